@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 import photonpano
 from photonpano import discover, hookspecs
-from photonpano.cli.app import app
+from photonpano.cli.app import app, commands
 from photonpano.cli.verbosity import PARAMETERS
 from photonpano.corrections import CORRECTIONS
 from photonpano.registry import KINDS
@@ -104,9 +104,7 @@ def corrections() -> str:
 
 def command(names: Sequence[str]) -> str:
     """Return a table of the arguments and options of a command."""
-    node: Any = typer.main.get_command(app)
-    for name in names:
-        node = node.commands[name]
+    node: Any = commands()[" ".join(names)] if names else typer.main.get_command(app)
     shown = [parameter for parameter in node.params if "--help" not in parameter.opts]
     if not names:  # every command takes these as well
         shown += PARAMETERS
@@ -116,7 +114,7 @@ def command(names: Sequence[str]) -> str:
         if parameter.param_type_name == "argument":
             flags = [parameter.metavar]
         elif not parameter.is_flag:
-            flags[-1] += f" {parameter.metavar}"
+            flags[-1] += f" {parameter.metavar or parameter.name.upper()}"
         default = parameter.default if isinstance(parameter.default, bool) and parameter.secondary_opts else None
         remark = "" if default is None else f" Default: `{flags[0] if default else flags[1]}`."
         rows.append([", ".join(f"`{flag}`" for flag in flags), f"{parameter.help}{remark}"])

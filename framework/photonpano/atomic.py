@@ -17,8 +17,7 @@ from photonpano.locks import claim, claimed, is_at
 from photonpano.text import byte_size
 
 _PARTIAL = re.compile("[0-9a-f]{8}")
-_unfinished: set[Path] = set()
-"""Files and folders under temporary names, which are to become final."""
+_unfinished: set[Path] = set()  # files and folders under temporary names, which are to become final
 
 
 def discard_unfinished() -> None:

@@ -21,12 +21,10 @@ from photonpano.atomic import flush, is_partial, partial_paths, remove, unfinish
 from photonpano.errors import OutputError
 from photonpano.locks import claim
 
-PENDING = ".photonpano-pending"
-"""The folder of new files that are complete, and not yet all in place."""
-_REMOVED = ".removed"
-"""A file in it: the names that the folder loses."""
+PENDING = ".photonpano-pending"  # the folder of new files that are complete, and not yet all in place
+_REMOVED = ".removed"  # a file in it: the names that the folder loses
+# Folders of unfinished files of older versions, and of what a stopped program discards
 _OLDER = re.compile(r"\.part-[a-z0-9_]{8}")
-"""Folders of unfinished files of older versions, and of what a stopped program discards."""
 _AT_FDCWD, _RENAME_EXCHANGE, _RENAME_SWAP = -100, 2, 2
 
 

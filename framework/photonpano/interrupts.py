@@ -6,8 +6,7 @@ import signal
 import threading
 from types import FrameType
 
-_noted: list[int] = []
-"""The numbers of the signals that have interrupted the program, in their order."""
+_noted: list[int] = []  # the numbers of the signals that have interrupted the program, in their order
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:

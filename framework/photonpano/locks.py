@@ -16,10 +16,8 @@ from typing import TypedDict
 
 from photonpano.errors import OutputError
 
-_NOTE_S = 2.0
-"""How long to wait for the note of a process that has just taken a lock."""
-_held: dict[Path, int] = {}
-"""Open files that this process uses until its end."""
+_NOTE_S = 2.0  # how long to wait for the note of a process that has just taken a lock
+_held: dict[Path, int] = {}  # open files that this process uses until its end
 
 
 class Holder(TypedDict):

@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 
 from photonpano.text import count, duration
 
-_MAX_PIXELS = 900
-"""Longer side of a picture."""
+_MAX_PIXELS = 900  # longer side of a picture
 _WHITE_QUANTILE = 0.995
-_PERIOD_S = 0.2
-"""Least time between two drawings of the bars."""
+_PERIOD_S = 0.2  # least time between two drawings of the bars
 
 
 def in_notebook() -> bool:

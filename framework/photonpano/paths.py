@@ -16,8 +16,8 @@ _KINDS = (
     (stat.S_ISBLK, "a device"),
 )
 
+# A scheme has two letters or more: `C:/` is a disk. `Path` makes one slash of two.
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+(.+)", re.DOTALL)
-"""A scheme has two letters or more: `C:/` is a disk. `Path` makes one slash of two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +76,7 @@ class Url:
         return urlsplit(str(self)).netloc
 
 
-Location = Path | Url
-"""Where a capture is: a path, or a URL."""
+Location = Path | Url  # where a capture is: a path, or a URL
 
 
 def location(text: str | Path | Url) -> Location:

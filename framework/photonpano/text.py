@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-_MOST = 3
-"""The largest number of names that are suggested."""
-_SAME_WORD = 0.8
-"""The similarity of two words from which one counts as a misspelling of the other."""
+_MOST = 3  # the largest number of names that are suggested
+_SAME_WORD = 0.8  # the similarity of two words from which one counts as a misspelling of the other
 
 
 def listed(words: Iterable[str], last: str = "and") -> str:
     """Join words as a sentence does: `a, b and c`."""
     words = list(words)
     return f" {last} ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
+
+
+def columns(rows: Sequence[Sequence[str]]) -> str:
+    """Align rows of text in columns: two spaces apart, no line wrapped, no trailing spaces."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 
 
 def install_line(installs: Iterable[str]) -> str:

@@ -16,8 +16,8 @@ from threadpoolctl import threadpool_limits
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
+# Calls a function with each item, several at once, and yields the results in order
 InOrder = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
-"""Calls a function with each item, several at once, and yields the results in order."""
 
 
 def thread_count(threads: int | Literal["auto"]) -> int:

@@ -119,7 +119,7 @@ def main_program() -> None:
 def preload() -> None:
     """Import what a run needs."""
     for name in (
-        "photonpano.cli.run", "photonpano.pipeline.run", "photonpano.specs", "photonpano.residuals.verdict",
+        "photonpano.api.run", "photonpano.pipeline.run", "photonpano.specs", "photonpano.residuals.verdict",
         "matplotlib.figure", "matplotlib.backends.backend_svg", "scipy.sparse.linalg", "jinja2", "rich.progress", "numba",
     ):  # fmt: skip
         importlib.import_module(name)

@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 
 from photonpano import parse_spec, run, simulate
-from photonpano.api.runs import evaluate
+from photonpano.api.evaluate import evaluate
 from photonpano.context import Context
 from photonpano.evaluation.images import covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.inputs import load_panorama, load_run_trajectory, load_truth

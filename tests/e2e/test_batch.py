@@ -21,16 +21,16 @@ INTERRUPTED = """\
 import sys, time
 from pathlib import Path
 sys.path[:] = {path}
-import photonpano.api.batch.batch
+import photonpano.api.batch
 import hanging
-photonpano.api.batch.batch.SpecText = hanging.Hanging
+photonpano.api.batch.SpecText = hanging.Hanging
 from photonpano.cli import main
 main()
 """
 HANGING = """\
 import time
 from pathlib import Path
-from photonpano.api.batch.sweeps import SpecText
+from photonpano.api.batching.sweeps import SpecText
 from photonpano.folders import staging_of
 
 class Hanging(SpecText):

@@ -1,1 +1,1 @@
-"""The commands as functions, for notebooks and scripts; `photonpano` exports them."""
+"""The commands: functions for notebooks and scripts, which `photonpano` exports, and what the program prints of them."""

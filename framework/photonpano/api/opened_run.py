@@ -13,6 +13,7 @@ from photonpano.capture import seen_through
 from photonpano.corrections import Vignette, divided_by, read_vignette
 from photonpano.errors import InputError, SpecError
 from photonpano.evaluation import RunTrajectory, load_run_trajectory
+from photonpano.evaluation import load_panorama as read_panorama
 from photonpano.geometry import FrameTrajectory
 from photonpano.lighting import in_light_of
 from photonpano.motion.frame_motion import FrameMotion
@@ -25,7 +26,7 @@ from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
 from photonpano.specs import Plan, parse_spec
-from photonpano.values import FrameSpan, StreamInfo
+from photonpano.values import FrameSpan, Panorama, StreamInfo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,3 +125,32 @@ def _motion(run: RunTrajectory) -> FrameMotion:
     trajectory = FrameTrajectory(run.homographies)
     std_px = np.where(run.located, np.nan_to_num(run.std_px, posinf=np.inf), np.inf)
     return FrameMotion(trajectory, span, run.homographies, run.located, std_px, reference, run.frame_shape, run.camera)
+
+
+def load_panorama(run_folder: Path | str) -> Panorama:
+    """Read the panorama of a finished run: flux, weight and canvas.
+
+    Args:
+        run_folder: written by `run` or `render`.
+
+    Raises:
+        InputError: the folder is no run folder, or a file is missing or damaged.
+    """
+    folder = Path(run_folder)
+    require_one_run(folder, ["trajectory.npz", "panorama.tiff", "coverage.tiff"])
+    canvas = load_run_trajectory(folder, needs_std_px=False).canvas
+    return Panorama(*read_panorama(folder), canvas)
+
+
+def load_trajectory(run_folder: Path | str) -> RunTrajectory:
+    """Read the motion of a finished run: the homography of every frame, with its expected error.
+
+    Args:
+        run_folder: written by `run` or `render`.
+
+    Raises:
+        InputError: the folder is no run folder, or the file is missing or damaged.
+    """
+    folder = Path(run_folder)
+    require_one_run(folder, ["trajectory.npz"])
+    return load_run_trajectory(folder, needs_std_px=False)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import typer
 
+from photonpano.api.command import command
 from photonpano.api.opened_run import OpenedRun, opened_run
-from photonpano.api.rendering import require_harmless, require_same_plane
+from photonpano.api.render import require_harmless, require_same_plane
 from photonpano.captures.picture_files import counted, require_writable, write_pictures
 from photonpano.context import Progress, usual
 from photonpano.errors import ExtentError, InputError, ProjectionError
@@ -27,8 +29,7 @@ from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
 View = Literal["panorama", "smooth"]
-_SMOOTH_S = 0.5
-"""Standard deviation of the smooth path, in seconds of the video."""
+_SMOOTH_S = 0.5  # standard deviation of the smooth path, in seconds of the video
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 
@@ -53,6 +54,23 @@ class Video:
     speed: float | None
 
 
+def _lines(made: Video) -> Iterator[str]:
+    height, width = made.shape
+    yield f"{made.path}: {made.n_pictures:,} pictures of {height}x{width}, {made.exposure:,} frames each"
+    if made.speed is not None:
+        yield f"a second of the video shows {made.speed:.4g} s of the capture"
+
+
+@command(
+    "runs/first first.mp4 --view smooth --exposure 2ms --speed 0.05",
+    _lines,
+    settings={"scale": typer.Option(metavar="X", help="Pixels of the video per pixel of a frame.")},
+    output=typer.Argument(metavar="OUT"),
+    view=typer.Option(metavar="VIEW", parser=str),
+    exposure=typer.Option(metavar="N|TIME"),
+    fps=typer.Option(min=0.1, max=240, metavar="HZ"),
+    speed=typer.Option(metavar="X"),
+)
 def video(
     run_folder: Path | str,
     output: Path | str,
@@ -69,18 +87,18 @@ def video(
     """Make a video along the motion of a finished run. Nothing is located again.
 
     Each picture merges the frames of an exposure along the motion, in the view of its middle. The flux that is white in the
-    panorama of the run is white in all pictures.
+    panorama of the run is white in all pictures. MP4 needs av: pip install "photonpano[video]".
 
     Args:
         run_folder: written by `run`.
-        output: a file that ends in .mp4, .webp or .gif; or a new folder, for PNGs of 16 bits.
-        view: "panorama" shows the canvas of the panorama, on which still things stand still; "smooth" is as large as a frame
-            and follows the camera without its tremor.
+        output: an .mp4, .webp or .gif file, or a new folder for PNGs of 16 bits.
+        view: "panorama", the canvas of the panorama, on which still things stand still; or "smooth", as large as a frame, which
+            follows the camera without its tremor.
         exposure: frames that a picture merges, or a time such as "5 ms"; by default as many as the groups of the last level.
         fps: pictures per second of the video.
         speed: seconds of the capture that pass in a second of the video; below 1 for slow motion. By default, each picture
             begins where the exposure of the one before ends.
-        trail: whether to draw the outline of the frame, over the panorama.
+        trail: draw the outline of the frame, over the panorama.
         changes: values of the recorded spec to change, such as `render.scale=0.5` or `render.extent=reference`.
         progress: receives the stages; by default, bars in a notebook and nothing elsewhere.
         catalog: what can be chosen; by default what the installed plugins offer.

@@ -1,4 +1,4 @@
-"""The command line: one command a file."""
+"""The command line: it reads arguments, calls functions of `api`, and prints their results."""
 
 from photonpano.cli.app import main
 

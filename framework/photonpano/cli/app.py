@@ -1,46 +1,74 @@
-"""The program `photonpano`. Commands import their modules when they run, to keep `--help` fast."""
+"""The program `photonpano`. A command is a module of `api`, which is imported when it is used: that keeps `--help` fast."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import photonpano
-from photonpano.cli.batch import batch
-from photonpano.cli.check import check
-from photonpano.cli.check_run import check_run
-from photonpano.cli.clean import clean
-from photonpano.cli.command import Command
-from photonpano.cli.compare import compare
-from photonpano.cli.convert import convert
-from photonpano.cli.dark import dark
+from photonpano import api
 from photonpano.cli.ending import end_on_signals, leave
 from photonpano.cli.errors import FAILED, SIGNALLED, print_error
-from photonpano.cli.evaluate import evaluate
-from photonpano.cli.explain import explain
-from photonpano.cli.export import export
-from photonpano.cli.info import info
-from photonpano.cli.plugins import plugins
-from photonpano.cli.preview import preview
-from photonpano.cli.render import render
-from photonpano.cli.run import run
-from photonpano.cli.schema import schema
-from photonpano.cli.simulate import simulate
+from photonpano.cli.signatures import SETTINGS, loaded
 from photonpano.cli.streams import prepare_streams
 from photonpano.cli.verbosity import with_verbosity
-from photonpano.cli.verify import verify
-from photonpano.cli.video import video
-from photonpano.cli.warm_up import warm_up
 from photonpano.errors import OutputError
 from photonpano.interrupts import interrupted_by
 
+# The commands that `--help` lists before all others
+_FIRST = ("info", "check", "run", "batch", "check_run", "verify", "evaluate", "compare", "render", "video", "export")
+
+
+class _Command(TyperCommand):
+    """A command whose module is imported when it is used."""
+
+    def __init__(self, words: str, module: str, summary: str) -> None:
+        super().__init__(words.rpartition(" ")[2], short_help=summary)
+        self.words, self._module = words, module
+
+    @cached_property
+    def loaded(self) -> Any:
+        """The command of the module."""
+        return loaded(self.words, self._module)
+
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        """Read the command line."""
+        return self.loaded.make_context(*arguments, **options)
+
 
 class _Commands(TyperGroup):
-    """The commands."""
+    """The modules of a package that are commands, and its packages that hold some; with -v, -q and --log before the name."""
+
+    def __init__(self, *, package: str = "photonpano.api", **options: Any) -> None:
+        super().__init__(**options)
+        folder = Path(api.__path__[0], *package.split(".")[2:])
+        for file in sorted(folder.glob("*.py"), key=lambda file: (_place(file.stem), file.stem)):
+            if "\n@command(" in file.read_text(encoding="utf-8"):
+                words = " ".join([*package.split(".")[2:], file.stem.replace("_", "-")])
+                self.add_command(_Command(words, f"{package}.{file.stem}", _first_line(file)))
+        for file in sorted(folder.glob("*/__init__.py")):
+            name = file.parent.name
+            help_of_group: Any = {"help": _first_line(file), "no_args_is_help": True, "rich_markup_mode": None}
+            group = _Commands(name=name, package=f"{package}.{name}", context_settings=SETTINGS, **help_of_group)
+            if group.commands:
+                self.add_command(group)
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the parameters."""
         return with_verbosity(super().get_params(ctx))
+
+
+def _place(name: str) -> int:
+    return _FIRST.index(name) if name in _FIRST else len(_FIRST)
+
+
+def _first_line(file: Path) -> str:
+    return file.read_text(encoding="utf-8").partition("\n")[0].strip('"')
 
 
 app = typer.Typer(
@@ -49,15 +77,8 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings=SETTINGS,
 )
-_COMMANDS = (
-    *(run, batch, check, check_run, verify, render, video, explain, info, preview),
-    *(convert, export, simulate, dark, evaluate, compare, clean, schema, warm_up),
-)
-for command in _COMMANDS:
-    app.command(cls=Command)(command)
-app.add_typer(plugins, name="plugins")
 
 
 def _print_version(wanted: bool) -> None:
@@ -81,6 +102,16 @@ def photonpano_options(
 
     Exit codes: 0 success, 1 failure, 2 wrong spec or command line.
     """
+
+
+def commands() -> dict[str, Any]:
+    """Import all commands, and return them by their names, such as `plugins list`."""
+
+    def inside(group: Any) -> Iterator[tuple[str, Any]]:
+        for each in group.commands.values():
+            yield from [(each.words, each.loaded)] if isinstance(each, _Command) else inside(each)
+
+    return dict(inside(typer.main.get_command(app)))
 
 
 def main() -> None:

@@ -8,19 +8,15 @@ from contextlib import contextmanager
 
 import typer
 
+from photonpano.api.command import WrongArgumentError
 from photonpano.cli.verbosity import SHOWN, log_shown
 from photonpano.errors import PhotonpanoError, PluginError, SpecError
 from photonpano.interrupts import interrupted_by
 
 FAILED = 1
 WRONG_SPEC = 2
-SIGNALLED = 128
-"""Plus the number of the signal: 130 for Ctrl-C."""
+SIGNALLED = 128  # plus the number of the signal: 130 for Ctrl-C
 INTERRUPTED = "\ninterrupted; no file is left half-written under its final name"
-
-
-class WrongArgumentError(PhotonpanoError):
-    """An argument or an option of a command is wrong."""
 
 
 @contextmanager
@@ -91,9 +87,3 @@ def print_error(error: PhotonpanoError, debug: bool = False) -> int:
     count = len(error.problems)
     typer.echo(f"error: the spec has {count} problem{'' if count == 1 else 's'}", err=True)
     return WRONG_SPEC
-
-
-def warn(message: str) -> None:
-    """Print a warning."""
-    typer.echo(f"warning: {message}", err=True)
-    log_shown(logging.WARNING, message)

@@ -20,12 +20,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as RichProgress
 
-INTERVAL_S = 10.0
-"""Time between two lines of progress."""
-_LEAST_S = 1.0
-"""How long a stage has gone on before it has a line."""
-_IN_NOTEBOOK = "JPY_PARENT_PID"
-"""Set for commands of a notebook, whose terminal shows what moves a cursor as it is."""
+INTERVAL_S = 10.0  # time between two lines of progress
+_LEAST_S = 1.0  # how long a stage has gone on before it has a line
+_IN_NOTEBOOK = "JPY_PARENT_PID"  # set for commands of a notebook, whose terminal shows what moves a cursor as it is
 
 
 def progress_for_stderr(*, notes: bool = False) -> Progress:

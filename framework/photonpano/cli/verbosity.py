@@ -9,19 +9,14 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from photonpano import __version__
-from photonpano.text import byte_size, duration
-
-if TYPE_CHECKING:
-    from photonpano.record.schema import RunRecord
 
 logger = logging.getLogger("photonpano")
-SHOWN = f"{__name__}.shown"
-"""The logger of what is on the screen already, such as progress: for the log file alone."""
+SHOWN = f"{__name__}.shown"  # the logger of what is on the screen already, such as progress: for the log file alone
 _VERBOSE, _QUIET, _LOG = "verbose", "quiet", "log"
 _chosen: set[str] = set()
 
@@ -45,16 +40,6 @@ def log_shown(level: int, message: str, error: BaseException | None = None) -> N
     """Write what was printed to the log file, with the traceback of an error."""
     if is_logged():
         logging.getLogger(SHOWN).log(level, "%s", message, exc_info=error)
-
-
-def log_decisions(record: RunRecord) -> None:
-    """Log each decision of a run with its reason, and what the run took."""
-    if not is_logged():
-        return
-    for each in record["decisions"]:
-        logger.info("%s %s: %s", each["what"], each["value"], each["reason"])
-    memory = record["peak_memory_bytes"]
-    logger.info("took %s%s", duration(record["seconds"]), f" and at most {byte_size(memory)} of memory" if memory else "")
 
 
 def with_verbosity(parameters: list[Any]) -> list[Any]:

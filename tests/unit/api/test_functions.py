@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import typer
 
 import photonpano
 from photonpano import Config, Plan, RefinerContribution, capture_plan, convert, discover, explain, info, parse_spec, simulate
-from photonpano.cli.app import app
+from photonpano.cli.app import commands
 from photonpano.record.environment import plugin_records
 
 
@@ -30,7 +28,7 @@ def test_every_public_name_is_importable() -> None:
 
 @pytest.mark.parametrize("name", ["preview", "dark", "evaluate", "convert", "simulate"])
 def test_function_has_defaults_of_command(name: str) -> None:
-    command: Any = typer.main.get_command(app).commands[name]
+    command = commands()[name]
     options = {each.name: each.default for each in command.params if each.default is not None}
     parameters = inspect.signature(getattr(photonpano, name)).parameters
     defaults = {key: each.default for key, each in parameters.items() if each.default not in (None, each.empty)}

@@ -32,13 +32,6 @@ def change(folder: Path, edit: Callable[[dict[str, Any]], object]) -> None:
     (folder / "run.json").write_text(json.dumps(record))
 
 
-def change_trajectory(folder: Path, **arrays: np.ndarray | None) -> None:
-    """Replace arrays of the trajectory, or leave them out."""
-    with np.load(folder / "trajectory.npz") as archive:
-        kept = {**archive, **arrays}
-    np.savez(folder / "trajectory.npz", **{name: array for name, array in kept.items() if array is not None})
-
-
 def error_of(folder: Path) -> str:
     with pytest.raises(InputError) as caught:
         check_run(folder)
@@ -65,40 +58,6 @@ def test_check_run_doubts_other_photons_of_the_same_size(finished: Path) -> None
     assert any(reason.what.startswith("the panorama does not explain the photons") for reason in verdict.reasons)
 
 
-def test_check_run_refuses_missing_capture(finished: Path) -> None:
-    cube = finished.parent / "cube.npy"
-    cube.unlink()
-    assert error_of(finished) == (
-        f"{finished}: the capture of this run cannot be opened by its recorded spec "
-        f"(source: there is no file {cube}; check the path)"
-    )
-
-
-@pytest.mark.parametrize(("part", "size"), [(np.s_[:299], "299 frames of 128x160"), (np.s_[:, :120], "300 frames of 120x160")])
-def test_check_run_refuses_capture_of_another_size(finished: Path, part: Any, size: str) -> None:
-    cube = finished.parent / "cube.npy"
-    np.save(cube, np.load(cube)[part])
-    assert error_of(finished) == (
-        f"{finished} is a run of 300 frames of 128x160, but its capture now has {size}; it is another capture"
-    )
-
-
-def test_check_run_of_older_version_says_what_it_cannot_judge(finished: Path, small_run: RunResult) -> None:
-    def age(record: dict[str, Any]) -> None:
-        del record["verdict"], record["refinements"], record["files"], record["capture"]
-        for level in record["levels"]:
-            del level["contradictions"]
-
-    change(finished, age)
-    change_trajectory(finished, std_px=None)
-    found = check_run(finished)
-    assert found.verdict.status == small_run.verdict.status
-    assert found.unknown == (
-        "trajectory.npz has no std_px, as it is of an older version: the expected error is not judged",
-        "run.json does not list contradicting pairs, as it is of an older version: they are not judged",
-    )
-
-
 def test_check_run_judges_recorded_contradictions(finished: Path) -> None:
     pair = {"moving": [0, 50], "fixed": [50, 100]}
     change(finished, lambda record: record["levels"][-1].update(pairs=10, contradictions=[pair, pair]))
@@ -114,28 +73,3 @@ def test_check_run_keeps_what_only_the_run_can_find(finished: Path) -> None:
     found = [reason.what for reason in check_run(finished).verdict.reasons]
     assert found[-2:] == ["more than half of the frame stands still while the rest moves", REPEATS]
     assert other["what"] not in found
-
-
-def test_check_run_refuses_folder_that_is_no_run(finished: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "other"
-    assert error_of(folder) == f"{folder} is not a folder; give the run folder that `photonpano run` wrote"
-    folder.mkdir()
-    assert error_of(folder) == (
-        f"{folder} has no trajectory.npz, so no run has finished in it; give the folder of a finished run"
-    )
-    (finished / "run.json").unlink()
-    assert error_of(finished) == f"{finished} has no run.json, so no run has finished in it; give the folder of a finished run"
-
-
-def test_check_run_refuses_run_without_located_frames(finished: Path) -> None:
-    change(finished, lambda record: record.pop("files"))
-    change_trajectory(finished, located=np.zeros(300, np.bool_))
-    assert error_of(finished) == f"{finished}: the run located no frame, so that it has no panorama"
-
-
-def test_check_run_refuses_files_of_two_runs(finished: Path) -> None:
-    change_trajectory(finished, std_px=np.zeros(300))
-    assert error_of(finished) == (
-        f"{finished}: trajectory.npz is not the file that its run.json lists; the folder mixes several runs, or a file was "
-        "changed: run the spec again"
-    )

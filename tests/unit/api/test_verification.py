@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonpano import InputError, clean, evaluate, verify
+from photonpano import InputError, clean, verify
 from photonpano.pipeline.run import RunResult
 from photonpano.reading.gzipped import unpacked
 
@@ -53,30 +53,6 @@ def test_verify_says_what_it_cannot_compare(finished: Path) -> None:
     del record["files"]
     (finished / "run.json").write_text(json.dumps(record))
     assert verify(finished).problems == ("run.json lists no hashes, as in older versions",)
-
-
-def test_evaluate_refuses_files_of_two_runs(finished: Path, small_capture: Path) -> None:
-    truth = small_capture.with_name("cube.truth.npz")
-    assert evaluate(finished, truth, oracle=False).trajectory.mean_px < 1
-    np.savez(finished / "trajectory.npz", **np.load(finished / "trajectory.npz"))
-    with (finished / "panorama.tiff").open("ab") as file:
-        file.write(b"more")
-    with pytest.raises(InputError) as caught:
-        evaluate(finished, truth, oracle=False)
-    assert str(caught.value) == (
-        f"{finished}: panorama.tiff is not the file that its run.json lists; the folder mixes several runs, or a file was "
-        "changed: run the spec again"
-    )
-
-
-def test_evaluate_of_an_older_run_warns(finished: Path, small_capture: Path, caplog: pytest.LogCaptureFixture) -> None:
-    record = json.loads((finished / "run.json").read_text())
-    del record["files"]
-    (finished / "run.json").write_text(json.dumps(record))
-    evaluate(finished, small_capture.with_name("cube.truth.npz"), oracle=False)
-    assert [message.getMessage() for message in caplog.records] == [
-        f"{finished}: run.json lists no hashes, as in older versions, so the files may be of several runs"
-    ]
 
 
 def test_clean_removes_leftovers_only(tmp_path: Path) -> None:

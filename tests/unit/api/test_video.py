@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from photonpano import PhotonpanoError, video
+from photonpano import video
 from photonpano.pipeline.run import RunResult
 
 BOX = "render.extent=[10, 20, 90, 80]"
@@ -68,78 +65,3 @@ def test_trail_shows_the_panorama_around_the_frame(small_run: RunResult, tmp_pat
     assert (plain == 0).mean() > 0.15
     assert (trail == 0).mean() < 0.05
     assert (trail > 0.7).sum() > (plain > 0.7).sum() + 200
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments", "message"),
-    [
-        (
-            "film.avi",
-            {},
-            "cannot write {folder}/film.avi: pictures go to a folder, as PNGs, or to a file that ends in .mp4, .webp or .gif",
-        ),
-        (
-            "film.gif",
-            {"exposure": 301},
-            "{run}: an exposure of 301 frames is longer than the 300 frames that were located; choose a shorter one",
-        ),
-        ("film.gif", {"exposure": "soon"}, "exposure: expected a number of frames, or a time such as 5ms, got soon"),
-        ("film.gif", {"exposure": "1.5"}, "exposure: expected a number of frames, or a time such as 5ms, got 1.5"),
-        ("film.gif", {"exposure": "1us"}, "exposure: expected at least one frame, got 1us"),
-        ("film.gif", {"fps": 0}, "fps: expected a number above 0, got 0"),
-        ("film.gif", {"speed": -1}, "speed: expected a number above 0, got -1"),
-        ("film.gif", {"view": "top"}, "view: expected panorama or smooth, got top"),
-        (
-            "film.gif",
-            {"view": "smooth", "trail": True},
-            "the trail is drawn over the panorama; choose the view panorama, or no trail",
-        ),
-        (
-            "film.gif",
-            {"speed": 1e-5},
-            "cannot write {folder}/film.gif: 6,457 pictures are too many for an animated GIF, which holds 500; take fewer, or "
-            "write an .mp4",
-        ),
-        (
-            "film.gif",
-            {"changes": ["locate.use=opencv-sift"]},
-            "locate.use=opencv-sift: a rendering has only the sections render, output, run and source; run the spec again to "
-            "change others",
-        ),
-        (
-            "film.gif",
-            {"changes": ["render.scale=16", "run.memory=64 MiB"]},
-            "{run}: a picture of 3520 x 2256 pixels takes 303 MiB, more than the 64 MiB of run.memory; lower render.scale, or "
-            "choose a part with render.extent",
-        ),
-    ],
-)
-def test_wrong_input_is_named(small_run: RunResult, tmp_path: Path, name: str, arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(PhotonpanoError) as caught:
-        video(small_run.directory, tmp_path / name, **arguments)
-    assert str(caught.value) == message.format(folder=tmp_path, run=small_run.directory)
-    assert not list(tmp_path.iterdir())
-
-
-def test_run_without_its_capture_or_its_rate_is_named(small_run: RunResult, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    shutil.copytree(small_run.directory, folder)
-    record = json.loads((folder / "run.json").read_text())
-    del record["spec"]["source"]["with"]["frame_rate_hz"]
-    (folder / "run.json").write_text(json.dumps(record))
-    for arguments, message in (
-        (
-            {"speed": 0.1},
-            f"{folder}: the speed of a video needs the frame rate of the capture, which is not known; set "
-            "source.with.frame_rate_hz, or leave the speed out",
-        ),
-        ({"exposure": "1ms"}, "exposure: the frame rate of the capture is not known; give a number of frames"),
-    ):
-        with pytest.raises(PhotonpanoError) as caught:
-            video(folder, tmp_path / "film.gif", **arguments)
-        assert str(caught.value) == message
-    record["spec"]["source"]["with"]["path"] = str(tmp_path / "gone.npy")
-    (folder / "run.json").write_text(json.dumps(record))
-    with pytest.raises(PhotonpanoError, match="the capture of this run cannot be opened by its recorded spec"):
-        video(folder, tmp_path / "film.gif")
-    assert not (tmp_path / "film.gif").exists()

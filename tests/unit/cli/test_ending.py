@@ -19,7 +19,7 @@ import ctypes, hashlib, itertools, threading, time
 from pathlib import Path
 from photonpano.atomic import atomic_path
 from photonpano.cli.app import app, main
-from photonpano.cli.command import Command
+from photonpano.cli.signatures import LoadedCommand as Command
 from photonpano.folders import staging_of
 from photonpano.threads import thread_pool
 

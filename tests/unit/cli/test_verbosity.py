@@ -77,25 +77,6 @@ def test_log_is_appended_to_and_holds_stages_and_errors(folder: Path, invoke: Ca
     assert messages[4] == "nowhere.yaml: there is no such file"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--log", "nowhere/run.log"], "Invalid value for '--log': cannot write nowhere/run.log: No such file or directory"),
-        (["--log", "."], "Invalid value for '--log': cannot write .: Is a directory"),
-        (["-v", "-q"], "Invalid value for '-v' and '-q': give one of them"),
-    ],
-)
-def test_wrong_option_exits_2_before_anything_is_done(
-    folder: Path, invoke: Callable[..., Any], arguments: list[str], message: str
-) -> None:
-    for words in ((*arguments, *SIMULATE), (*SIMULATE, *arguments)):
-        result = invoke(*words)
-        assert (result.exit_code, result.stdout) == (2, "")
-        assert message in result.stderr
-        assert "Traceback" not in result.stderr
-    assert sorted(path.name for path in folder.iterdir()) == ["capture.yaml"]
-
-
 class FullDisk(io.RawIOBase):
     """A file on a disk without room."""
 

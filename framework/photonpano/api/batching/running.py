@@ -1,0 +1,123 @@
+"""Do one run of a batch, in whatever process."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+
+from photonpano.api.batching.sweeps import Job, is_of_capture
+from photonpano.captures.writing import truth_path
+from photonpano.context import Quiet
+from photonpano.errors import InputError, PhotonpanoError, SpecError, described
+from photonpano.evaluation import evaluate, evaluate_poses
+from photonpano.paths import Url
+from photonpano.pipeline.run import RunResult, run
+from photonpano.record.batch_row import BatchRow
+from photonpano.registry import Catalog
+from photonpano.report.drawing import jpeg_uri, shrunk
+
+_THUMBNAIL_PIXELS = 240  # longer side
+
+
+def run_job(job: Job, catalog: Catalog | None = None) -> BatchRow:
+    """Do one run, unless it was finished before, and score it if the truth lies beside the capture.
+
+    Args:
+        job: what to do.
+        catalog: what can be chosen; by default what the installed plugins offer.
+
+    Returns:
+        The row of the summary. Errors become its reason; only what ends the process escapes.
+    """
+    with _warnings() as warnings:
+        row = _attempted(job, catalog)
+    return replace(row, reason="\n".join([row.reason, *warnings]).strip())
+
+
+class _Warnings(logging.Handler):
+    """Collects what is logged as a warning."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.found: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.found.append(f"warning: {record.getMessage()}")
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """Collect what is logged as a warning while the block runs."""
+    logger, handler = logging.getLogger("photonpano"), _Warnings()
+    logger.addHandler(handler)
+    try:
+        yield handler.found
+    finally:
+        logger.removeHandler(handler)
+
+
+def _attempted(job: Job, catalog: Catalog | None) -> BatchRow:
+    """Do a run; an error becomes the reason of its row."""
+    try:
+        plan = job.spec.plan(job.overrides, job.row.directory, catalog)
+        if plan.run.threads == "auto":  # the record keeps `auto`: results do not depend on it
+            plan = replace(plan, run=plan.run.model_copy(update={"threads": job.threads}))
+        result = run(plan, Quiet(), overwrite=job.overwrite, resume=True)
+        return _scored(_finished(job.row, result), result)
+    except SpecError as error:
+        own = [each for each in error.problems if is_of_capture(each.where)]
+        reason = "\n".join(each.message for each in own) if len(own) == len(error.problems) else str(error)
+        return replace(job.row, status="failed", reason=reason)
+    except PhotonpanoError as error:
+        return replace(job.row, status="failed", reason=str(error), report=error.report)
+    except MemoryError:
+        return replace(job.row, status="failed", reason="there is not enough memory; lower run.memory, or the number of jobs")
+    except Exception as error:
+        return replace(job.row, status="failed", reason=f"{described(error)} (a defect of photonpano or of a plugin)")
+
+
+def _finished(row: BatchRow, result: RunResult) -> BatchRow:
+    """Describe what a run has found."""
+    record, poses, motion = result.record, result.record["poses"], result.record["motion"]
+    doubts = [str(each) for each in (poses["doubts"] if poses else result.verdict.reasons if result.verdict else ())]
+    return replace(
+        row,
+        status="done",
+        was_finished=result.was_finished,
+        verdict="doubtful" if doubts else "trusted",
+        reason="\n".join(doubts),
+        expected_error_px=motion["std_px"] if motion else None,
+        expected_position_error=poses["std_position"] if poses else None,
+        n_frames=record["source"]["n_frames"],
+        seconds=record["seconds"],
+        peak_memory_bytes=record["peak_memory_bytes"],
+        report=result.directory / "report.html" if "report.html" in record.get("files", {}) else None,
+        thumbnail=_thumbnail(result.directory / "panorama.png"),
+    )
+
+
+def _scored(row: BatchRow, result: RunResult) -> BatchRow:
+    """Add the score of a run whose truth lies beside the capture."""
+    if isinstance(row.capture, Url) or not (truth := truth_path(row.capture)).exists():
+        return row
+    try:
+        if result.record["poses"]:
+            return replace(row, true_position_error=evaluate_poses(result.directory, truth).ate_share)
+        score = evaluate(result.directory, truth)
+        psnr_db = None if score.panorama is None else score.panorama.psnr_db
+        return replace(row, true_error_px=score.trajectory.mean_px, psnr_db=psnr_db)
+    except InputError as error:
+        return replace(row, reason="\n".join(filter(None, (row.reason, f"no score: {error}"))))
+
+
+def _thumbnail(picture: Path) -> str | None:
+    image = cv2.imread(str(picture), cv2.IMREAD_ANYCOLOR) if picture.exists() else None
+    if image is None:
+        return None
+    small = shrunk(image, _THUMBNAIL_PIXELS)
+    return jpeg_uri(small if small.ndim == 2 else small[..., ::-1])

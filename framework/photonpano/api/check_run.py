@@ -1,0 +1,88 @@
+"""Judge a finished run by its capture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from photonpano.api.command import command, require_trust, verdict_line, warn
+from photonpano.api.opened_run import opened_run
+from photonpano.context import Context, Progress, usual
+from photonpano.record.schema import RunRecord
+from photonpano.registry import Catalog
+from photonpano.residuals.refinement import MotionFit
+from photonpano.residuals.verdict import NO_TURN, REPEATS, Reason, Verdict, contradictions, judge
+from photonpano.threads import one_thread_inside, thread_count
+from photonpano.values import Decision
+
+
+@dataclass(frozen=True, slots=True)
+class RunCheck:
+    """What `check_run` found.
+
+    Attributes:
+        verdict: whether motion and panorama explain the photons.
+        unknown: what could not be judged, a sentence each.
+    """
+
+    verdict: Verdict
+    unknown: tuple[str, ...]
+
+
+def _lines(found: RunCheck, *, strict: bool = False) -> Iterator[str]:
+    yield verdict_line(found.verdict)
+    for sentence in found.unknown:
+        warn(sentence)
+    ratio = found.verdict.residual_ratio
+    yield f"scatter   {'unknown: too few frames' if ratio is None else f'{ratio:.2f} times what noise explains'}"
+    if strict:
+        require_trust(found.verdict, "nothing was written")
+
+
+@command("runs/first --strict", _lines)
+def check_run(run_folder: Path | str, progress: Progress | None = None, catalog: Catalog | None = None) -> RunCheck:
+    """Judge a finished run: render the panorama along its motion, and compare it with the photons of the capture.
+
+    Writes nothing. The panorama is rendered with the scale of the frames, whatever that of the run was. What only the loop can
+    find, such as pairs that fit at several places, is taken from the record.
+
+    Args:
+        run_folder: written by `run`.
+        progress: receives the stages; by default, bars in a notebook and nothing elsewhere.
+        catalog: what can be chosen; by default what the installed plugins offer.
+
+    Raises:
+        InputError: the folder is no run folder, its capture cannot be opened, or it is another capture now.
+    """
+    with opened_run(Path(run_folder), catalog) as opened, one_thread_inside():
+        record, plan = opened.record, opened.plan
+        context = Context(thread_count(plan.run.threads), usual(progress))
+        fit = MotionFit(opened.source, opened.motion, plan.render.tolerance_px, int(plan.run.memory), context)
+        explained = fit.explained()
+    verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
+    unknown = []
+    if not opened.has_std_px:
+        unknown.append("trajectory.npz has no std_px, as it is of an older version: the expected error is not judged")
+    pairs = _pairs(record)
+    if pairs is None:
+        unknown.append("run.json does not list contradicting pairs, as it is of an older version: they are not judged")
+    elif (reason := contradictions(*pairs)) is not None:
+        verdict = _with(verdict, reason)
+    for found in (record.get("verdict") or {"reasons": ()})["reasons"]:
+        if found["what"] in (REPEATS, NO_TURN):
+            verdict = _with(verdict, Reason(**found))
+    return RunCheck(verdict, tuple(unknown))
+
+
+def _pairs(record: RunRecord) -> tuple[int, int] | None:
+    """Return the contradicting pairs of the last level and all of its pairs; None if the record does not list them."""
+    try:
+        last = record["levels"][-1]
+        return len(last["contradictions"]), int(last["pairs"])
+    except (KeyError, IndexError, TypeError, ValueError):
+        return None
+
+
+def _with(verdict: Verdict, reason: Reason) -> Verdict:
+    return Verdict("doubtful", (*verdict.reasons, reason), verdict.residual_ratio)

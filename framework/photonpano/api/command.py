@@ -1,0 +1,127 @@
+"""Declare commands of the program: a function, the lines that it prints, and how its parameters are given.
+
+A module of `api` that uses `command` is a command of its name; the first line of the module is its line in `photonpano --help`.
+The signature and the docstring of the function give the rest: see `photonpano.cli.signatures`.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import typer
+
+from photonpano.errors import PhotonpanoError
+
+if TYPE_CHECKING:
+    from photonpano.residuals.verdict import Verdict
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+logger = logging.getLogger("photonpano")
+
+
+class WrongArgumentError(PhotonpanoError):
+    """An argument or an option of a command is wrong."""
+
+
+class DoubtfulError(PhotonpanoError):
+    """A run is doubtful, and only a trusted one is a success."""
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command.
+
+    Attributes:
+        function: does the work; its signature and docstring give the options.
+        prints: turns the result into the lines of standard output. Its keyword-only parameters are options as well.
+        example: the words after the name of the command, for its help.
+        plan: what gives the parameter `plan`: a spec, or a capture with options.
+        settings: options that stand for values of the section `render`, as `--scale 2` for `--set render.scale=2`.
+        notes: whether the notes of the progress are printed without a terminal, or the option that decides it.
+        calls: is called in place of `function`, with the same parameters.
+        options: how parameters are given, where names, types and docstring do not say it.
+    """
+
+    function: Callable[..., Any]
+    prints: Callable[..., Iterable[str]]
+    example: str = ""
+    plan: Literal["spec", "capture"] | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    notes: bool | str = False
+    calls: Callable[..., Any] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+SPEC = typer.Argument(metavar="SPEC", help="The spec: a YAML file.")
+CHANGES = typer.Option(
+    "--set", metavar="KEY=VALUE", help="Change a value of the spec, such as run.seed=1 or levels.0.scale=0.5."
+)
+COMMANDS: dict[str, Command] = {}  # the commands whose modules are imported, by module
+
+
+def command(example: str, prints: Callable[..., Iterable[str]], **declared: Any) -> Callable[[FunctionT], FunctionT]:
+    """Make a function a command.
+
+    Args:
+        example: see `Command`.
+        prints: see `Command`.
+        declared: other attributes of `Command`; what is none of them is an item of `options`.
+    """
+    own = {name: declared.pop(name) for name in ("plan", "settings", "notes", "calls") if name in declared}
+
+    def declare(function: FunctionT) -> FunctionT:
+        COMMANDS[function.__module__] = Command(function, prints, example, options=declared, **own)
+        return function
+
+    return declare
+
+
+def component_names(*kinds: str) -> Callable[[str], list[str]]:
+    """Return what completes the name of a component.
+
+    Args:
+        kinds: of the components; by default all.
+    """
+
+    def complete(incomplete: str) -> list[str]:
+        from photonpano.registry import discover
+
+        rows = discover().rows
+        return sorted({each.name for each in rows if each.name.startswith(incomplete) and (not kinds or each.kind in kinds)})
+
+    return complete
+
+
+def warn(message: str) -> None:
+    """Print a warning on standard error, once the command runs."""
+    logger.warning("%s", message)
+
+
+def json_lines(data: Any) -> list[str]:
+    """Return data as JSON, for programs."""
+    return [json.dumps(data, indent=2)]
+
+
+def verdict_line(verdict: Verdict) -> str:
+    """Return the line with the status; each reason of a doubtful one is a sentence on standard error."""
+    for reason in verdict.reasons:
+        typer.echo(f"doubtful: {reason}", err=True)
+    return f"verdict   {verdict.status}"
+
+
+def require_trust(verdict: Verdict, files: str) -> None:
+    """Fail with --strict.
+
+    Args:
+        verdict: of the run.
+        files: what became of the files, as a clause.
+
+    Raises:
+        DoubtfulError: the verdict is doubtful.
+    """
+    if verdict.status != "trusted":
+        raise DoubtfulError(f"the verdict is doubtful, and --strict accepts only a trusted one; {files}")

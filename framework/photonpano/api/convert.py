@@ -1,0 +1,166 @@
+"""Convert binary frames to a packed .npy file or a zarr array."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from shlex import quote
+from typing import Any
+from zipfile import ZipFile
+
+import typer
+from rich.filesize import decimal
+
+from photonpano.api.command import command, warn
+from photonpano.atomic import part_path
+from photonpano.captures.writing import write_folder, write_packed
+from photonpano.context import Progress, usual
+from photonpano.contributions import SourceContribution
+from photonpano.errors import OutputError
+from photonpano.notebooks import facts
+from photonpano.pipeline.components import build_source
+from photonpano.protocols import Source
+from photonpano.registry import Catalog, discover
+from photonpano.registry.description import flow
+from photonpano.specs import Plan
+from photonpano.text import columns, counted
+from photonpano.threads import thread_count
+from photonpano.values import StreamInfo
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenCapture:
+    """A packed .npy file, or a folder such as a zarr array, written by `convert` or `simulate`.
+
+    Attributes:
+        path: the file or folder.
+        truth: the file beside it with the true motion and scene, if the source knows them.
+        info: the size and rate of the capture.
+        n_masked: how many pixels the source masks; the file holds no mask.
+        source: the section of a spec that reads the file.
+        sharp: the folder with pictures of frames without noise, if they were asked for.
+    """
+
+    path: Path
+    truth: Path | None
+    info: StreamInfo
+    n_masked: int
+    source: Mapping[str, Any]
+    sharp: Path | None = None
+
+    def _repr_html_(self) -> str:
+        """Show what was written in a notebook."""
+        files = {"capture": self.path, "truth": self.truth, "frames without noise": self.sharp}
+        rows = [(name, str(path)) for name, path in files.items() if path]
+        return facts([*rows, ("frames", str(self.info)), ("source", str(dict(self.source)))])
+
+
+def lines_of_capture(written: WrittenCapture) -> Iterator[str]:
+    """Yield the lines that name the files that were written, and the spec that reads them."""
+    if written.n_masked:
+        mask = "mask them with `corrections`"
+        warn(f"{written.n_masked} pixels of the capture are masked, and {written.path} holds no mask; {mask}")
+    files = [(written.path, str(written.info)), (written.truth, "the truth: motion and scene")]
+    if written.sharp:
+        files.append((written.sharp, f"{counted(len(list(written.sharp.iterdir())), 'frame')} without noise"))
+    yield columns([[str(file), decimal(_size(file)), text] for file, text in files if file])
+    yield f"\nIn a spec in this folder:\n\nsource: {flow(dict(written.source))}"
+    held = ZipFile(written.truth).namelist() if written.truth else ()
+    for array, kind in (("homographies", "run"), ("camera_from_world", "run with `pose`")):
+        if f"{array}.npy" in held:
+            yield f"\nTo score a {kind} of it: photonpano evaluate RUN --truth {quote(str(written.truth))}"
+
+
+def _size(path: Path) -> int:
+    """Return the bytes of a file, or of the files in a folder."""
+    return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]))
+
+
+@command(
+    "recording/ cube.npy --with frame_rate_hz=96800",
+    lines_of_capture,
+    plan="capture",
+    notes=True,
+    output=typer.Argument(metavar="OUTPUT"),
+)
+def convert(
+    plan: Plan,
+    output: Path | str,
+    progress: Progress | None = None,
+    resumed: Callable[[int], object] | None = None,
+    *,
+    compress: bool = False,
+    catalog: Catalog | None = None,
+) -> WrittenCapture:
+    """Write a capture of binary frames to a packed .npy file, or to a zarr array.
+
+    Eight pixels are packed into a byte. The only corrections are those of the plan. When writing a .npy file is interrupted,
+    the frames written so far stay in OUTPUT.part; the next call compares them with the capture, and continues from there. A
+    zarr array is written whole or not at all.
+
+    Args:
+        plan: of the capture, from `capture_plan` or `load_spec`; its corrections are applied.
+        output: the .npy file, such as cube.npy; or a folder whose name ends as those that a source writes, such as cube.zarr.
+        progress: receives the stage; by default, bars in a notebook and nothing elsewhere.
+        resumed: called with the number of frames that OUTPUT.part holds, if there are any.
+        compress: compress the frames, in a format that can, such as zarr.
+        catalog: the sources that may write it; by default those of the installed plugins.
+
+    Raises:
+        InputError: the frames are not binary, or a correction changes sums of frames, which bits cannot hold.
+        OutputError: the file cannot be written, the disk is full, or OUTPUT.part is another file.
+    """
+    output = Path(output)
+    writer = writer_of(output, discover() if catalog is None else catalog)
+    if writer is None and compress:
+        raise OutputError(f"cannot compress {output}: packed .npy files are not compressed; name it {output.stem}.zarr")
+    part, progress = part_path(output), usual(progress)
+
+    def goes_on(n_frames: int) -> None:
+        progress.note(f"{part} holds {n_frames:,} frames of this capture: continuing from there")
+        if resumed is not None:
+            resumed(n_frames)
+
+    before = part.stat().st_mtime_ns if part.exists() else None
+    try:
+        with build_source(plan) as source:
+            return write_capture(source, plan, output, progress, goes_on, writer, compress)
+    finally:
+        if part.exists() and part.stat().st_mtime_ns != before:
+            progress.note(f"the frames written so far are in {part}; the same command continues from there")
+
+
+def writer_of(output: Path, catalog: Catalog) -> SourceContribution | None:
+    """Return the source that writes a folder of such a name; None for any other name."""
+    for entry in catalog.rows:
+        source = entry.contribution
+        if isinstance(source, SourceContribution) and source.write and output.suffix.lower() in source.suffixes:
+            return source
+    return None
+
+
+def write_capture(
+    source: Source,
+    plan: Plan,
+    output: Path,
+    progress: Progress | None,
+    resumed: Callable[[int], object] | None,
+    writer: SourceContribution | None = None,
+    compressed: bool = False,
+) -> WrittenCapture:
+    """Write the frames of a source to a packed file, or with the source that writes such folders."""
+    info, n_masked, threads = source.info, int((~source.valid).sum()), thread_count(plan.run.threads)
+    with usual(progress).stage(f"writing {output.name}", info.n_frames, "frames") as advance:
+        if writer is not None and (write := writer.write) is not None:
+            folder, *truth = write_folder(source, output, partial(write, compressed=compressed), advance, threads)
+            section = {"use": writer.name, "with": {"path": str(folder)}}
+            return WrittenCapture(folder, truth[0] if truth else None, info, n_masked, section)
+        path, *truth = write_packed(source, output, advance, threads, resumed)
+    keys: dict[str, Any] = {"path": str(path)}
+    if info.frame_rate_hz is not None:
+        keys["frame_rate_hz"] = info.frame_rate_hz
+    if info.width % 8:
+        keys["width"] = info.width
+    return WrittenCapture(path, truth[0] if truth else None, info, n_masked, {"use": "packed-npy", "with": keys})

@@ -1,0 +1,134 @@
+"""Score a run against the truth of its capture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from photonpano.api.command import command, json_lines, warn
+from photonpano.api.opened_run import opened_run
+from photonpano.context import Context, Progress, usual
+from photonpano.evaluation import Evaluation, ImageScore, PoseScore, evaluate_poses, has_poses
+from photonpano.evaluation import evaluate as evaluate_folder
+from photonpano.geometry import Canvas
+from photonpano.merging.colour import composed
+from photonpano.merging.panorama import render
+from photonpano.pipeline.components import build_renderer
+from photonpano.protocols import Trajectory
+from photonpano.registry import Catalog
+from photonpano.text import columns
+from photonpano.threads import thread_count
+from photonpano.values import Panorama
+
+_FEW = 0.1  # if a smaller share of the positions lies within 3 expected errors, poses and truth hardly belong together
+
+
+def _score(run_folder: Path, truth: Path, **how: Any) -> Evaluation | PoseScore:
+    """Score a panorama or poses, whichever the run has found."""
+    if not has_poses(run_folder):
+        return evaluate(run_folder, truth, **how)
+    score = evaluate_poses(run_folder, truth)
+    if score.honest_shares is not None and score.honest_shares[2] < _FEW:
+        warn(f"{100 * score.honest_shares[2]:.0f} % of the positions are within 3 std_position: is {truth} of this capture?")
+    return score
+
+
+def _lines(score: Evaluation | PoseScore, *, as_json: bool = False) -> Iterator[str]:
+    if as_json:
+        yield from json_lines(_data(score) if isinstance(score, Evaluation) else _pose_data(score))
+    else:
+        yield columns(score.rows())
+
+
+@command(
+    "runs/scan --truth cube.truth.npz",
+    _lines,
+    calls=_score,
+    truth=typer.Option(metavar="TRUTH.npz"),
+    oracle=typer.Option("--oracle/--no-oracle"),
+)
+def evaluate(
+    run_folder: Path | str,
+    truth: Path | str,
+    oracle: bool = True,
+    progress: Progress | None = None,
+    catalog: Catalog | None = None,
+) -> Evaluation:
+    """Score a run folder against the truth of its capture.
+
+    Corner errors are in px of a frame, over the located frames, after the best alignment of both reference planes. Those of
+    rotations are angles, after the best common rotation. PSNR and SSIM compare the panorama with the true scene, where it was
+    seen. The oracle is the panorama along the true motion.
+
+    Of a run with `pose`, positions are in m after the best similarity (ATE), and relative errors (RPE) over some frames.
+
+    Args:
+        run_folder: written by `run`.
+        truth: the `.truth.npz` that was simulated with the capture.
+        oracle: also render the capture along the true motion, and score that; opens the capture again.
+        progress: receives the stages of that; by default, bars in a notebook and nothing elsewhere.
+        catalog: what can be chosen; by default what the installed plugins offer.
+
+    Raises:
+        InputError: a file is missing or damaged, or run and truth are not of the same capture.
+    """
+    if not oracle:
+        return evaluate_folder(run_folder, truth)
+    with opened_run(Path(run_folder), catalog) as opened:
+
+        def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
+            source, plan = opened.source, opened.plan
+            context = Context(thread_count(plan.run.threads), usual(progress))
+            renderer = build_renderer(plan, source, [])
+            images = render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
+            return composed(images, source)
+
+        return evaluate_folder(run_folder, truth, along_truth)
+
+
+def _pose_data(score: PoseScore) -> dict[str, Any]:
+    return {
+        "ate_m": score.ate_m,
+        "ate_share": score.ate_share,
+        "rotation_deg": score.rotation_deg,
+        "turns_deg": score.turns_deg,
+        "rpe_frames": score.rpe_frames,
+        "rpe_m": score.rpe_m,
+        "rpe_deg": score.rpe_deg,
+        "located_share": score.located_share,
+        "within_std_shares": score.honest_shares,
+        "std_ratio": score.std_ratio,
+        "focal_error": score.focal_error,
+    }
+
+
+def _data(evaluation: Evaluation) -> dict[str, Any]:
+    motion = evaluation.trajectory
+    return {
+        "corner_error_px": {
+            "mean": motion.mean_px,
+            "median": motion.median_px,
+            "p95": motion.p95_px,
+            "max": motion.max_px,
+        },
+        "located_share": motion.located_share,
+        "within_three_std_share": evaluation.honest_share,
+        "rotation": _rotation(evaluation),
+        "panorama": _scores(evaluation.panorama),
+        "oracle": _scores(evaluation.oracle),
+        "below_oracle_db": evaluation.below_oracle_db,
+    }
+
+
+def _rotation(evaluation: Evaluation) -> dict[str, float] | None:
+    score = evaluation.rotation
+    if score is None:
+        return None
+    return {"mean_deg": score.mean_deg, "max_deg": score.max_deg, "focal_error": score.focal_error}
+
+
+def _scores(score: ImageScore | None) -> dict[str, float] | None:
+    return None if score is None else {"psnr_db": score.psnr_db, "ssim": score.ssim, "compared_share": score.compared_share}

@@ -1,0 +1,96 @@
+"""Write poses of a camera for other programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import typer
+
+from photonpano.api.command import command
+from photonpano.atomic import atomic_folder
+from photonpano.errors import InputError
+from photonpano.evaluation import RunPoses, RunTrajectory, has_poses, load_run_poses, load_run_trajectory
+from photonpano.poses import POSE_FORMATS, PoseFormat, Poses, centres
+from photonpano.record.contents import require_one_run
+from photonpano.record.run_json import read_record
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedPoses:
+    """Poses that were written.
+
+    Attributes:
+        files: their paths.
+        n_frames: frames with a pose.
+    """
+
+    files: tuple[Path, ...]
+    n_frames: int
+
+
+@command(
+    "runs/turn --format colmap --output poses",
+    lambda found: [f"{found.n_frames:,} poses in {', '.join(map(str, found.files))}"],
+    file_format=typer.Option("--format"),
+    every=typer.Option(min=1, metavar="N"),
+)
+def export(run_folder: Path | str, file_format: PoseFormat, output: Path | str, every: int = 1) -> ExportedPoses:
+    """Write the poses and the camera of a run for another program.
+
+    Needs a run with the model rotation, or with pose. Frames that were not located are left out.
+
+    Args:
+        run_folder: written by `run`, with the model `rotation` or with `pose`.
+        file_format: "colmap" (a text model), "nerfstudio" (transforms.json) or "tum" (times and quaternions).
+        output: a new folder.
+        every: 1 for all located frames, 2 for every other, and so on.
+
+    Raises:
+        InputError: the folder is no run folder, the run knows no rotations, or no frame is located; for "tum", the frame rate
+            of the capture is not known.
+        OutputError: the folder cannot be written, or is there already.
+        ValueError: the format is not known, or `every` is below 1.
+    """
+    if file_format not in POSE_FORMATS or every < 1:
+        raise ValueError(
+            f"file_format must be one of {', '.join(POSE_FORMATS)}, and every at least 1; got {file_format!r} and {every}"
+        )
+    folder, output = Path(run_folder), Path(output)
+    files = POSE_FORMATS[file_format](poses := _poses(folder, every, needs_seconds=file_format == "tum"))
+    with atomic_folder(output) as written:
+        for name, text in files.items():
+            (written / name).write_text(text, encoding="utf-8")
+    return ExportedPoses(tuple(output / name for name in files), len(poses.names))
+
+
+def _poses(folder: Path, every: int, needs_seconds: bool) -> Poses:
+    require_one_run(folder, ["trajectory.npz", "poses.npz"])
+    positions = None
+    run: RunPoses | RunTrajectory
+    if has_poses(folder):
+        run = load_run_poses(folder)
+        camera, positions = run.camera, centres(run.camera_from_world)
+        rotations = np.swapaxes(run.camera_from_world[:, :, :3], -1, -2)
+    else:
+        run = load_run_trajectory(folder, needs_std_px=False)
+        if run.turn is None:
+            raise InputError(
+                f"{folder} knows homographies, and no rotations of a camera; run its spec again with "
+                "--set motion.model=rotation"
+            )
+        camera, rotations = run.turn.camera, run.turn.rotations
+    frames = np.flatnonzero(run.located)[::every]
+    if not len(frames):
+        raise InputError(f"{folder}: the run located no frame, so that it has no poses")
+    rate = read_record(folder)["source"]["frame_rate_hz"]
+    if rate is None and needs_seconds:
+        raise InputError(
+            f"{folder} knows no frame rate, which the times of the format tum need; set source.with.frame_rate_hz and run "
+            "the spec again"
+        )
+    digits = len(str(len(run.located) - 1))
+    names = tuple(f"frame_{frame:0{digits}}.png" for frame in frames.tolist())
+    places = None if positions is None else positions[frames]
+    return Poses(camera, run.frame_shape, names, rotations[frames], frames / (rate or 1.0), places)

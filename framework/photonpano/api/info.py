@@ -1,0 +1,222 @@
+"""Print size, brightness and speed of a capture, and a spec."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from photonpano.api.command import command, json_lines, warn
+from photonpano.captures.obstacles import order_warning
+from photonpano.captures.summary import require_photons, saturated_share, summarise
+from photonpano.corrections import HotPixels, without_still_pixels
+from photonpano.errors import InputError
+from photonpano.notebooks import facts
+from photonpano.paths import Url
+from photonpano.pipeline.components import build_source, foreseen_decisions
+from photonpano.protocols import Source
+from photonpano.registry import Catalog
+from photonpano.registry.description import flow
+from photonpano.specs import Plan, parse_spec
+from photonpano.text import columns, duration
+from photonpano.threads import one_thread_inside, thread_count
+from photonpano.values import CaptureSummary, StreamInfo
+
+HOT_SHARE = 0.001  # share of hot pixels above which the warnings recommend a mask
+STANDING_SHARE = 0.5  # if more of the frame is static than this, `corrections: auto` masks nothing
+SATURATED_SHARE = 0.01  # share of pixels saturated in every frame above which the warnings recommend less light
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureInfo:
+    """What a capture is and what its frames show; `photonpano info --json` prints these fields.
+
+    Attributes:
+        source: the source that reads it.
+        reason: why this source was chosen; None if the spec names it.
+        n_frames: number of frames.
+        height: rows of a frame.
+        width: columns of a frame.
+        kind: "binary" or "intensity".
+        bit_depth: bits of a pixel.
+        frame_rate_hz: frames per second; None if unknown.
+        seconds: duration; None if the frame rate is unknown.
+        flux: mean flux, photons per pixel per frame.
+        speed_px: speed of the image where it is fast, px per frame; None if it cannot be measured.
+        speed_how: how the speed was measured, or why not.
+        unused_share: share of the pixels that are masked.
+        hot_share: share of the other pixels that the correction `hot-pixels` would mask.
+        still_share: share of them that the correction `still-pixels` would mask, as a run with `corrections: auto` does.
+        standing_share: share of the frame that stands still, of the parts that show motion or rest.
+        still_how: what stands still, or why nothing is masked.
+        saturated_share: share of them that have their highest value in every frame looked at.
+        group_size: frames of a group that `group_size: auto` chooses; None if the capture is too short.
+        group_size_reason: the reason for that choice.
+        warnings: what to correct before a run, a sentence each.
+        spec: a spec to start from, as plain data; its paths are relative to the current folder where they lie in it.
+    """
+
+    source: str
+    reason: str | None
+    n_frames: int
+    height: int
+    width: int
+    kind: Literal["binary", "intensity"]
+    bit_depth: int
+    frame_rate_hz: float | None
+    seconds: float | None
+    flux: float
+    speed_px: float | None
+    speed_how: str
+    unused_share: float
+    hot_share: float
+    still_share: float
+    standing_share: float
+    still_how: str
+    saturated_share: float
+    group_size: int | None
+    group_size_reason: str
+    warnings: tuple[str, ...]
+    spec: dict[str, Any]
+
+    @property
+    def stream(self) -> StreamInfo:
+        """Frames, size and rate as one value."""
+        return StreamInfo(self.n_frames, self.height, self.width, self.frame_rate_hz, self.kind, self.bit_depth)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return what was found, in words: pairs of a name and what it is."""
+        speed, size = self.speed_px, self.group_size
+        return [
+            ("source", self.source + (f" ({self.reason})" if self.reason else "")),
+            ("capture", str(self.stream)),
+            ("duration", "unknown without frame_rate_hz" if self.seconds is None else duration(self.seconds)),
+            ("flux", f"{self.flux:.3g} photons per pixel per frame"),
+            ("hot pixels", f"about {percent(self.hot_share)}" if self.hot_share else "none"),
+            ("still", self.still_how),
+            ("speed", self.speed_how if speed is None else f"{speed:.2g} px per frame ({self.speed_how})"),
+            ("group size", "unknown" if size is None else f"{size}: {self.group_size_reason}"),
+        ]
+
+    def _repr_html_(self) -> str:
+        """Show what was found, and the warnings, in a notebook."""
+        return facts([*self.rows(), *(("warning", each) for each in self.warnings)])
+
+
+def _lines(found: CaptureInfo, *, as_json: bool = False) -> Iterator[str]:
+    if as_json:
+        yield from json_lines(asdict(found))
+        return
+    yield columns(found.rows())
+    for warning in found.warnings:
+        warn(warning)
+    spec = "\n".join(f"{section}: {flow(value)}" for section, value in found.spec.items())
+    yield f"\nA spec to start from:\n\n{spec}"
+
+
+@command("cube.npy --with frame_rate_hz=96800", _lines, plan="capture")
+def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
+    """Summarise a capture: size, brightness and speed, and a spec to start from.
+
+    Reads some thousands of frames, spread over the capture.
+
+    Args:
+        plan: of the capture, from `capture_plan` or `load_spec`; its corrections are applied.
+        catalog: what can be chosen; by default what the installed plugins offer.
+
+    Raises:
+        InputError: the capture cannot be read.
+    """
+    with build_source(plan) as read:
+        marked = without_still_pixels(read)
+        source = marked if plan.corrects_itself else read
+        with one_thread_inside():
+            summary = summarise(source, thread_count(plan.run.threads))
+        stream, rate = source.info, source.info.frame_rate_hz
+        size, reason = _group_size(plan, source, summary, catalog)
+        with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as other:
+            hot = read.valid & ~other.valid
+        still = read.valid & ~marked.valid
+        decided = {each.what: each for each in marked.decisions}
+        found = CaptureInfo(
+            source=plan.source.contribution.name,
+            reason=next((decision.reason for decision in plan.decisions if decision.what == "source"), None),
+            n_frames=stream.n_frames,
+            height=stream.height,
+            width=stream.width,
+            kind=stream.kind,
+            bit_depth=stream.bit_depth,
+            frame_rate_hz=rate,
+            seconds=None if rate is None else stream.n_frames / rate,
+            flux=summary.flux,
+            speed_px=summary.speed_px,
+            speed_how=summary.how,
+            unused_share=1 - float(read.valid.mean()),
+            hot_share=float(hot[read.valid].mean()),
+            still_share=float(still[read.valid].mean()),
+            standing_share=float(decided["standing_share"].value) if "standing_share" in decided else 0.0,
+            still_how=decided["still_pixels"].reason if "still_pixels" in decided else "not measured",
+            saturated_share=saturated_share(source),
+            group_size=size,
+            group_size_reason=reason,
+            warnings=(),
+            spec=_spec(plan),
+        )
+        return replace(found, warnings=tuple(_warnings(source, found, float(hot[source.valid].mean()))))
+
+
+def percent(share: float) -> str:
+    """Write a share as a percentage of two digits."""
+    return f"{100 * share:.2g} %"
+
+
+def _group_size(plan: Plan, source: Source, summary: CaptureSummary, catalog: Catalog | None) -> tuple[int | None, str]:
+    """Return the group size that `auto` chooses, whatever the spec says, and the reason."""
+    source_section = {"use": plan.source.contribution.name, "with": plan.source.config.model_dump(by_alias=True)}
+    spec = {"version": 1, "source": source_section, "resample": {"use": "midpoint"}, "levels": 1}
+    try:
+        decisions = foreseen_decisions(parse_spec(spec, catalog=catalog), source, summary)
+    except InputError as error:
+        return None, str(error)
+    return next((int(each.value), each.reason) for each in decisions if each.what == "group_size")
+
+
+def _warnings(source: Source, found: CaptureInfo, hot_left: float) -> Iterator[str]:
+    try:
+        require_photons(source)
+    except InputError as error:
+        yield str(error)
+        return
+    if warning := order_warning(source):
+        yield warning
+    if hot_left > HOT_SHARE:
+        yield f"about {percent(hot_left)} of the pixels are hot; mask them with the correction hot-pixels"
+    if found.standing_share > STANDING_SHARE:
+        share = f"{found.standing_share:.0%}"
+        yield f"{share} of the frame stands still; if the camera moved, mask what is not the scene with the correction mask"
+    if found.saturated_share > SATURATED_SHARE:
+        share = percent(found.saturated_share)
+        yield f"{share} of the pixels have their highest value in every frame, so that their flux is unknown; expose less"
+    if found.group_size is None:
+        yield found.group_size_reason
+
+
+def _spec(plan: Plan) -> dict[str, Any]:
+    """Return the spec of the capture, without defaults."""
+    keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
+    spec = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
+    return spec | ({} if plan.corrects_itself else {"corrections": plan.document["corrections"]})
+
+
+def _relative(value: Any) -> Any:
+    """Return plain data with its paths relative to the current folder, where they lie in it."""
+    if isinstance(value, dict):
+        return {key: _relative(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_relative(item) for item in value]
+    if isinstance(value, Path):
+        return str(value.relative_to(Path.cwd()) if value.is_relative_to(Path.cwd()) else value)
+    if isinstance(value, Url):
+        return str(value)
+    return value

@@ -1,0 +1,1 @@
+"""List and describe the components of the installed plugins."""

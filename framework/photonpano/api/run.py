@@ -1,0 +1,161 @@
+"""Make a panorama from a spec."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import typer
+
+from photonpano.api.command import (
+    CHANGES,
+    SPEC,
+    DoubtfulError,
+    WrongArgumentError,
+    command,
+    logger,
+    require_trust,
+    verdict_line,
+    warn,
+)
+from photonpano.context import Progress
+from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
+from photonpano.pipeline.estimate import START
+from photonpano.pipeline.run import END_AFTER_S, RunResult, run
+from photonpano.record.schema import PanoramaRecord, RefinementRecord, RunRecord
+from photonpano.report import LiveFigures
+from photonpano.specs import load_spec
+from photonpano.text import byte_size, counted, duration
+
+
+def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
+    """Yield what a run has found, and where its files are."""
+    record, directory = result.record, result.directory.resolve()
+    _log(record)
+    if result.was_finished:
+        yield "finished  this run was finished before; nothing was left to do"
+    if result.followed is not None:
+        yield f"followed  {_delays(result.followed)}"
+    if result.verdict is not None:
+        yield verdict_line(result.verdict)
+    for warning in record["warnings"]:
+        warn(warning)
+    for decision in record["decisions"]:
+        if decision["what"] in (START, CUT, DARK_JUMP, REPEATED):
+            yield f"{decision['what']:<9} {decision['value']}: {decision['reason']}"
+    for refinement in record["refinements"]:
+        if refinement["rounds"]:
+            yield f"refined   {_correction(refinement)}"
+    if line := _range(record.get("panorama")):
+        yield f"range     {line}"
+    poses = record.get("poses")
+    if poses:
+        yield f"located   {poses['located']:,} of {counted(record['source']['n_frames'], 'frame')}"
+        yield f"poses     {directory / 'poses.npz'}"
+    else:
+        yield f"panorama  {directory / 'panorama.png'}"
+    if "report.html" in record["files"]:
+        yield f"report    {directory / 'report.html'}"
+    if strict and result.verdict is not None:
+        require_trust(result.verdict, "all files of the run folder are written")
+    if strict and poses and poses["doubts"]:
+        raise DoubtfulError("the poses are doubtful, and --strict accepts only trusted ones; all files of the run are written")
+
+
+@command(
+    "scan.yaml --output runs/first --set render.scale=2",
+    _lines,
+    notes="follow",
+    spec=SPEC,
+    changes=CHANGES,
+    from_level=typer.Option(metavar="N"),
+    end_after=typer.Option(metavar="SECONDS", min=0.1),
+)
+def _run(
+    spec: Path,
+    output: Path | None = None,
+    changes: Sequence[str] = (),
+    overwrite: bool = False,
+    resume: bool = False,
+    from_level: int | None = None,
+    keep_work: bool = False,
+    follow: bool = False,
+    end_after: float | None = None,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Make a panorama from a spec.
+
+    Writes the run folder: panorama.png to look at, panorama.tiff with linear flux, coverage.tiff, trajectory.npz, run.json
+    (settings, versions, results) and report.html. The verdict says whether motion and panorama explain the photons.
+    A spec with `pose` finds the poses of a camera instead: poses.npz, and files of other programs.
+
+    Args:
+        spec: a YAML file.
+        output: the run folder, instead of the spec's output.directory.
+        changes: overrides of values of the spec, such as run.seed=1.
+        overwrite: as in `run`.
+        resume: go on with a run of this spec that was interrupted.
+        from_level: take the levels before N from the run before, whose work was kept, and compute N and what follows.
+        keep_work: keep what each level has found, for --from-level, in the folder DIR.work.
+        follow: follow a capture that is still being written, or comes on standard input: locate its frames as they arrive, and
+            write a page with the picture so far, DIR.live/live.html. Run the whole once it is complete.
+        end_after: with --follow, a growing file is complete when nothing has come for this time; by default 5.
+        progress: receives stages and messages.
+
+    Raises:
+        WrongArgumentError: options exclude each other.
+    """
+    if resume and from_level is not None:
+        raise WrongArgumentError("--resume and --from-level: give one of them")
+    if follow and (resume or from_level is not None):
+        raise WrongArgumentError(
+            "--follow begins a new run, which --resume and --from-level do not; to go on with frames that have arrived, leave "
+            "out --follow"
+        )
+    if end_after is not None and not follow:
+        raise WrongArgumentError("--end-after says when a capture that is followed is complete; give --follow as well")
+    return run(
+        load_spec(spec, changes, output, arriving=follow),
+        progress,
+        overwrite=overwrite,
+        resume=resume,
+        from_level=from_level,
+        keep_work=keep_work,
+        follow=follow,
+        end_after=END_AFTER_S if end_after is None else end_after,
+    )
+
+
+def _log(record: RunRecord) -> None:
+    """Log each decision of a run with its reason, and what the run took."""
+    for each in record["decisions"]:
+        logger.info("%s %s: %s", each["what"], each["value"], each["reason"])
+    if logger.isEnabledFor(logging.INFO):
+        memory = record["peak_memory_bytes"]
+        logger.info("took %s%s", duration(record["seconds"]), f" and at most {byte_size(memory)} of memory" if memory else "")
+
+
+def _delays(figures: LiveFigures) -> str:
+    """Describe how fast frames were located."""
+    text = f"{figures.located:,} of {counted(figures.frames, 'frame')} were located as they arrived"
+    if figures.delay_mean_s is None or figures.delay_longest_s is None:
+        return text
+    return f"{text}, {duration(figures.delay_mean_s)} later on average and {duration(figures.delay_longest_s)} at most"
+
+
+def _range(panorama: PanoramaRecord | None) -> str:
+    """Describe the dynamic range of a panorama; empty where nothing exceeds its noise."""
+    if panorama is None:
+        return ""
+    decibels, measurable = panorama.get("dynamic_range_db"), panorama.get("measurable_range_db")
+    if decibels is None or measurable is None:
+        return ""
+    share = panorama.get("saturated_share", 0.0)
+    saturated = f"; {100 * share:.2g} % of the pixels are saturated" if share else ""
+    return f"{decibels:.0f} dB, of {measurable:.0f} dB that the frames over a pixel can measure{saturated}"
+
+
+def _correction(refinement: RefinementRecord) -> str:
+    """Describe a correction by its first round, which is the largest."""
+    return f"{refinement['change_px']:.2g} px on average by {refinement['use']}: {refinement['rounds'][0]}"

@@ -1,0 +1,31 @@
+"""Print the JSON Schema of specs, for editors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import typer
+
+from photonpano.api.command import command
+from photonpano.atomic import atomic_path
+from photonpano.registry import discover
+from photonpano.specs import json_schema
+
+
+@command("--output photonpano.schema.json", lambda line: [line], output=typer.Option("--output", "-o", metavar="FILE"))
+def schema(output: Path | None = None) -> str:
+    """Print the JSON Schema of specs, for editors.
+
+    The schema holds the keys of all installed plugins. Editors with a YAML language server complete and check specs whose first
+    line is '# yaml-language-server: $schema=FILE'.
+
+    Args:
+        output: write the schema to a file instead of printing it.
+    """
+    text = json.dumps(json_schema(discover()), indent=2, ensure_ascii=False)
+    if output is None:
+        return text
+    with atomic_path(output) as temporary:
+        temporary.write_text(f"{text}\n", encoding="utf-8")
+    return str(output)
