@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
+from photonpano.capture import seen_through
 from photonpano.context import Context
 from photonpano.corrections import Vignette
 from photonpano.motion.frame_motion import FrameMotion, motion_of_frames
@@ -16,7 +17,6 @@ from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.timeline import Timeline
 from photonpano.protocols import Source, Trajectory, camera_of_motion
 from photonpano.residuals.refinement import MotionFit
-from photonpano.source_wrapper import seen_through
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Light
 
