@@ -126,7 +126,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     def simulated(**changes: Any) -> Path:
         shake = {"rms_px": 3, "frequencies_hz": [300, 400, 600]}
         settings = {
-            "scene": {"kind": "street", "width": 1024, "height": 682},
+            "scene": {"kind": "street", "width": 1024, "height": 682, "seed": 1},
             "path": {"kind": "pan", "length_px": 60, "angle_deg": 10, "shake": shake},
             "n_frames": 300,
             "frame_shape": [128, 160],

@@ -14,7 +14,7 @@ from photonpano.pipeline.run import RunResult
 
 FOCAL_PX = 163.0
 SIMULATED: dict[str, Any] = {
-    "scene": {"kind": "street", "width": 1024, "height": 512},
+    "scene": {"kind": "street", "width": 1024, "height": 512, "seed": 2},
     "path": {"kind": "turn", "degrees": 100, "pitch_wobble_deg": 3, "roll_wobble_deg": 2},
     "frame_shape": [96, 160],
     "focal_length_px": FOCAL_PX,

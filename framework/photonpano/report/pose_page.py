@@ -23,9 +23,8 @@ def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
     shape = record["source"]["height"], record["source"]["width"]
     return filled(
         "poses.html",
-        **head_of(record),
+        **(head_of(record) | {"warnings": [each for each in record["warnings"] if not each.startswith(DOUBTFUL)]}),
         poses=record["poses"],
-        warnings=[each for each in record["warnings"] if not each.startswith(DOUBTFUL)],
         path_views=path_views(estimate, shape),
         scene_views=scene_views(estimate, shape) if len(estimate.points.positions) else (),
         errors_over_time=errors_over_time(estimate, record["source"]["frame_rate_hz"]),

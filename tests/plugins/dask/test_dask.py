@@ -6,7 +6,7 @@ import os
 import signal
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +30,16 @@ FILES = "trajectory.npz", "panorama.tiff"
 CONTEXT = ExecutorContext(2, CaptureElsewhere(None, lambda: None), {"photonpano": "0.1.0", "numpy": "2.4.6"}, dict)
 
 
+def worker_pids() -> list[int]:
+    """Return the processes of the workers; children of other tests may end meanwhile."""
+    found = []
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            if "spawn_main" in str(child.cmdline()):
+                found.append(child.pid)
+    return found
+
+
 class Killing(Quiet):
     """Kills a worker in the middle of each of some stages."""
 
@@ -43,8 +53,7 @@ class Killing(Quiet):
         def advance(_: int) -> None:
             if title in self.stages:
                 self.stages.remove(title)
-                processes = [each for each in psutil.Process().children(recursive=True) if "spawn_main" in str(each.cmdline())]
-                os.kill(processes[0].pid, signal.SIGKILL)
+                os.kill(worker_pids()[0], signal.SIGKILL)
                 self.killed.append(title)
 
         yield advance
