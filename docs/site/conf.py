@@ -63,8 +63,14 @@ def sections() -> Iterator[tuple[str, list[str]]]:
     for caption, items in re.findall(
         r"^##+ ([^\n]+)\n\n(?:\w[^\n]*\n\n)?((?:- .*\n)+)", INDEX.read_text(encoding="utf-8"), re.MULTILINE
     ):
-        pages = [f"docs/{name}" for name in re.findall(r"^- \[[^\]]*\]\(([^)]+)\.(?:md|ipynb)\)", items, re.MULTILINE)]
+        names = re.findall(r"^- \[[^\]]*\]\(([^)]+)\.(?:md|ipynb)\)", items, re.MULTILINE)
+        pages = [page for name in names for page in (f"docs/{name}", *parts_of(f"docs/{name}"))]
         yield caption, pages + SITE_ONLY.get(caption, [])
+
+
+def parts_of(page: str) -> list[str]:
+    """Return the pages that a page is divided into: those in the folder of its name."""
+    return sorted(path.with_suffix("").relative_to(ROOT).as_posix() for path in (ROOT / page).glob("*.md"))
 
 
 def contents() -> Iterator[str]:
