@@ -90,7 +90,7 @@ def test_same_bytes_and_decisions_as_on_threads_though_workers_are_killed(spec: 
         assert (tmp_path / "dask" / name).read_bytes() == (tmp_path / "threads" / name).read_bytes()
     assert there.record["decisions"] == here.record["decisions"]
     assert [each["what"] for each in here.record["decisions"]].count("chunk_frames") == 1
-    assert not [each for each in psutil.Process().children(recursive=True) if "spawn_main" in str(each.cmdline())]
+    assert not worker_pids()
 
 
 def test_what_is_shared_may_be_large_without_a_warning() -> None:
