@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 QUICK = {
     "source.with.path": {"kind": "random-spline", "length_px": 60, "shake": {"rms_px": 1.5, "frequencies_hz": [450, 800]}},
-    "source.with.scene": {"kind": "street", "width": 512, "height": 341, "seed": 1},
+    "source.with.scene": {"kind": "street", "width": 512, "height": 341, "seed": 3},
     "source.with.n_frames": 1200,
     "source.with.frame_shape": [96, 128],
     "source.with.flux": 0.5,
