@@ -14,10 +14,10 @@ from photonpano.geometry import Canvas
 from photonpano.merging.chunks import Chunk
 from photonpano.merging.footprints import Footprint, footprints_of
 from photonpano.merging.light import LightTerms, LitFrames
-from photonpano.merging.warping import Grid, add_footprint, add_remapped, add_running_sums, add_warped, average_squares, padded
+from photonpano.merging.warping import Grid, Texture, add_warped, average_squares
 from photonpano.protocols import Source
 from photonpano.threads import InOrder
-from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, Homography, Response
+from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
 
 _RUN = 64  # chunks that are summed on a part of the grid of their own. It does not depend on the threads, for sums are rounded
 _BLOCK = 4096  # chunks whose footprints are known at a time
@@ -164,11 +164,17 @@ def _sum_on(
     """Return the counts and the coverages of a canvas: (H, W) and (P, H, W)."""
     masked = weights_of(source)
     corrected = source.corrected if source.corrects_sums else None
-    total = _Total.zeros(canvas, 1 if terms is None else terms.number)
+    grid, seen_by = Grid.zeros(canvas, 1 if terms is None else terms.number), _Seen(source.info.frame_shape, masked)
     for chunk, footprint in visible:
-        total.add(_summed(counts_of, corrected, masked, terms, chunk, footprint))
+        amounts = np.array([float(len(chunk.span))]) if terms is None else terms.amounts(chunk.span)
+        raw = counts_of(chunk.span)
+        counts: FluxImage | Counts = raw if corrected is None else corrected(raw, len(chunk.span))
+        if masked is not None:
+            counts = np.asarray(counts * masked, np.float32)
+        shrunk = average_squares(np.ascontiguousarray(counts), footprint.shrink)
+        add_warped(Texture.of(shrunk), seen_by(footprint.shrink), amounts, footprint, grid)
         advance(len(chunk.span))
-    return total.result()
+    return grid.total, grid.coverages
 
 
 def weights_of(source: Source) -> FluxImage | None:
@@ -179,90 +185,20 @@ def weights_of(source: Source) -> FluxImage | None:
     return None if capture.valid.all() else capture.valid.astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Summed:
-    """The sum of the frames of a chunk, with its footprint.
+class _Seen:
+    """The share of each pixel that is seen, averaged over squares: the same for all chunks."""
 
-    Attributes:
-        footprint: where it lies on the grid.
-        amounts: (P,) what each pixel adds to the coverages: the number of frames, and in changing light terms of their gains.
-        counts: (h, w) float32 or uint32; `padded` if it is remapped.
-        seen: (h, w) float32, the share of each pixel that was seen; None if it is 1 for all.
-    """
+    def __init__(self, frame_shape: tuple[int, int], masked: FluxImage | None) -> None:
+        self._frame_shape, self._masked = frame_shape, masked
+        self._textures: dict[int, Texture | None] = {}
 
-    footprint: Footprint
-    amounts: FloatArray
-    counts: FluxImage | Counts
-    seen: FluxImage | None
-
-
-def _summed(
-    counts_of: Callable[[FrameSpan], Counts],
-    corrected: Callable[[Counts, int], FluxImage] | None,
-    masked: FluxImage | None,
-    terms: LightTerms | None,
-    chunk: Chunk,
-    footprint: Footprint,
-) -> _Summed:
-    n_frames, shrink = len(chunk.span), footprint.shrink
-    amounts = np.array([float(n_frames)]) if terms is None else terms.amounts(chunk.span)
-    raw, seen = counts_of(chunk.span), masked
-    counts: FluxImage | Counts = np.ascontiguousarray(raw)
-    if corrected is not None:
-        counts = np.ascontiguousarray(corrected(raw, n_frames))
-    if masked is not None:
-        counts = np.asarray(counts.astype(np.float32) * masked, np.float32)
-    elif any(side % shrink for side in counts.shape):
-        seen = np.ones(counts.shape, np.float32)
-    if shrink > 1:
-        counts, seen = average_squares(counts, shrink), None if seen is None else average_squares(seen, shrink)
-    if not footprint.straight:
-        counts, seen = padded(counts), None if seen is None else padded(seen)
-    return _Summed(footprint, amounts, counts, seen)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Total:
-    """The sums of a grid.
-
-    Attributes:
-        grid: the sums, with coverages from the borders of frames and from masked frames.
-        steps: (P, H, W + 1) float32, row-wise differences of the coverages inside of frames; `result` adds their cumulative
-            sums to the coverages.
-    """
-
-    grid: Grid
-    steps: FluxImage
-
-    @classmethod
-    def zeros(cls, canvas: Canvas, number: int) -> _Total:
-        return cls(Grid.zeros(canvas, number), np.zeros((number, canvas.height, canvas.width + 1), np.float32))
-
-    def add(self, each: _Summed) -> None:
-        """Add the sum of a chunk."""
-        to_image, coverages = each.footprint.to_image, self.grid.coverages
-        if not each.footprint.straight:
-            add_remapped(np.asarray(each.counts, np.float32), each.seen, each.amounts, each.footprint, self.grid)
-            return
-        if each.seen is None:
-            for amount, coverage, steps in zip(each.amounts, coverages, self.steps, strict=True):
-                if amount:
-                    add_footprint(each.counts.shape, to_image, float(amount), steps, coverage)
-        elif len(each.amounts) == 1:
-            add_warped(each.seen * np.float32(each.amounts[0]), to_image, coverages[0])
-        else:
-            seen = np.zeros_like(self.grid.total)
-            add_warped(each.seen, to_image, seen)
-            for amount, coverage in zip(each.amounts, coverages, strict=True):
-                if amount:
-                    coverage += np.float32(amount) * seen
-        add_warped(each.counts, to_image, self.grid.total)
-
-    def result(self) -> tuple[FluxImage, FluxImage]:
-        """Return the counts, (H, W), and the coverages, (P, H, W)."""
-        for steps, coverage in zip(self.steps, self.grid.coverages, strict=True):
-            add_running_sums(steps, coverage)
-        return self.grid.total, self.grid.coverages
+    def __call__(self, shrink: int) -> Texture | None:
+        """Return it for squares of `shrink` pixels a side; None if it is 1 for all."""
+        if shrink not in self._textures:
+            whole = self._masked is None and not any(side % shrink for side in self._frame_shape)
+            share = np.ones(self._frame_shape, np.float32) if self._masked is None else self._masked
+            self._textures[shrink] = None if whole else Texture.of(average_squares(share, shrink))
+        return self._textures[shrink]
 
 
 def divided(length: int, parts: int) -> list[range]:

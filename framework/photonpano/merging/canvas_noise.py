@@ -11,7 +11,7 @@ from photonpano.capture import Capture, capture_of
 from photonpano.geometry import Camera, Canvas, rescaling
 from photonpano.merging.averaging import Averaging
 from photonpano.merging.footprints import footprints_of
-from photonpano.merging.warping import Grid, add_remapped, average_squares, padded
+from photonpano.merging.warping import Grid, Texture, add_warped, average_squares
 from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
 from photonpano.protocols import Source, Trajectory
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Response
@@ -141,10 +141,10 @@ def laid(
     sums, share = np.zeros((len(images), *canvas.shape), np.float32), np.zeros((1, *canvas.shape), np.float32)
     grid, once, never = Grid.zeros(canvas, 1)._replace(coverages=share), np.ones(1), np.zeros(1)
     for at in footprints_of(canvas, camera, homographies, (valid.shape[0], valid.shape[1])):
-        known = padded(average_squares(valid.astype(np.float32), at.shrink))
+        known = Texture.of(average_squares(valid.astype(np.float32), at.shrink))
         for number, (image, total) in enumerate(zip(images, sums, strict=True)):
-            counts = padded(average_squares(np.where(valid, image, np.float32(0)), at.shrink))
-            add_remapped(counts, known, never if number else once, at, grid._replace(total=total))
+            counts = Texture.of(average_squares(np.where(valid, image, np.float32(0)), at.shrink))
+            add_warped(counts, known, never if number else once, at, grid._replace(total=total))
     return sums, share[0]
 
 

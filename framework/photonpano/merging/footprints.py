@@ -10,7 +10,6 @@ import numpy as np
 from photonpano.geometry import Camera, Canvas, corners, inverse, outline_of, rescaling, transform_points
 from photonpano.values import FloatArray, Homography
 
-_LONG_RUN_PX = 96  # from this length of runs on, the warp along runs is faster than the remap pixel by pixel
 _NEAR_POLE = np.radians(75)  # a frame that comes this near to a pole may touch any column
 _WIDEST = 100.0  # largest radius, in focal lengths, that a lens images
 
@@ -46,8 +45,6 @@ class Footprint:
         rows: rows of the grid that the frame may touch; empty if it lies outside.
         columns: columns that it may touch; two ranges where it crosses the seam of a full turn, none where it lies outside.
         lens: from ideal coordinates to pixels of the averaged frame.
-        straight: `to_image` is a homography that hardly rotates or scales, so that neighbours on a row of the grid lie at
-            neighbours of the frame.
     """
 
     shrink: int
@@ -55,7 +52,6 @@ class Footprint:
     rows: range
     columns: tuple[range, ...]
     lens: Lens = NO_LENS
-    straight: bool = False
 
 
 def by_homographies(canvas: Canvas, camera: Camera | None, homographies: FloatArray, frame_shape: tuple[int, int]) -> bool:
@@ -88,10 +84,9 @@ def footprints_of(
     outlines = np.array([corners(_shrunk(frame_shape, factor)) for factor in shrink]).reshape(-1, 4, 2)
     low, high = _touched(transform_points(to_grid, outlines), canvas.shape)
     to_image = inverse(to_grid)
-    straight = _run_px(to_image, low, high) >= _LONG_RUN_PX
     return [
-        Footprint(factor, back, range(y0, y1), (range(x0, x1),) if x0 < x1 else (), straight=bool(flag))
-        for factor, back, (x0, y0), (x1, y1), flag in zip(shrink, to_image, low.tolist(), high.tolist(), straight, strict=True)
+        Footprint(factor, back, range(y0, y1), (range(x0, x1),) if x0 < x1 else ())
+        for factor, back, (x0, y0), (x1, y1) in zip(shrink, to_image, low.tolist(), high.tolist(), strict=True)
     ]
 
 
@@ -210,13 +205,3 @@ def _touched(outline: FloatArray, grid_shape: tuple[int, int]) -> tuple[np.ndarr
     low = np.clip(np.floor(outline.min(axis=1)) - 1, 0, size)
     high = np.clip(np.ceil(outline.max(axis=1)) + 2, low, size)
     return low.astype(int), high.astype(int)
-
-
-def _run_px(to_image: FloatArray, low: np.ndarray, high: np.ndarray) -> FloatArray:
-    """Return the length of runs along a row on which each step of a pixel is one of the frame, at each frame's worst corner."""
-    x, y = np.stack([low, high], axis=-1).transpose(1, 0, 2)
-    places = np.stack([x[:, [0, 0, 1, 1]], y[:, [0, 1, 0, 1]], np.ones((len(x), 4))], axis=1)
-    u, v, depth = (to_image @ places).transpose(1, 0, 2)
-    along = to_image[:, 2, 0, None] / depth**2
-    across = np.abs(to_image[:, 0, 0, None] / depth - u * along - 1), np.abs(to_image[:, 1, 0, None] / depth - v * along)
-    return np.asarray(1 / np.maximum(np.maximum(*across), 1e-9).max(axis=1))

@@ -1,8 +1,7 @@
-"""Add bilinear warps of images to a grid. Compiled.
+"""Add bilinear warps of images to a grid: onto planes, cylinders and spheres, and through a lens. Compiled.
 
-`add_warped` is for homographies that hardly rotate: it is vectorised along runs of pixels whose neighbours lie at neighbours of
-the image. `add_remapped` is for any other warp: onto a cylinder or a sphere, or through a lens. A pixel of the grid goes to a
-ray, through the motion and the lens to a pixel of a frame, and is interpolated there, once.
+A pixel of the grid goes to a ray, through the motion and the lens to a pixel of a frame, and is interpolated there, once. Each
+row takes three loops that the compiler vectorises: places in the image, one word of memory for each place, and interpolation.
 """
 
 from __future__ import annotations
@@ -14,72 +13,61 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 from photonpano.geometry import Canvas
-from photonpano.geometry.sampling import Pixels, run_from, sample_run, visible_columns
+from photonpano.geometry.sampling import Pixels
 from photonpano.merging.footprints import Footprint, Lens
-from photonpano.values import FloatArray, FluxImage
+from photonpano.values import FloatArray
 
-# Zeros before and after the rows and columns of an image that is remapped, so that it is interpolated at its border as well.
-_PADDING = 1, 2
+_LEVELS = 65535  # highest level of a texture
+_BEHIND = 1e-6  # rays with less depth than this are behind the camera
 
 
-@compiled
-def add_warped(image: Pixels, to_image: NDArray[np.float64], total: NDArray[np.float32]) -> None:
-    """Add an image to a grid, interpolated bilinearly; the image is 0 outside of its border.
+class Texture(NamedTuple):
+    """An image made ready for interpolation: a place takes one word of memory instead of four pixels.
 
-    Args:
-        image: (h, w) float32 or uint32.
-        to_image: (3, 3), pixels of the grid to pixels of the image.
-        total: (H, W) the grid.
+    Attributes:
+        texels: (h + 1, w + 1) uint64. That at (x, y) holds the pixels (x - 1, y - 1), (x, y - 1), (x - 1, y) and (x, y), the
+            first in its lowest bits, as levels of 16 bits; pixels outside of the image are 0.
+        scale: value of a level, a power of two. Whole numbers up to 65,535 are exact, others to 1 / 65,535 of their range.
+        zero: level of 0.
     """
-    sampled = np.empty(total.shape[1], np.float32)
-    for y in range(total.shape[0]):
-        row = total[y]
-        first, inside, outside, last = _parts(image.shape, to_image, y, total.shape[1])
-        for x in range(first, inside):
-            row[x] += _at(image, to_image, x, y)
-        for x in range(outside, last):
-            row[x] += _at(image, to_image, x, y)
-        x = inside
-        while x < outside:
-            run = run_from(to_image, x, y, outside - x, image.shape[0], image.shape[1])
-            sample_run(image, run, sampled[x : x + run.size])
-            x += run.size
-        totals, values = row[inside:outside], sampled[inside:outside]
-        for t in range(len(totals)):
-            totals[t] += values[t]
+
+    texels: NDArray[np.uint64]
+    scale: float
+    zero: float
+
+    @classmethod
+    def of(cls, image: Pixels) -> Texture:
+        """Return the texture of an (h, w) image of finite values."""
+        low, high = min(0.0, float(image.min(initial=0))), float(image.max(initial=0))
+        scale = 2.0 ** np.ceil(np.log2((high - low) / _LEVELS)) if high > low else 1.0
+        zero = np.ceil(-low / scale)
+        texels = np.empty((image.shape[0] + 1, image.shape[1] + 1), np.uint64)
+        _fill(texels, image, 1 / scale, zero)
+        return cls(texels, scale, zero)
 
 
 @compiled
-def add_footprint(
-    shape: tuple[int, int], to_image: NDArray[np.float64], value: float, steps: NDArray[np.float32], total: NDArray[np.float32]
-) -> None:
-    """Add what `add_warped` adds for an image of one value, but compute pixels at its border only.
-
-    Args:
-        shape: (h, w) of the image.
-        to_image: (3, 3), pixels of the grid to pixels of the image.
-        value: value of every pixel.
-        steps: (H, W + 1), row-wise differences; add their cumulative sums to `total` with `add_running_sums` in the end.
-        total: (H, W) the grid.
-    """
-    for y in range(total.shape[0]):
-        first, inside, outside, last = _parts(shape, to_image, y, total.shape[1])
-        steps[y, inside] += value
-        steps[y, outside] -= value
-        for x in range(first, inside):
-            total[y, x] += value * _coverage(shape, to_image, x, y)
-        for x in range(outside, last):
-            total[y, x] += value * _coverage(shape, to_image, x, y)
-
-
-@compiled
-def add_running_sums(steps: NDArray[np.float32], total: NDArray[np.float32]) -> None:
-    """Add the cumulative sums of `steps` along each row; see `add_footprint`."""
-    for y in range(total.shape[0]):
-        running, row, step = 0.0, total[y], steps[y]
-        for x in range(len(row)):
-            running += step[x]
-            row[x] += np.float32(running)
+def _fill(texels: NDArray[np.uint64], image: Pixels, levels: float, zero: float) -> None:
+    """Fill the texels of an image; `levels` is their number in 1."""
+    height, width = image.shape
+    above, here = np.empty(width + 2, np.uint64), np.empty(width + 2, np.uint64)
+    above[:] = np.uint64(zero)
+    here[0] = here[width + 1] = np.uint64(zero)
+    factor, rounded = np.float32(levels), np.float32(zero + 0.5)
+    for y in range(height + 1):
+        if y < height:
+            row, inner = image[y], here[1 : width + 1]
+            for x in range(width):
+                level = min(np.float32(row[x]) * factor + rounded, np.float32(_LEVELS))
+                inner[x] = np.uint64(np.uint32(np.int32(level)))
+        else:
+            here[:] = np.uint64(zero)
+        into = texels[y]
+        for x in range(width + 1):
+            upper = above[x] | (above[x + 1] << np.uint64(16))
+            into[x] = upper | (here[x] << np.uint64(32)) | (here[x + 1] << np.uint64(48))
+        above, here = here, above
+        here[0] = here[width + 1] = np.uint64(zero)
 
 
 def average_squares(image: Pixels, side: int) -> NDArray[np.float32]:
@@ -108,16 +96,20 @@ class Grid(NamedTuple):
     """Sums on a grid, and the rays of its pixels: see `Canvas`.
 
     Attributes:
-        p: (W,) of the columns.
-        s: (W,) of the columns.
+        p: (W,) of the columns, relative to that of the middle one, for float32 is not exact enough for thousands of pixels.
+        s: (W,) of the columns, likewise.
+        p0: of the middle column.
+        s0: of the middle column.
         q: (H,) of the rows.
         r: (H,) of the rows.
         total: (H, W) float32 sums of counts.
         coverages: (P, H, W) float32 sums of what was seen.
     """
 
-    p: NDArray[np.float64]
-    s: NDArray[np.float64]
+    p: NDArray[np.float32]
+    s: NDArray[np.float32]
+    p0: float
+    s0: float
     q: NDArray[np.float64]
     r: NDArray[np.float64]
     total: NDArray[np.float32]
@@ -126,45 +118,43 @@ class Grid(NamedTuple):
     @classmethod
     def zeros(cls, canvas: Canvas, number: int) -> Grid:
         """Return no sums on a canvas, with some coverages."""
+        (p, s), middle = canvas.columns(), canvas.width // 2
+        p0, s0 = float(p[middle]), float(s[middle])
         coverages = np.zeros((number, *canvas.shape), np.float32)
-        return cls(*canvas.columns(), *canvas.rows(), np.zeros(canvas.shape, np.float32), coverages)
+        columns = (p - p0).astype(np.float32), (s - s0).astype(np.float32)
+        return cls(*columns, p0, s0, *canvas.rows(), np.zeros(canvas.shape, np.float32), coverages)
 
     def parts(self, footprint: Footprint) -> list[Grid]:
         """Return views of the parts that a frame may touch."""
         down, boxes = slice(footprint.rows.start, footprint.rows.stop), footprint.columns if footprint.rows else ()
         across = [slice(columns.start, columns.stop) for columns in boxes]
-        p, s, q, r, total, coverages = self
-        return [Grid(p[x], s[x], q[down], r[down], total[down, x], coverages[:, down, x]) for x in across]
+        rows = self._replace(q=self.q[down], r=self.r[down])
+        return [
+            rows._replace(p=self.p[x], s=self.s[x], total=self.total[down, x], coverages=self.coverages[:, down, x])
+            for x in across
+        ]
 
 
-def padded(image: NDArray[np.generic]) -> FluxImage:
-    """Return an image as `add_remapped` takes it: float32, with zeros around it."""
-    before, after = _PADDING
-    found = np.zeros((image.shape[0] + before + after, image.shape[1] + before + after), np.float32)
-    found[before : before + image.shape[0], before : before + image.shape[1]] = image
-    return found
-
-
-def add_remapped(counts: FluxImage, seen: FluxImage | None, amounts: FloatArray, footprint: Footprint, grid: Grid) -> None:
+def add_warped(counts: Texture, seen: Texture | None, amounts: FloatArray, footprint: Footprint, grid: Grid) -> None:
     """Add an image to a grid, and its share of each pixel to coverages, both interpolated bilinearly.
 
     Args:
-        counts: the image, from `padded`.
-        seen: share of each of its pixels, from `padded`; None if it is 1.
+        counts: the image.
+        seen: share of each of its pixels; None if it is 1.
         amounts: (P,) factors of the share.
         footprint: of the frame on the grid.
         grid: added to.
     """
-    shares = np.zeros((0, 0), np.float32) if seen is None else seen
     for part in grid.parts(footprint):
-        _add_remapped(counts, shares, amounts, np.ascontiguousarray(footprint.to_image), footprint.lens, part)
+        to_image = np.ascontiguousarray(footprint.to_image)
+        _add_warped(counts, counts if seen is None else seen, seen is None, amounts, to_image, footprint.lens, part)
 
 
 @compiled
 def image_row(
     matrix: NDArray[np.float64], lens: Lens, grid: Grid, row: int, u: NDArray[np.float32], v: NDArray[np.float32]
 ) -> None:
-    """Map a row of a grid to pixels of an image.
+    """Map a row of a grid to pixels of an image, to about 1e-6 of its size.
 
     Args:
         matrix: (3, 3), rays to homogeneous ideal coordinates.
@@ -174,121 +164,123 @@ def image_row(
         u: (W,) output, x; -9 behind the camera and beyond the lens.
         v: (W,) output, y.
     """
-    p, s, q, r = grid.p, grid.s, grid.q[row], grid.r[row]
-    m00, m01, m02 = matrix[0, 0] * r, matrix[0, 1] * q, matrix[0, 2] * r
-    m10, m11, m12 = matrix[1, 0] * r, matrix[1, 1] * q, matrix[1, 2] * r
-    m20, m21, m22 = matrix[2, 0] * r, matrix[2, 1] * q, matrix[2, 2] * r
-    k1, k2, p1, p2, limit = lens.k1, lens.k2, lens.p1, lens.p2, lens.limit
-    focal_x, focal_y, x0, y0 = lens.focal_x, lens.focal_y, lens.x, lens.y
-    if limit == np.inf:
+    p, s, q, r, p0, s0 = grid.p, grid.s, grid.q[row], grid.r[row], grid.p0, grid.s0
+    x0, y0, z0 = np.float32(matrix[0, 0] * r), np.float32(matrix[1, 0] * r), np.float32(matrix[2, 0] * r)
+    x1 = np.float32(matrix[0, 0] * r * p0 + matrix[0, 1] * q + matrix[0, 2] * r * s0)
+    y1 = np.float32(matrix[1, 0] * r * p0 + matrix[1, 1] * q + matrix[1, 2] * r * s0)
+    z1 = np.float32(matrix[2, 0] * r * p0 + matrix[2, 1] * q + matrix[2, 2] * r * s0)
+    x2, y2, z2 = np.float32(matrix[0, 2] * r), np.float32(matrix[1, 2] * r), np.float32(matrix[2, 2] * r)
+    one, two, behind, nowhere = np.float32(1), np.float32(2), np.float32(_BEHIND), np.float32(-9)
+    if lens.limit == np.inf:
         for t in range(len(u)):
-            depth = m20 * p[t] + m21 + m22 * s[t]
-            nearer = 1 / depth
-            x, y = (m00 * p[t] + m01 + m02 * s[t]) * nearer, (m10 * p[t] + m11 + m12 * s[t]) * nearer
-            u[t] = np.float32(x if depth > 1e-9 else -9.0)
-            v[t] = np.float32(y if depth > 1e-9 else -9.0)
+            depth = z0 * p[t] + z1 + z2 * s[t]
+            nearer = one / depth
+            x, y = (x0 * p[t] + x1 + x2 * s[t]) * nearer, (y0 * p[t] + y1 + y2 * s[t]) * nearer
+            u[t] = x if depth > behind else nowhere
+            v[t] = y if depth > behind else nowhere
         return
+    k1, k2, p1, p2 = np.float32(lens.k1), np.float32(lens.k2), np.float32(lens.p1), np.float32(lens.p2)
+    focal_x, focal_y, limit = np.float32(lens.focal_x), np.float32(lens.focal_y), np.float32(lens.limit)
+    centre_x, centre_y = np.float32(lens.x), np.float32(lens.y)
     for t in range(len(u)):
-        depth = m20 * p[t] + m21 + m22 * s[t]
-        nearer = 1 / depth
-        x, y = (m00 * p[t] + m01 + m02 * s[t]) * nearer, (m10 * p[t] + m11 + m12 * s[t]) * nearer
+        depth = z0 * p[t] + z1 + z2 * s[t]
+        nearer = one / depth
+        x, y = (x0 * p[t] + x1 + x2 * s[t]) * nearer, (y0 * p[t] + y1 + y2 * s[t]) * nearer
         square = x * x + y * y
-        radial = 1 + square * (k1 + k2 * square)
-        imaged = (depth > 1e-9) & (square <= limit)
-        across = focal_x * (x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)) + x0
-        down = focal_y * (y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y) + y0
-        u[t] = np.float32(across if imaged else -9.0)
-        v[t] = np.float32(down if imaged else -9.0)
+        radial = one + square * (k1 + k2 * square)
+        imaged = (depth > behind) & (square <= limit)
+        across = focal_x * (x * radial + two * p1 * x * y + p2 * (square + two * x * x)) + centre_x
+        down = focal_y * (y * radial + p1 * (square + two * y * y) + two * p2 * x * y) + centre_y
+        u[t] = across if imaged else nowhere
+        v[t] = down if imaged else nowhere
 
 
 @compiled
-def _add_remapped(
-    counts: NDArray[np.float32],
-    seen: NDArray[np.float32],
+def _add_warped(
+    counts: Texture,
+    seen: Texture,
+    whole: bool,
     amounts: NDArray[np.float64],
     matrix: NDArray[np.float64],
     lens: Lens,
     grid: Grid,
 ) -> None:
-    total, coverages = grid.total, grid.coverages
-    height, width = np.float32(counts.shape[0] - 3), np.float32(counts.shape[1] - 3)
-    rows, columns = total.shape
-    stride = np.uint64(counts.shape[1])
-    one, zero = np.float32(1), np.float32(0)
-    pixels, shares = counts.reshape(-1), seen.reshape(-1)
-    u, v = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    share, place = np.empty(columns, np.float32), np.empty(columns, np.int32)
+    """Add an image and its share of each pixel, which is that of `seen`, or 1 for a `whole` image."""
+    rows, columns = grid.total.shape
+    u, v, share = np.empty(columns, np.float32), np.empty(columns, np.float32), np.empty(columns, np.float32)
+    places, texels = np.empty(columns, np.uint32), np.empty(columns, np.uint64)
     for y in range(rows):
         image_row(matrix, lens, grid, y, u, v)
-        for t in range(columns):
-            # From the first zero before the image to the first one after it: beyond, there is nothing to interpolate.
-            a, b = min(max(u[t] + one, zero), width + one), min(max(v[t] + one, zero), height + one)
-            along, across = min(min(a, width + one - a), one), min(min(b, height + one - b), one)
-            share[t] = along * across
-            left, top = np.floor(a), np.floor(b)
-            u[t], v[t] = a - left, b - top
-            place[t] = np.int32(np.float64(top) * counts.shape[1] + left)
-        row = total[y]
-        for t in range(columns):
-            at = np.uint64(np.uint32(place[t]))
-            upper = pixels[at] + u[t] * (pixels[at + np.uint64(1)] - pixels[at])
-            lower = pixels[at + stride] + u[t] * (pixels[at + stride + np.uint64(1)] - pixels[at + stride])
-            row[t] += upper + v[t] * (lower - upper)
-        if seen.size:
-            for t in range(columns):
-                at = np.uint64(np.uint32(place[t]))
-                upper = shares[at] + u[t] * (shares[at + np.uint64(1)] - shares[at])
-                lower = shares[at + stride] + u[t] * (shares[at + stride + np.uint64(1)] - shares[at + stride])
-                share[t] = upper + v[t] * (lower - upper)
+        first, last = _places(u, v, counts.texels.shape, places, share)
+        if first >= last:
+            continue
+        a, b, at, into = u[first:last], v[first:last], places[first:last], texels[: last - first]
+        _read(counts, at, into)
+        _add_interpolated(counts, into, a, b, grid.total[y, first:last])
+        weight = share[first:last]
+        if not whole:
+            weight[:] = 0
+            _read(seen, at, into)
+            _add_interpolated(seen, into, a, b, weight)
         for k in range(len(amounts)):
-            amount, coverage = np.float32(amounts[k]), coverages[k, y]
-            for t in range(columns):
-                coverage[t] += amount * share[t]
+            amount, coverage = np.float32(amounts[k]), grid.coverages[k, y, first:last]
+            for t in range(len(weight)):
+                coverage[t] += amount * weight[t]
 
 
 @compiled
-def _parts(shape: tuple[int, int], to_image: NDArray[np.float64], y: int, columns: int) -> tuple[int, int, int, int]:
-    """Divide a row of a grid.
+def _places(
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    shape: tuple[int, int],
+    places: NDArray[np.uint32],
+    share: NDArray[np.float32],
+) -> tuple[int, int]:
+    """Return the half-open range of places in an image.
 
-    Returns:
-        first, inside, outside, last: the image contributes to pixels from `first` to `last`, half-open, and those from
-        `inside` to `outside` have four neighbours in the image.
+    Args:
+        u: (W,) x in the image; becomes the fraction between two pixels.
+        v: (W,) y, likewise.
+        shape: of its texels.
+        places: (W,) output, numbers of texels.
+        share: (W,) output, 1 within the image, falling to 0 over one pixel outside of it.
     """
-    height, width = shape
-    first, last = visible_columns(to_image, y, -1.0, width, -1.0, height, columns)
-    inside, outside = visible_columns(to_image, y, 0.0, width - 1.0, 0.0, height - 1.0, columns)
-    if inside >= outside:
-        return first, last, last, last
-    return first, inside, outside, last
+    height, width, one, zero = np.float32(shape[0]), np.float32(shape[1]), np.float32(1), np.float32(0)
+    stride, columns = np.int32(shape[1]), len(u)
+    first, last = np.int32(columns), np.int32(0)
+    for t in range(columns):
+        # From the first zero before the image to the first one after it: beyond, there is nothing to interpolate.
+        a, b = u[t] + one, v[t] + one
+        along, across = min(min(a, width - a), one), min(min(b, height - b), one)
+        within = (along > zero) & (across > zero)
+        a, b = a if within else zero, b if within else zero
+        left, top = np.int32(a), np.int32(b)
+        u[t], v[t] = a - np.float32(left), b - np.float32(top)
+        places[t] = np.uint32(np.int32(top * stride + left))
+        share[t] = along * across if within else zero
+        here = np.int32(t)
+        first = min(first, here if within else np.int32(columns))
+        last = max(last, np.int32(here + np.int32(1)) if within else np.int32(0))
+    return int(first), int(last)
 
 
 @compiled
-def _at(image: Pixels, to_image: NDArray[np.float64], x: int, y: int) -> float:
-    """Interpolate at the border, beyond which the image is 0."""
-    height, width = image.shape
-    u, v = _mapped(to_image, x, y)
-    left, top = int(np.floor(u)), int(np.floor(v))
-    total = 0.0
-    for j in range(max(top, 0), min(top + 2, height)):
-        for i in range(max(left, 0), min(left + 2, width)):
-            total += image[j, i] * (1 - abs(u - i)) * (1 - abs(v - j))
-    return total
+def _read(texture: Texture, places: NDArray[np.uint32], into: NDArray[np.uint64]) -> None:
+    texels = texture.texels.reshape(-1)
+    for t in range(len(into)):
+        into[t] = texels[np.uint64(places[t])]
 
 
 @compiled
-def _coverage(shape: tuple[int, int], to_image: NDArray[np.float64], x: int, y: int) -> float:
-    """Interpolate an image of ones at its border."""
-    height, width = shape
-    u, v = _mapped(to_image, x, y)
-    along = max(0.0, min(1.0, 1 + min(u, width - 1 - u)))
-    across = max(0.0, min(1.0, 1 + min(v, height - 1 - v)))
-    return along * across
-
-
-@compiled
-def _mapped(to_image: NDArray[np.float64], x: int, y: int) -> tuple[float, float]:
-    depth = to_image[2, 0] * x + to_image[2, 1] * y + to_image[2, 2]
-    return (
-        (to_image[0, 0] * x + to_image[0, 1] * y + to_image[0, 2]) / depth,
-        (to_image[1, 0] * x + to_image[1, 1] * y + to_image[1, 2]) / depth,
-    )
+def _add_interpolated(
+    texture: Texture, texels: NDArray[np.uint64], a: NDArray[np.float32], b: NDArray[np.float32], into: NDArray[np.float32]
+) -> None:
+    """Add texels interpolated at the fractions a along x and b along y."""
+    levels, low, high = texels.view(np.uint32), np.uint32(0xFFFF), np.uint32(16)
+    scale, zero = np.float32(texture.scale), np.float32(texture.scale * texture.zero)
+    for t in range(len(into)):
+        above, below = levels[np.uint64(2) * np.uint64(t)], levels[np.uint64(2) * np.uint64(t) + np.uint64(1)]
+        p, q = np.float32(np.int32(above & low)), np.float32(np.int32(above >> high))
+        r, s = np.float32(np.int32(below & low)), np.float32(np.int32(below >> high))
+        upper, lower = p + a[t] * (q - p), r + a[t] * (s - r)
+        into[t] += scale * (upper + b[t] * (lower - upper)) - zero

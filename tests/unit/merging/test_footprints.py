@@ -13,9 +13,9 @@ def footprints(to_grid: np.ndarray) -> list[Footprint]:
     return footprints_of(GRID, None, to_grid, FRAME)
 
 
-def test_footprint_of_shift_is_straight_and_covers_shifted_frame() -> None:
+def test_footprint_of_shift_covers_shifted_frame() -> None:
     (footprint,) = footprints(translation(10.5, 20.25)[None])
-    assert (footprint.shrink, footprint.straight) == (1, True)
+    assert footprint.shrink == 1
     assert (footprint.rows, footprint.columns) == (range(19, 276), (range(9, 508),))
     assert footprint.to_image == pytest.approx(translation(-10.5, -20.25))
 
@@ -24,11 +24,6 @@ def test_footprint_is_empty_outside_of_grid() -> None:
     for shift in (translation(800, 0), translation(-600, 0), translation(0, 400)):
         (footprint,) = footprints(shift[None])
         assert not (footprint.rows and footprint.columns)
-
-
-def test_footprint_is_not_straight_beyond_small_rotation() -> None:
-    turned = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in (0.005, 0.02)]
-    assert [footprint.straight for footprint in footprints(np.array(turned))] == [True, False]
 
 
 def test_footprint_shrinks_frame_on_coarse_grid() -> None:
