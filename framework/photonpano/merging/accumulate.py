@@ -171,8 +171,7 @@ def _sum_on(
         counts: FluxImage | Counts = raw if corrected is None else corrected(raw, len(chunk.span))
         if masked is not None:
             counts = np.asarray(counts * masked, np.float32)
-        shrunk = average_squares(np.ascontiguousarray(counts), footprint.shrink)
-        add_warped(Texture.of(shrunk), seen_by(footprint.shrink), amounts, footprint, grid)
+        add_warped(Texture.of(average_squares(counts, footprint.shrink)), seen_by(footprint.shrink), amounts, footprint, grid)
         advance(len(chunk.span))
     return grid.total, grid.coverages
 

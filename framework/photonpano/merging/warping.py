@@ -36,7 +36,7 @@ class Texture(NamedTuple):
     zero: float
 
     @classmethod
-    def of(cls, image: Pixels) -> Texture:
+    def of(cls, image: NDArray[np.float32]) -> Texture:
         """Return the texture of an (h, w) image of finite values."""
         low, high = min(0.0, float(image.min(initial=0))), float(image.max(initial=0))
         scale = 2.0 ** np.ceil(np.log2((high - low) / _LEVELS)) if high > low else 1.0
@@ -47,49 +47,48 @@ class Texture(NamedTuple):
 
 
 @compiled
-def _fill(texels: NDArray[np.uint64], image: Pixels, levels: float, zero: float) -> None:
+def _fill(texels: NDArray[np.uint64], image: NDArray[np.float32], levels: float, zero: float) -> None:
     """Fill the texels of an image; `levels` is their number in 1."""
     height, width = image.shape
-    above, here = np.empty(width + 2, np.uint64), np.empty(width + 2, np.uint64)
-    above[:] = np.uint64(zero)
-    here[0] = here[width + 1] = np.uint64(zero)
-    factor, rounded = np.float32(levels), np.float32(zero + 0.5)
+    row = np.full(width + 2, np.uint32(zero))
+    above = np.full(width + 1, np.uint32(zero) | (np.uint32(zero) << np.uint32(16)))
+    pairs = above.copy()
+    factor, rounded, most = np.float32(levels), np.float32(zero + 0.5), np.float32(_LEVELS)
     for y in range(height + 1):
-        if y < height:
-            row, inner = image[y], here[1 : width + 1]
-            for x in range(width):
-                level = min(np.float32(row[x]) * factor + rounded, np.float32(_LEVELS))
-                inner[x] = np.uint64(np.uint32(np.int32(level)))
-        else:
-            here[:] = np.uint64(zero)
-        into = texels[y]
+        pixels, inner = image[min(y, height - 1)], row[1 : width + 1]
+        for x in range(width):
+            inner[x] = np.uint32(np.int32(min(pixels[x] * factor + rounded, most)))
+        if y == height:
+            row[:] = np.uint32(zero)
+        left, right, into = row[: width + 1], row[1:], texels[y]
         for x in range(width + 1):
-            upper = above[x] | (above[x + 1] << np.uint64(16))
-            into[x] = upper | (here[x] << np.uint64(32)) | (here[x + 1] << np.uint64(48))
-        above, here = here, above
-        here[0] = here[width + 1] = np.uint64(zero)
+            pairs[x] = left[x] | (right[x] << np.uint32(16))
+        for x in range(width + 1):
+            into[x] = np.uint64(above[x]) | (np.uint64(pairs[x]) << np.uint64(32))
+        above, pairs = pairs, above
 
 
 def average_squares(image: Pixels, side: int) -> NDArray[np.float32]:
     """Average squares of pixels, (h, w) to (ceil(h / side), ceil(w / side)); the image is padded with 0 to whole squares."""
+    pixels = np.ascontiguousarray(image, np.float32)
     if side == 1:
-        return np.asarray(image, dtype=np.float32)
+        return pixels
     averages = np.zeros((-(-image.shape[0] // side), -(-image.shape[1] // side)), np.float32)
-    _add_squares(image, side, averages)
+    _add_squares(pixels, side, averages)
     return averages
 
 
 @compiled
-def _add_squares(image: Pixels, side: int, averages: NDArray[np.float32]) -> None:
+def _add_squares(image: NDArray[np.float32], side: int, averages: NDArray[np.float32]) -> None:
     share = np.float32(1 / side**2)
     for y in range(image.shape[0]):
         row, into = image[y], averages[y // side]
         whole = len(row) // side
         for t in range(whole):
             for x in range(side):
-                into[t] += share * np.float32(row[t * side + x])
+                into[t] += share * row[t * side + x]
         for x in range(whole * side, len(row)):
-            into[whole] += share * np.float32(row[x])
+            into[whole] += share * row[x]
 
 
 class Grid(NamedTuple):

@@ -30,7 +30,8 @@ def interpolated(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int]
 def warped(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int], seen: np.ndarray | None = None) -> Grid:
     """Warp an image, and its share of each pixel times 3, onto a grid of zeros."""
     grid, footprint = Grid.zeros(Canvas(*shape, np.eye(3)), 1), Footprint(1, to_image, range(shape[0]), (range(shape[1]),))
-    add_warped(Texture.of(image), None if seen is None else Texture.of(seen), np.array([3.0]), footprint, grid)
+    textures = [None if each is None else Texture.of(each.astype(np.float32)) for each in (image, seen)]
+    add_warped(textures[0], textures[1], np.array([3.0]), footprint, grid)
     return grid
 
 
