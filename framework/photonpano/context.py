@@ -118,20 +118,13 @@ class KeepNothing:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """How a computation runs; its result does not depend on it.
+    """How a computation runs; its result does not depend on it."""
 
-    Attributes:
-        threads: how many tasks are under way at once.
-        progress: receives stages and messages.
-        on_level: called with the `LevelResult` of each level of the loop when it is done.
-        checkpoints: keep what is found, for the case of an interruption.
-        executor: works on the tasks.
-    """
-
-    threads: int = 1
+    threads: int = 1  # how many tasks are under way at once
     progress: Progress = field(default_factory=Quiet)
+    # called with the `LevelResult` of each level of the loop when it is done
     on_level: Callable[[Any], object] = lambda _: None
-    checkpoints: Checkpoints = field(default_factory=KeepNothing)
+    checkpoints: Checkpoints = field(default_factory=KeepNothing)  # keep what is found, for the case of an interruption
     executor: Executor = field(default_factory=LocalExecutor)
 
     def in_order(self, work: Callable[[ItemT], ResultT], items: Iterable[ItemT]) -> Iterator[ResultT]:

@@ -22,15 +22,12 @@ _PER_FRAME = ("homographies", "rotations", "camera_from_world", "light", "taken"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Colours:
-    """The colours of a capture behind a filter array.
+    """The colours of a capture behind a filter array."""
 
-    Attributes:
-        parts: a capture for each of "red", "green", "blue" and, if there are pixels without filter, "clear", in this order:
-            the same frames, in which only the pixels behind filters of this colour are valid.
-        clear_mix: (3,) the flux of a clear pixel is the sum of these factors times the flux of red, green and blue ones.
-    """
-
+    # a capture for each of "red", "green", "blue" and, if there are pixels without filter, "clear", in this order: the same
+    # frames, in which only the pixels behind filters of this colour are valid
     parts: Mapping[str, Capture]
+    # (3,) the flux of a clear pixel is the sum of these factors times the flux of red, green and blue ones
     clear_mix: FloatArray
 
 

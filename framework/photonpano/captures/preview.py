@@ -25,17 +25,11 @@ _FONT, _FONT_SCALE, _LINE_PX, _MARGIN_PX = cv2.FONT_HERSHEY_PLAIN, 0.8, 14, 3
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """The rendering style of pictures.
+    """The rendering style of pictures."""
 
-    Attributes:
-        white_flux: the flux that is white, the same in all pictures.
-        srgb: whether levels follow the sRGB curve; otherwise they are proportional to the flux.
-        label: whether frames and time are written below each picture.
-    """
-
-    white_flux: float
-    srgb: bool = True
-    label: bool = True
+    white_flux: float  # the flux that is white, the same in all pictures
+    srgb: bool = True  # whether levels follow the sRGB curve; otherwise they are proportional to the flux
+    label: bool = True  # whether frames and time are written below each picture
 
 
 def preview_spans(info: StreamInfo, group_size: int, step: int) -> list[FrameSpan]:

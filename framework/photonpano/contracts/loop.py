@@ -90,19 +90,12 @@ def require_groups(found: Iterable[Any], n_frames: int) -> tuple[Group, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What a merger was asked for.
-
-    Attributes:
-        group: the group.
-        scale: pixels of the exposure per pixel of a frame.
-        frame_shape: (height, width) of a frame.
-        response: that of the source; None where it is not compared.
-    """
+    """What a merger was asked for."""
 
     group: Group
-    scale: float
-    frame_shape: tuple[int, int]
-    response: Response | None = None
+    scale: float  # pixels of the exposure per pixel of a frame
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    response: Response | None = None  # that of the source; None where it is not compared
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -310,16 +303,11 @@ class KnotErrors:
 
     A trajectory that smooths misses its knots by a few of their expected errors, and outliers may lie further away: so these
     are medians, which may be as large as the larger of `KNOT_STDS` expected errors and `KNOT_PX`.
-
-    Attributes:
-        missed_px: distance from the knots.
-        strayed_px: half-way between two knots, distance from the mean of both, beyond the distance between them.
-        std_px: expected error of the knots; NaN where it is not known.
     """
 
-    missed_px: float
-    strayed_px: float
-    std_px: float
+    missed_px: float  # distance from the knots
+    strayed_px: float  # half-way between two knots, distance from the mean of both, beyond the distance between them
+    std_px: float  # expected error of the knots; NaN where it is not known
 
     @property
     def allowed_px(self) -> float:

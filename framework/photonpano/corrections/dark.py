@@ -29,15 +29,10 @@ _AT_ONCE = 1024  # frames summed between two reports of progress
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DarkFrames:
-    """Dark counts of each pixel, from frames taken with the lens covered.
+    """Dark counts of each pixel, from frames taken with the lens covered."""
 
-    Attributes:
-        rates: (H, W) float32, dark counts per frame: photons of binary frames, grey values of others.
-        n_frames: frames that they were measured in; None if unknown.
-    """
-
-    rates: FluxImage
-    n_frames: int | None
+    rates: FluxImage  # (H, W) float32, dark counts per frame: photons of binary frames, grey values of others
+    n_frames: int | None  # frames that they were measured in; None if unknown
 
 
 class DarkCounts(Correction):

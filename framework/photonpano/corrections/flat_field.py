@@ -39,19 +39,12 @@ class FlatField(Correction):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vignette:
-    """The relative sensitivity of the pixels.
+    """The relative sensitivity of the pixels."""
 
-    Attributes:
-        gain: (H, W) float32, 1 in the middle, or on average if it is a flat field.
-        mean: (H, W) float32, mean count of a frame of each pixel, around which the division is linear.
-        spans: the frames that it was estimated from.
-        std: (H, W) float32, standard deviation of the gain, relative to it; None for a vignette.
-    """
-
-    gain: FluxImage
-    mean: FluxImage
-    spans: tuple[FrameSpan, ...]
-    std: FluxImage | None = None
+    gain: FluxImage  # (H, W) float32, 1 in the middle, or on average if it is a flat field
+    mean: FluxImage  # (H, W) float32, mean count of a frame of each pixel, around which the division is linear
+    spans: tuple[FrameSpan, ...]  # the frames that it was estimated from
+    std: FluxImage | None = None  # (H, W) float32, standard deviation of the gain, relative to it; None for a vignette
 
     @property
     def decision(self) -> Decision:

@@ -103,13 +103,9 @@ class MissingRow(Rearrangement):
 
 
 class Turn(Rearrangement):
-    """Rotates or mirrors the frame.
+    """Rotates or mirrors the frame."""
 
-    Attributes:
-        turn: the numpy function that does it.
-    """
-
-    turn: ClassVar[Callable[[Index], Index]]
+    turn: ClassVar[Callable[[Index], Index]]  # the numpy function that does it
 
     def moved(self, pixels: Index) -> Index:
         """See `Rearrangement`."""
@@ -131,14 +127,9 @@ TURNS = _turns()  # A class for each way to turn a frame
 
 
 class Preset(Rearrangement):
-    """Other corrections, one after the other, that a known sensor needs.
+    """Other corrections, one after the other, that a known sensor needs."""
 
-    Attributes:
-        shape: (height, width) of the frames that it is made for.
-        steps: the corrections.
-    """
-
-    shape: ClassVar[tuple[int, int]]
+    shape: ClassVar[tuple[int, int]]  # (height, width) of the frames that it is made for
     steps: ClassVar[tuple[Rearrangement, ...]]
 
     def moved(self, pixels: Index) -> Index:

@@ -78,17 +78,11 @@ def without_still_pixels(source: Source, look: bool = True) -> Capture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Still:
-    """What stands still in the frame.
+    """What stands still in the frame."""
 
-    Attributes:
-        mask: (H, W) bool, the pixels to mask.
-        share: share of the frame that stands still, of the parts that show motion or rest; 0 if no part does.
-        why: a clause on the masked pixels.
-    """
-
-    mask: BoolArray
-    share: float
-    why: str
+    mask: BoolArray  # (H, W) bool, the pixels to mask
+    share: float  # share of the frame that stands still, of the parts that show motion or rest; 0 if no part does
+    why: str  # a clause on the masked pixels
 
 
 def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike: Sequence[BoolArray] | None = None) -> Still:

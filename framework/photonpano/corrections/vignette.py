@@ -67,19 +67,12 @@ def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """What the squares of the sensor saw in a span: N of them that saw photons.
+    """What the squares of the sensor saw in a span: N of them that saw photons."""
 
-    Attributes:
-        flux: (N,) photons per pixel and frame.
-        weight: (N,) inverse variance of its logarithm: photons.
-        places: (N, 2) integers, the squares of the scene.
-        distance: (N,) distance from the middle of the frame, relative to that of a corner.
-    """
-
-    flux: FloatArray
-    weight: FloatArray
-    places: NDArray[np.int64]
-    distance: FloatArray
+    flux: FloatArray  # (N,) photons per pixel and frame
+    weight: FloatArray  # (N,) inverse variance of its logarithm: photons
+    places: NDArray[np.int64]  # (N, 2) integers, the squares of the scene
+    distance: FloatArray  # (N,) distance from the middle of the frame, relative to that of a corner
 
     @classmethod
     def of(cls, capture: Capture, span: FrameSpan, trajectory: Trajectory) -> _Seen:

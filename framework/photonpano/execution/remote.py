@@ -23,15 +23,10 @@ ResultT = TypeVar("ResultT")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaptureElsewhere:
-    """What stands for a capture in tasks.
+    """What stands for a capture in tasks."""
 
-    Attributes:
-        source: the capture in this process.
-        opener: opens it in another one; can be pickled, and tells by `==` whether it is the same capture.
-    """
-
-    source: object
-    opener: Callable[[], object]
+    source: object  # the capture in this process
+    opener: Callable[[], object]  # opens it in another one; can be pickled, and tells by `==` whether it is the same capture
 
 
 class Pending(Protocol):

@@ -32,18 +32,13 @@ _NARROWEST = 1e-3  # least standard deviation of the prior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelGain:
-    """The relative gain of the pixels of a sensor.
+    """The relative gain of the pixels of a sensor."""
 
-    Attributes:
-        gain: (H, W) float32, 1 on average over the valid pixels.
-        std: (H, W) float32, its standard deviation, relative to the gain. It contains what the motion leaves open: of a picture
-            that turns, how the gain changes with the distance from the centre of the turn.
-        spans: the frames that it was measured from.
-    """
-
-    gain: FluxImage
+    gain: FluxImage  # (H, W) float32, 1 on average over the valid pixels
+    # (H, W) float32, its standard deviation, relative to the gain. It contains what the motion leaves open: of a picture that
+    # turns, how the gain changes with the distance from the centre of the turn.
     std: FluxImage
-    spans: tuple[FrameSpan, ...]
+    spans: tuple[FrameSpan, ...]  # the frames that it was measured from
 
 
 def measure_pixel_gain(source: Source, trajectory: Trajectory, context: Context) -> PixelGain:
@@ -94,15 +89,10 @@ def _on_sensor(seen: SeenCells, to_frames: FloatArray, to_cells: Homography) -> 
 
 @dataclass(frozen=True, slots=True)
 class _Knots:
-    """A grid of knots from corner to corner of the frame.
+    """A grid of knots from corner to corner of the frame."""
 
-    Attributes:
-        frame_shape: (height, width).
-        shape: (rows, columns).
-    """
-
-    frame_shape: tuple[int, int]
-    shape: tuple[int, int]
+    frame_shape: tuple[int, int]  # (height, width)
+    shape: tuple[int, int]  # (rows, columns)
 
     @classmethod
     def of(cls, frame_shape: tuple[int, int]) -> _Knots:

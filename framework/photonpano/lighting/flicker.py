@@ -25,19 +25,12 @@ _MOST = 1.5  # largest amplitude, relative to the mean light of a place
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalFlicker:
-    """The flicker of each square of the scene: `1 + cosine cos(2 pi f t) + sine sin(2 pi f t)` of its mean light.
+    """The flicker of each square of the scene: `1 + cosine cos(2 pi f t) + sine sin(2 pi f t)` of its mean light."""
 
-    Attributes:
-        frequency: f, in cycles per frame.
-        cosine: (h, w) float32.
-        sine: (h, w) float32.
-        slow: (S,) gain of the spans, over which it does not flicker.
-    """
-
-    frequency: float
-    cosine: FluxImage
-    sine: FluxImage
-    slow: FloatArray
+    frequency: float  # f, in cycles per frame
+    cosine: FluxImage  # (h, w) float32
+    sine: FluxImage  # (h, w) float32
+    slow: FloatArray  # (S,) gain of the spans, over which it does not flicker
 
 
 def local_frequency(gains: Gains) -> float:

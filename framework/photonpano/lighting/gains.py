@@ -42,24 +42,15 @@ _WIDEST = np.pi / 2  # widest field of view, in radians, of which squares lie on
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenCells:
-    """Photons of squares of the scene in spans of frames: N observations of C squares in S spans.
-
-    Attributes:
-        spans: the spans.
-        cells: (N,) index of the square, below `n_cells`.
-        times: (N,) index of the span.
-        photons: (N,) photons, those that a saturated pixel missed included.
-        exposure: (N,) pixels times frames.
-        shape: (h, w) rows and columns of squares, C in all.
-        to_cells: (3, 3), pixels of the reference plane to squares: integers are their middles. None if they lie on a sphere.
-    """
+    """Photons of squares of the scene in spans of frames: N observations of C squares in S spans."""
 
     spans: tuple[FrameSpan, ...]
-    cells: NDArray[np.intp]
-    times: NDArray[np.intp]
-    photons: FloatArray
-    exposure: FloatArray
-    shape: tuple[int, int]
+    cells: NDArray[np.intp]  # (N,) index of the square, below `n_cells`
+    times: NDArray[np.intp]  # (N,) index of the span
+    photons: FloatArray  # (N,) photons, those that a saturated pixel missed included
+    exposure: FloatArray  # (N,) pixels times frames
+    shape: tuple[int, int]  # (h, w) rows and columns of squares, C in all
+    # (3, 3), pixels of the reference plane to squares: integers are their middles. None if they lie on a sphere.
     to_cells: Homography | None
 
     @property
@@ -75,23 +66,14 @@ class SeenCells:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gains:
-    """The light of spans of frames, up to a common factor.
-
-    Attributes:
-        seen: the observations.
-        logarithm: (S,) of the gain, 0 on average.
-        std: (S,) its standard deviation.
-        brightness: (C,) logarithm of the flux of each square in light of gain 1; NaN for squares that were not seen.
-        change: root mean square of the change of the light between spans that see the same places, noise subtracted.
-        shifted: (N,) logarithm of what errors of the motion change in each observation.
-    """
+    """The light of spans of frames, up to a common factor."""
 
     seen: SeenCells
-    logarithm: FloatArray
-    std: FloatArray
-    brightness: FloatArray
-    change: float
-    shifted: FloatArray
+    logarithm: FloatArray  # (S,) of the gain, 0 on average
+    std: FloatArray  # (S,) its standard deviation
+    brightness: FloatArray  # (C,) logarithm of the flux of each square in light of gain 1; NaN for squares that were not seen
+    change: float  # root mean square of the change of the light between spans that see the same places, noise subtracted
+    shifted: FloatArray  # (N,) logarithm of what errors of the motion change in each observation
 
     @property
     def gain(self) -> FloatArray:

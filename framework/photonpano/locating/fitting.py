@@ -20,17 +20,11 @@ MIN_NOISE_PX = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A homography fitted to matches.
+    """A homography fitted to matches."""
 
-    Attributes:
-        homography: (3, 3), moving to fixed.
-        information: (8, 8) inverse covariance of p1..p8.
-        residual_px: standard deviation of a coordinate of a keypoint of median size, in px.
-    """
-
-    homography: Homography
-    information: FloatArray
-    residual_px: float
+    homography: Homography  # (3, 3), moving to fixed
+    information: FloatArray  # (8, 8) inverse covariance of p1..p8
+    residual_px: float  # standard deviation of a coordinate of a keypoint of median size, in px
 
     def corner_std_px(self, shape: tuple[int, int]) -> float:
         """Return the largest expected error of a corner of the frame, in px; infinite if the fit is degenerate."""

@@ -114,19 +114,12 @@ def _turn(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """A rotation fitted to matches.
+    """A rotation fitted to matches."""
 
-    Attributes:
-        homography: (3, 3), moving to fixed.
-        agrees: (N,) which matches agree.
-        residual_px: standard deviation of a coordinate of their residuals, in px.
-        information: (8, 8) inverse covariance of p1..p8, as if all were estimated.
-    """
-
-    homography: Homography
-    agrees: BoolArray
-    residual_px: float
-    information: FloatArray
+    homography: Homography  # (3, 3), moving to fixed
+    agrees: BoolArray  # (N,) which matches agree
+    residual_px: float  # standard deviation of a coordinate of their residuals, in px
+    information: FloatArray  # (8, 8) inverse covariance of p1..p8, as if all were estimated
 
 
 def _fit(moving: FloatArray, fixed: FloatArray, start: Homography, camera: Camera, threshold_px: float) -> _Fit:

@@ -28,20 +28,13 @@ class CanvasNoise:
     """Noise model of a canvas: all that its noise depends on beside flux and weight.
 
     A correction multiplies the counts of a pixel by `slope` and adds `offset` for each frame: see `flux_std`.
-
-    Attributes:
-        response: the response of the camera.
-        slope: one number, or a map of the canvas, coarser by `reduction`: (h, w), or (h, w, 3) in colour.
-        offset: as `slope`.
-        reduction: pixels of the canvas per pixel of the maps, along each side.
-        averaging: how far interpolation lowers the noise; None without motion.
     """
 
     response: Response
-    slope: Factor = 1.0
-    offset: Factor = 0.0
-    reduction: float = 1.0
-    averaging: Averaging | None = None
+    slope: Factor = 1.0  # one number, or a map of the canvas, coarser by `reduction`: (h, w), or (h, w, 3) in colour
+    offset: Factor = 0.0  # as `slope`
+    reduction: float = 1.0  # pixels of the canvas per pixel of the maps, along each side
+    averaging: Averaging | None = None  # how far interpolation lowers the noise; None without motion
 
     @classmethod
     def of(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
@@ -159,23 +152,14 @@ def _stacked(factors: list[Factor]) -> Factor:
 
 @dataclass(slots=True)
 class DynamicRange:
-    """The range of flux in a panorama, gathered tile by tile.
+    """The range of flux in a panorama, gathered tile by tile."""
 
-    Attributes:
-        noise: of its canvas.
-        low: the lowest flux that exceeds its standard deviation; infinite before there is one.
-        high: the highest.
-        n_saturated: number of values of pixels that were lit in every frame.
-        n_seen: number of values of pixels that were seen.
-        frames: frames that saw each value, added up.
-    """
-
-    noise: CanvasNoise
-    low: float = float("inf")
-    high: float = 0.0
-    n_saturated: int = 0
-    n_seen: int = 0
-    frames: float = 0.0
+    noise: CanvasNoise  # of its canvas
+    low: float = float("inf")  # the lowest flux that exceeds its standard deviation; infinite before there is one
+    high: float = 0.0  # the highest
+    n_saturated: int = 0  # number of values of pixels that were lit in every frame
+    n_seen: int = 0  # number of values of pixels that were seen
+    frames: float = 0.0  # frames that saw each value, added up
 
     def add(self, flux: FluxImage, weight: FluxImage, top: int, left: int) -> None:
         """Add a tile, row by row so that it takes little memory."""

@@ -38,23 +38,16 @@ NO_LENS = Lens(0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, np.inf)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint:
-    """Where a frame lies on a grid, and how it is remapped there.
+    """Where a frame lies on a grid, and how it is remapped there."""
 
-    Attributes:
-        shrink: squares of this many pixels a side are averaged before the warp.
-        to_image: (3, 3), rays of the grid to homogeneous ideal coordinates; on a plane, pixels of the grid.
-        rows: rows of the grid that the frame may touch; empty if it lies outside.
-        columns: columns that it may touch; two ranges where it crosses the seam of a full turn, none where it lies outside.
-        lens: from ideal coordinates to pixels of the averaged frame.
-        straight: `to_image` is a homography that hardly rotates or scales, so that neighbours on a row of the grid lie at
-            neighbours of the frame.
-    """
-
-    shrink: int
-    to_image: Homography
-    rows: range
+    shrink: int  # squares of this many pixels a side are averaged before the warp
+    to_image: Homography  # (3, 3), rays of the grid to homogeneous ideal coordinates; on a plane, pixels of the grid
+    rows: range  # rows of the grid that the frame may touch; empty if it lies outside
+    # columns that it may touch; two ranges where it crosses the seam of a full turn, none where it lies outside
     columns: tuple[range, ...]
-    lens: Lens = NO_LENS
+    lens: Lens = NO_LENS  # from ideal coordinates to pixels of the averaged frame
+    # `to_image` is a homography that hardly rotates or scales, so that neighbours on a row of the grid lie at neighbours of the
+    # frame
     straight: bool = False
 
 

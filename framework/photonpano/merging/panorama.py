@@ -65,17 +65,11 @@ class RenderOptions(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tile:
-    """A part of a canvas.
+    """A part of a canvas."""
 
-    Attributes:
-        left: first column, on the canvas.
-        top: first row, on the canvas.
-        canvas: pixel grid of the tile.
-    """
-
-    left: int
-    top: int
-    canvas: Canvas
+    left: int  # first column, on the canvas
+    top: int  # first row, on the canvas
+    canvas: Canvas  # pixel grid of the tile
 
 
 def tiles_of(canvas: Canvas, memory: int, bytes_per_pixel: int = BYTES_PER_PIXEL) -> tuple[tuple[Tile, ...], int]:
@@ -202,29 +196,17 @@ def _averaged(image: NDArray[np.generic], step: int) -> FluxImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedPanorama:
-    """A panorama whose tiles have been written.
+    """A panorama whose tiles have been written."""
 
-    Attributes:
-        canvas: pixel grid of the whole panorama.
-        thumbnail: flux and weight, averaged down by `reduction`.
-        reduction: side of the squares of pixels that are averaged; 1 if the panorama fits into memory.
-        picture: (H, W) or (H, W, 3) uint8, red first, the thumbnail in sRGB.
-        white_flux: flux that is white in the picture, photons per pixel per frame.
-        coverage_share: share of the pixels that were seen.
-        seconds: time of rendering and writing.
-        noise: what the noise depends on, beside flux and weight; None if it was not asked for.
-        dynamic_range: the range of flux; None if it was not asked for.
-    """
-
-    canvas: Canvas
-    thumbnail: Panorama
-    reduction: int
-    picture: NDArray[np.uint8]
-    white_flux: float
-    coverage_share: float
-    seconds: float
-    noise: CanvasNoise | None = None
-    dynamic_range: DynamicRange | None = None
+    canvas: Canvas  # pixel grid of the whole panorama
+    thumbnail: Panorama  # flux and weight, averaged down by `reduction`
+    reduction: int  # side of the squares of pixels that are averaged; 1 if the panorama fits into memory
+    picture: NDArray[np.uint8]  # (H, W) or (H, W, 3) uint8, red first, the thumbnail in sRGB
+    white_flux: float  # flux that is white in the picture, photons per pixel per frame
+    coverage_share: float  # share of the pixels that were seen
+    seconds: float  # time of rendering and writing
+    noise: CanvasNoise | None = None  # what the noise depends on, beside flux and weight; None if it was not asked for
+    dynamic_range: DynamicRange | None = None  # the range of flux; None if it was not asked for
 
 
 def render_panorama(

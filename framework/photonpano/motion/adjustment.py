@@ -35,36 +35,25 @@ StateT = TypeVar("StateT")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """How well a graph determines its unknowns.
+    """How well a graph determines its unknowns."""
 
-    Attributes:
-        information: (N, k, k) inverse covariances of the motion of each node while the others are held: of p1..p8 of its
-            homography, or of a rotation vector in its own frame. NaN for a single node.
-        std_px: (N,) expected error of the corners of each node, after the best alignment of the planes.
-        std_camera: (5,) expected errors of the camera that all nodes share: of its focal length in px, and of k1, k2, p1 and
-            p2. They are 0 for what is given; () without a camera.
-    """
-
+    # (N, k, k) inverse covariances of the motion of each node while the others are held: of p1..p8 of its homography, or of a
+    # rotation vector in its own frame. NaN for a single node.
     information: FloatArray
-    std_px: FloatArray
+    std_px: FloatArray  # (N,) expected error of the corners of each node, after the best alignment of the planes
+    # (5,) expected errors of the camera that all nodes share: of its focal length in px, and of k1, k2, p1 and p2. They are 0
+    # for what is given; () without a camera.
     std_camera: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """A connected graph whose nodes are to be found.
+    """A connected graph whose nodes are to be found."""
 
-    Attributes:
-        pairs: (E, 2) the moving and the fixed node of each edge.
-        anchor: the node that does not change.
-        motions: the motions of the edges, with their information.
-        frame_shape: (height, width) of a frame.
-    """
-
-    pairs: NDArray[np.integer]
-    anchor: int
-    motions: Sequence[Located]
-    frame_shape: tuple[int, int]
+    pairs: NDArray[np.integer]  # (E, 2) the moving and the fixed node of each edge
+    anchor: int  # the node that does not change
+    motions: Sequence[Located]  # the motions of the edges, with their information
+    frame_shape: tuple[int, int]  # (height, width) of a frame
 
     @property
     def observed(self) -> FloatArray:

@@ -30,15 +30,10 @@ _START = "If the image turns or shifts at a constant velocity, write motion: {st
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """How much there is to see in an exposure.
+    """How much there is to see in an exposure."""
 
-    Attributes:
-        signal_to_noise: standard deviation of the scene over that of a pixel's noise, see `photonpano.photometry`.
-        blank: why nothing can be seen in it; None if something can.
-    """
-
-    signal_to_noise: float
-    blank: str | None = None
+    signal_to_noise: float  # standard deviation of the scene over that of a pixel's noise, see `photonpano.photometry`
+    blank: str | None = None  # why nothing can be seen in it; None if something can
 
 
 class UntiedError(LocationError):

@@ -29,19 +29,13 @@ MAX_HYPOTHESES = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Described:
-    """An exposure as it stays in the process that has merged it.
+    """An exposure as it stays in the process that has merged it."""
 
-    Attributes:
-        contrast: of its image.
-        exposure: the exposure itself, for loop closures.
-        features: what locators made of it so far, by their numbers; none of a blank exposure.
-        guard: held while a locator describes it, so that each does so once.
-    """
-
-    contrast: Contrast
-    exposure: VirtualExposure | None = None
+    contrast: Contrast  # of its image
+    exposure: VirtualExposure | None = None  # the exposure itself, for loop closures
+    # what locators made of it so far, by their numbers; none of a blank exposure
     features: dict[int, Any] = field(default_factory=dict)
-    guard: Guard = field(default_factory=Guard)
+    guard: Guard = field(default_factory=Guard)  # held while a locator describes it, so that each does so once
 
 
 # Exposures by their numbers.
@@ -50,50 +44,32 @@ Descriptions: TypeAlias = Mapping[int, Described]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Two exposures to register.
+    """Two exposures to register."""
 
-    Attributes:
-        moving: number of the later exposure.
-        fixed: number of the earlier one.
-        expected: the motion known so far, if any.
-        guessed: whether that is a guess of the first level, from which only locators that keep hypotheses start.
-        closure: whether it is a candidate for a loop closure. The motion known so far may have drifted between its exposures,
-            and does not predict whether the camera is back where it was.
-    """
-
-    moving: int
-    fixed: int
-    expected: FrameHomography | None
-    guessed: bool = False
+    moving: int  # number of the later exposure
+    fixed: int  # number of the earlier one
+    expected: FrameHomography | None  # the motion known so far, if any
+    guessed: bool = False  # whether that is a guess of the first level, from which only locators that keep hypotheses start
+    # whether it is a candidate for a loop closure. The motion known so far may have drifted between its exposures, and does not
+    # predict whether the camera is back where it was.
     closure: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """What a task returns beside its result.
+    """What a task returns beside its result."""
 
-    Attributes:
-        seconds: in each stage.
-        decisions: of components, where it was worked on in another process.
-    """
-
-    seconds: dict[str, float]
-    decisions: tuple[Decision, ...]
+    seconds: dict[str, float]  # in each stage
+    decisions: tuple[Decision, ...]  # of components, where it was worked on in another process
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """Exposures of the first level that were registered with earlier ones.
+    """Exposures of the first level that were registered with earlier ones."""
 
-    Attributes:
-        edges: of each exposure, by its number.
-        places: where each lies.
-        alternatives_px: see `Track`.
-    """
-
-    edges: dict[int, list[Edge]]
-    places: dict[int, Place]
-    alternatives_px: dict[tuple[int, int], float]
+    edges: dict[int, list[Edge]]  # of each exposure, by its number
+    places: dict[int, Place]  # where each lies
+    alternatives_px: dict[tuple[int, int], float]  # see `Track`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,14 +80,10 @@ class ExposureTasks:
 
     Convention:
         All homographies are in pixels of frames; only a locator sees pixels of exposures.
-
-    Attributes:
-        exposures: of the level.
-        independent: the share of the photons of a typical group that no earlier group contains.
     """
 
-    exposures: VirtualExposures
-    independent: float
+    exposures: VirtualExposures  # of the level
+    independent: float  # the share of the photons of a typical group that no earlier group contains
 
     def describe(self, indices: Sequence[int], keep: bool) -> tuple[dict[int, Described], tuple[list[Contrast], Notes]]:
         """Merge exposures, and have the first locator describe them; a blank exposure is not described.

@@ -20,26 +20,17 @@ class FrameMotion:
 
     Convention:
         Homographies map frame pixels to reference pixels; points are (x, y), integers are pixel centres.
-
-    Attributes:
-        trajectory: the homography of any instant, from those of the frames: what a run stores is all that it renders along.
-        span: the frames from the first to the last that a located exposure holds.
-        homographies: (T, 3, 3), one for each frame.
-        located: (T,), False outside `span`.
-        std_px: (T,) expected corner error, infinite outside `span`.
-        reference: the frame whose homography is the identity.
-        frame_shape: (height, width) of a frame.
-        camera: that turns; None where homographies are any. Theirs are K R K^-1 of determinant 1 otherwise.
     """
 
+    # the homography of any instant, from those of the frames: what a run stores is all that it renders along
     trajectory: Trajectory
-    span: FrameSpan
-    homographies: FloatArray
-    located: BoolArray
-    std_px: FloatArray
-    reference: int
-    frame_shape: tuple[int, int]
-    camera: Camera | None = None
+    span: FrameSpan  # the frames from the first to the last that a located exposure holds
+    homographies: FloatArray  # (T, 3, 3), one for each frame
+    located: BoolArray  # (T,), False outside `span`
+    std_px: FloatArray  # (T,) expected corner error, infinite outside `span`
+    reference: int  # the frame whose homography is the identity
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    camera: Camera | None = None  # that turns; None where homographies are any. Theirs are K R K^-1 of determinant 1 otherwise.
 
     @property
     def rotations(self) -> FloatArray | None:

@@ -50,39 +50,28 @@ class GraphSolution:
     Convention:
         Homographies map pixels of a node's frame to pixels of the anchor's frame; the anchor's is the identity. Those of a
         rotating camera have determinant 1, all others h33 = 1.
-
-    Attributes:
-        homographies: (N, 3, 3), NaN for nodes that are not tied to the anchor.
-        located: (N,) True for nodes that are tied to the anchor.
-        outliers: positions, in the list that was solved, of edges that were dropped because they contradict the others.
-        residual_px: root mean square residual of the other edges at the corners, 0 for a tree.
-        assess: returns how well the L located nodes are determined. It takes about as long as to solve the graph.
-        rotations: of the L located nodes, and their camera; None for homographies.
-        compare: returns how well a rotating camera explains the edges; None where one of the two models is not fitted.
-            For rotations it takes about as long as to solve the graph.
     """
 
-    homographies: FloatArray
-    located: BoolArray
+    homographies: FloatArray  # (N, 3, 3), NaN for nodes that are not tied to the anchor
+    located: BoolArray  # (N,) True for nodes that are tied to the anchor
+    # positions, in the list that was solved, of edges that were dropped because they contradict the others
     outliers: tuple[int, ...]
-    residual_px: float
+    residual_px: float  # root mean square residual of the other edges at the corners, 0 for a tree
+    # returns how well the L located nodes are determined. It takes about as long as to solve the graph.
     assess: Callable[[], Assessment]
-    rotations: Rotations | None = None
+    rotations: Rotations | None = None  # of the L located nodes, and their camera; None for homographies
+    # returns how well a rotating camera explains the edges; None where one of the two models is not fitted. For rotations it
+    # takes about as long as to solve the graph.
     compare: Callable[[], Evidence | None] = lambda: None
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """How well a rotating camera explains the pairs, compared with any homographies.
+    """How well a rotating camera explains the pairs, compared with any homographies."""
 
-    Attributes:
-        rotation: mean square of the whitened residuals of rotations, 1 where they are photon noise.
-        homography: that of homographies.
-        gain: by how much each additional unknown of the homographies lowers the sum of the squares, in units of `homography`.
-    """
-
-    rotation: float
-    homography: float
+    rotation: float  # mean square of the whitened residuals of rotations, 1 where they are photon noise
+    homography: float  # that of homographies
+    # by how much each additional unknown of the homographies lowers the sum of the squares, in units of `homography`
     gain: float
 
     @classmethod
@@ -154,42 +143,25 @@ def _compared(tied: _Tied, start: FloatArray | None, rotating: _Fit) -> tuple[_F
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """A solution of the graph.
-
-    Attributes:
-        adjustment: the problem.
-        state: of least cost.
-        norms: (E,) of the whitened residuals.
-        kept: (E,) False for outliers.
-    """
+    """A solution of the graph."""
 
     adjustment: Adjustment[Any]
-    state: Any
-    norms: FloatArray
-    kept: BoolArray
+    state: Any  # of least cost
+    norms: FloatArray  # (E,) of the whitened residuals
+    kept: BoolArray  # (E,) False for outliers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Tied:
-    """The part of a graph that is tied to its anchor.
+    """The part of a graph that is tied to its anchor."""
 
-    Attributes:
-        located: (N,) which nodes.
-        order: these nodes, the anchor first, each after its parent.
-        parents: (N,) of the nodes: a tree of short edges.
-        positions: (E,) of the located edges between them, in the list that is solved.
-        pairs: (E, 2) their nodes.
-        motions: their motions.
-        frame_shape: (height, width) of a frame.
-    """
-
-    located: BoolArray
-    order: NDArray[np.integer]
-    parents: NDArray[np.integer]
-    positions: NDArray[np.integer]
-    pairs: NDArray[np.integer]
-    motions: Sequence[Located]
-    frame_shape: tuple[int, int]
+    located: BoolArray  # (N,) which nodes
+    order: NDArray[np.integer]  # these nodes, the anchor first, each after its parent
+    parents: NDArray[np.integer]  # (N,) of the nodes: a tree of short edges
+    positions: NDArray[np.integer]  # (E,) of the located edges between them, in the list that is solved
+    pairs: NDArray[np.integer]  # (E, 2) their nodes
+    motions: Sequence[Located]  # their motions
+    frame_shape: tuple[int, int]  # (height, width) of a frame
 
     @classmethod
     def of(cls, n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> _Tied:

@@ -55,39 +55,26 @@ class Recorder:
 
 @dataclass(frozen=True, slots=True)
 class NamedLocator:
-    """A locator of a level.
+    """A locator of a level."""
 
-    Attributes:
-        name: as in the spec; the second of a level with the same name is numbered, such as "opencv-sift 2".
-        component: the locator.
-        origin: who provides it, such as "locator 'opencv-sift' of photonpano 0.1.0".
-    """
-
-    name: str
+    name: str  # as in the spec; the second of a level with the same name is numbered, such as "opencv-sift 2"
     component: Locator
-    origin: str
+    origin: str  # who provides it, such as "locator 'opencv-sift' of photonpano 0.1.0"
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """The components of one level, built.
+    """The components of one level, built."""
 
-    Attributes:
-        number: from 1.
-        scale: pixels of the level's exposures per pixel of a frame.
-        locators: at least one; a pair that one of them does not locate is passed to the next.
-        origins: who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0".
-        recorder: records what they decide.
-    """
-
-    number: int
-    scale: float
+    number: int  # from 1
+    scale: float  # pixels of the level's exposures per pixel of a frame
     resampler: Resampler
     merger: Merger
-    locators: tuple[NamedLocator, ...]
+    locators: tuple[NamedLocator, ...]  # at least one; a pair that one of them does not locate is passed to the next
     interpolator: Interpolator
+    # who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0"
     origins: Mapping[str, str]
-    recorder: Recorder = field(default_factory=Recorder)
+    recorder: Recorder = field(default_factory=Recorder)  # records what they decide
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave out what only the process of the loop needs: the resampler and the interpolator."""

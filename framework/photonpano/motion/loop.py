@@ -26,25 +26,15 @@ from photonpano.values import FloatArray, Group
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelResult:
-    """The motion after one level.
+    """The motion after one level."""
 
-    Attributes:
-        level: its components.
-        groups: the frames of each virtual exposure.
-        located: pairs of exposures, their motions, and the homography of each exposure.
-        trajectory: the motion of every frame; the reference frame's homography is the identity.
-        uncertainty: the expected error of the trajectory.
-        seconds: time spent in each stage.
-        exposures: its virtual exposures, which can be merged again.
-    """
-
-    level: Level
-    groups: tuple[Group, ...]
-    located: LocatedLevel
-    trajectory: Trajectory
-    uncertainty: Uncertainty
+    level: Level  # its components
+    groups: tuple[Group, ...]  # the frames of each virtual exposure
+    located: LocatedLevel  # pairs of exposures, their motions, and the homography of each exposure
+    trajectory: Trajectory  # the motion of every frame; the reference frame's homography is the identity
+    uncertainty: Uncertainty  # the expected error of the trajectory
     seconds: dict[str, float]
-    exposures: VirtualExposures
+    exposures: VirtualExposures  # its virtual exposures, which can be merged again
 
     @property
     def change_px(self) -> float | None:

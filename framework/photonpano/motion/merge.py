@@ -17,23 +17,14 @@ from photonpano.values import FloatArray, Group, VirtualExposure
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VirtualExposures:
-    """The virtual exposures of a level, planned. May be used from several threads.
-
-    Attributes:
-        level: the components of the level.
-        source: the capture.
-        groups: the frames of each exposure.
-        previous: the motion known so far; None at the first level.
-        clock: adds up the time that merging takes.
-        timeline: where the image jumps; None if it is not known to.
-    """
+    """The virtual exposures of a level, planned. May be used from several threads."""
 
     level: Level
     source: Source
-    groups: Sequence[Group]
-    previous: Trajectory | None
-    clock: Stopwatch
-    timeline: Timeline | None = None
+    groups: Sequence[Group]  # the frames of each exposure
+    previous: Trajectory | None  # the motion known so far; None at the first level
+    clock: Stopwatch  # adds up the time that merging takes
+    timeline: Timeline | None = None  # where the image jumps; None if it is not known to
 
     @property
     def frame_shape(self) -> tuple[int, int]:

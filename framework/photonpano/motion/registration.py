@@ -29,19 +29,12 @@ BRIDGE = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """An exposure whose pairs with earlier ones are registered.
+    """An exposure whose pairs with earlier ones are registered."""
 
-    Attributes:
-        edges: these pairs.
-        contrast: of its image.
-        place: where it lies, at a first level that is tracked; None at others.
-        alternatives_px: distance of a second motion that fits as well, by the other exposure of the pair.
-    """
-
-    edges: tuple[Edge, ...]
-    contrast: Contrast
-    place: Place | None
-    alternatives_px: Mapping[int, float]
+    edges: tuple[Edge, ...]  # these pairs
+    contrast: Contrast  # of its image
+    place: Place | None  # where it lies, at a first level that is tracked; None at others
+    alternatives_px: Mapping[int, float]  # distance of a second motion that fits as well, by the other exposure of the pair
 
 
 class Registrar:

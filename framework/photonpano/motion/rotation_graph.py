@@ -31,15 +31,10 @@ _GRID = 7  # points of a frame along each axis to which a homography is fitted
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rotations:
-    """The rotations of a camera.
+    """The rotations of a camera."""
 
-    Attributes:
-        rotations: (N, 3, 3) from the camera at each node to that at the anchor.
-        camera: of all of them.
-    """
-
-    rotations: FloatArray
-    camera: Camera
+    rotations: FloatArray  # (N, 3, 3) from the camera at each node to that at the anchor
+    camera: Camera  # of all of them
 
     def of(self, nodes: slice) -> Rotations:
         """Return the rotations of some nodes."""
@@ -48,17 +43,11 @@ class Rotations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensShift:
-    """Change of the homographies of pairs caused by undistorting pixels with the wrong lens.
+    """Change of the homographies of pairs caused by undistorting pixels with the wrong lens."""
 
-    Attributes:
-        frame_shape: (height, width) of a frame.
-        points: (P, 2) all over a frame.
-        seen: (E, P) which of them both exposures of each pair see.
-    """
-
-    frame_shape: tuple[int, int]
-    points: FloatArray
-    seen: BoolArray
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    points: FloatArray  # (P, 2) all over a frame
+    seen: BoolArray  # (E, P) which of them both exposures of each pair see
 
     @classmethod
     def of(cls, frame_shape: tuple[int, int], observed: FloatArray) -> LensShift:

@@ -21,18 +21,12 @@ _SHORTEST_PART = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cut:
-    """A place where the image jumps from one frame to the next.
+    """A place where the image jumps from one frame to the next."""
 
-    Attributes:
-        frame: the first frame after the jump.
-        shift_px: (2,) by how much more than before and after it the image moves there, x and y in px of a frame.
-        sigmas: its size in standard deviations of what the image does nearby.
-        dark: frames around it that show nothing, so that the jump may lie anywhere among them; None where all have light.
-    """
-
-    frame: int
-    shift_px: FloatArray
-    sigmas: float
+    frame: int  # the first frame after the jump
+    shift_px: FloatArray  # (2,) by how much more than before and after it the image moves there, x and y in px of a frame
+    sigmas: float  # its size in standard deviations of what the image does nearby
+    # frames around it that show nothing, so that the jump may lie anywhere among them; None where all have light
     dark: FrameSpan | None = None
 
     def along(self, trajectory: Trajectory, frame_shape: tuple[int, int]) -> Cut:
@@ -65,15 +59,10 @@ class Cut:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timeline:
-    """Time of each frame, and frames where the image jumps.
+    """Time of each frame, and frames where the image jumps."""
 
-    Attributes:
-        taken: (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated.
-        cuts: where the image jumps, in order.
-    """
-
-    taken: FloatArray
-    cuts: tuple[Cut, ...] = ()
+    taken: FloatArray  # (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated
+    cuts: tuple[Cut, ...] = ()  # where the image jumps, in order
 
     @classmethod
     def regular(cls, n_frames: int) -> Timeline:

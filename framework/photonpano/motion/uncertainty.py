@@ -23,14 +23,10 @@ class Uncertainty:
 
     It combines the expected error at the located instants, due to photon noise; the extrapolation at constant velocity beyond
     the first and the last of them; and a share of the last change, since exposures merged along a wrong motion confirm it.
-
-    Attributes:
-        change_px: mean displacement of the corners since the previous level, px of a frame; None at the first level.
-        std_camera: (5,) expected errors of the focal length, in px, and of k1, k2, p1 and p2, 0 for what is given; None for
-            homographies.
     """
 
-    change_px: float | None
+    change_px: float | None  # mean displacement of the corners since the previous level, px of a frame; None at the first level
+    # (5,) expected errors of the focal length, in px, and of k1, k2, p1 and p2, 0 for what is given; None for homographies
     std_camera: FloatArray | None
 
     def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, timeline: Timeline) -> None:

@@ -31,27 +31,17 @@ _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Where a camera was, and where it looked.
+    """Where a camera was, and where it looked."""
 
-    Attributes:
-        camera: of all images.
-        frame_shape: (height, width) of an image.
-        names: file names of N images.
-        rotations: (N, 3, 3), directions of each camera to those of the world.
-        seconds: (N,) times of the images.
-        positions: (N, 3) of the cameras in the world; None if the camera only turned.
-        observed: for each image the indices of K points and where it shows them, (K, 2); empty if they are not known.
-        points: of the scene; None if they are not known.
-    """
-
-    camera: Camera
-    frame_shape: tuple[int, int]
-    names: tuple[str, ...]
-    rotations: FloatArray
-    seconds: FloatArray
-    positions: FloatArray | None = None
+    camera: Camera  # of all images
+    frame_shape: tuple[int, int]  # (height, width) of an image
+    names: tuple[str, ...]  # file names of N images
+    rotations: FloatArray  # (N, 3, 3), directions of each camera to those of the world
+    seconds: FloatArray  # (N,) times of the images
+    positions: FloatArray | None = None  # (N, 3) of the cameras in the world; None if the camera only turned
+    # for each image the indices of K points and where it shows them, (K, 2); empty if they are not known
     observed: tuple[tuple[NDArray[np.intp], FloatArray], ...] = ()
-    points: ScenePoints | None = None
+    points: ScenePoints | None = None  # of the scene; None if they are not known
 
     @property
     def places(self) -> FloatArray:

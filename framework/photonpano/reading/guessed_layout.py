@@ -214,15 +214,10 @@ def _correlation(moments: NDArray[np.float64]) -> float:
 
 
 class Channel(NamedTuple):
-    """The channel that a recognised capture is read with.
+    """The channel that a recognised capture is read with."""
 
-    Attributes:
-        keys: the key `channel` of the source, if the capture has channels.
-        clause: follows the reason why the capture was recognised.
-    """
-
-    keys: dict[str, int]
-    clause: str
+    keys: dict[str, int]  # the key `channel` of the source, if the capture has channels
+    clause: str  # follows the reason why the capture was recognised
 
 
 def with_channel(read: Callable[[int | None], Capture]) -> tuple[Capture, Channel] | None:

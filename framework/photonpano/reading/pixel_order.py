@@ -40,19 +40,12 @@ class PixelOrder(NamedTuple):
 
 
 class OtherOrder(NamedTuple):
-    """An order of the pixels that the frames show instead of another.
-
-    Attributes:
-        order: the order.
-        within: correlation of adjacent bits of a byte, photon noise included.
-        expected: correlation across the borders of bytes in the order that was expected.
-        found: correlation across them in the order that was found.
-    """
+    """An order of the pixels that the frames show instead of another."""
 
     order: PixelOrder
-    within: float
-    expected: float
-    found: float
+    within: float  # correlation of adjacent bits of a byte, photon noise included
+    expected: float  # correlation across the borders of bytes in the order that was expected
+    found: float  # correlation across them in the order that was found
 
     def __str__(self) -> str:
         return (

@@ -32,17 +32,11 @@ _NO_ANSWER = {
 
 
 class RemoteFile(NamedTuple):
-    """What a server says about a file.
+    """What a server says about a file."""
 
-    Attributes:
-        size: its bytes; None if the server does not say.
-        modified: when it was written; None if the server does not say.
-        etag: the server's mark of its content; None if there is none.
-    """
-
-    size: int | None
-    modified: datetime | None
-    etag: str | None
+    size: int | None  # its bytes; None if the server does not say
+    modified: datetime | None  # when it was written; None if the server does not say
+    etag: str | None  # the server's mark of its content; None if there is none
 
 
 def library(module: str, install: str, what: str) -> ModuleType:

@@ -47,19 +47,12 @@ _NOISE_FLOOR = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class _Outlier:
-    """A shift between two sums that the motion before and after does not explain.
+    """A shift between two sums that the motion before and after does not explain."""
 
-    Attributes:
-        before: number of the sum before.
-        after: number of the sum after.
-        shift_px: (2,) what is not explained, in binned px.
-        sigmas: its size in standard deviations.
-    """
-
-    before: int
-    after: int
-    shift_px: FloatArray
-    sigmas: float
+    before: int  # number of the sum before
+    after: int  # number of the sum after
+    shift_px: FloatArray  # (2,) what is not explained, in binned px
+    sigmas: float  # its size in standard deviations
 
 
 def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ...]:
@@ -189,19 +182,12 @@ def _located(source: Source, track: SumTrack, outlier: _Outlier) -> Cut | None:
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """A smooth path of the image with a jump: a cubic polynomial of time, and a step.
+    """A smooth path of the image with a jump: a cubic polynomial of time, and a step."""
 
-    Attributes:
-        middle: the instant around which time is counted.
-        scale: frames of a unit of time.
-        coefficients: (4, 2) of the polynomial, in binned px.
-        jump: (2,) the step.
-    """
-
-    middle: float
-    scale: float
-    coefficients: FloatArray
-    jump: FloatArray
+    middle: float  # the instant around which time is counted
+    scale: float  # frames of a unit of time
+    coefficients: FloatArray  # (4, 2) of the polynomial, in binned px
+    jump: FloatArray  # (2,) the step
 
     @classmethod
     def of(cls, track: SumTrack, outlier: _Outlier) -> _Path:

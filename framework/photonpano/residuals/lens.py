@@ -17,16 +17,12 @@ _INSTANTS = 64  # instants of the motion at which the effect of a lens is comput
 
 @dataclass(frozen=True, slots=True)
 class LensDistortion:
-    """Radial distortion, as residuals show it.
+    """Radial distortion, as residuals show it."""
 
-    Attributes:
-        k1: displacement of a corner, relative to its distance from the centre; negative for a barrel. To first order: a strong
-            distortion is found too small.
-        std: its standard deviation.
-    """
-
+    # displacement of a corner, relative to its distance from the centre; negative for a barrel. To first order: a strong
+    # distortion is found too small.
     k1: float
-    std: float
+    std: float  # its standard deviation
 
     @property
     def sigmas(self) -> float:

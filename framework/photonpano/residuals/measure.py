@@ -50,43 +50,27 @@ _PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """Observed minus predicted photons, summed in four ways.
+    """Observed minus predicted photons, summed in four ways."""
 
-    Attributes:
-        spans: S spans of frames, in order, that together are the located frames.
-        instants: (S,) their centres.
-        normal: (S, 5, 5) matrices of the least-squares equations of the spans: shift along x and y in px, roll in radians,
-            zoom and gain as fractions.
-        gradient: (S, 5) right-hand sides of these equations.
-        misfit: (S,) mean over the blocks of a span of squared residual / variance, expected to be 1.
-        blocks: (h, w, 12) sums over time, for each block of the sensor: see `block_sums`.
-        block_misfit: (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen.
-        pixel_gain: (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted.
-        pixel_mean: (H, W) predicted photons of each pixel, in one of four spans.
-        cell_misfit: (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was
-            seen.
-        cell_count: (H', W') number of blocks that fell on each square.
-        cell_noise: (H', W') mean over these blocks of variance / squared prediction: the squared relative noise of a block.
-        frames_seen: frames that saw a place of the panorama, the median over its pixels.
-        frame_shape: (height, width) of a frame.
-        light: (S,) mean gain of the light of each span, 1 in steady light.
-    """
-
-    spans: tuple[FrameSpan, ...]
-    instants: FloatArray
+    spans: tuple[FrameSpan, ...]  # S spans of frames, in order, that together are the located frames
+    instants: FloatArray  # (S,) their centres
+    # (S, 5, 5) matrices of the least-squares equations of the spans: shift along x and y in px, roll in radians, zoom and gain
+    # as fractions
     normal: FloatArray
-    gradient: FloatArray
-    misfit: FloatArray
-    blocks: FloatArray
-    block_misfit: FloatArray
-    pixel_gain: FluxImage
-    pixel_mean: FluxImage
+    gradient: FloatArray  # (S, 5) right-hand sides of these equations
+    misfit: FloatArray  # (S,) mean over the blocks of a span of squared residual / variance, expected to be 1
+    blocks: FloatArray  # (h, w, 12) sums over time, for each block of the sensor: see `block_sums`
+    block_misfit: FloatArray  # (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen
+    pixel_gain: FluxImage  # (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted
+    pixel_mean: FluxImage  # (H, W) predicted photons of each pixel, in one of four spans
+    # (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was seen
     cell_misfit: FloatArray
-    cell_count: FloatArray
+    cell_count: FloatArray  # (H', W') number of blocks that fell on each square
+    # (H', W') mean over these blocks of variance / squared prediction: the squared relative noise of a block
     cell_noise: FloatArray
-    frames_seen: float
-    frame_shape: tuple[int, int]
-    light: FloatArray
+    frames_seen: float  # frames that saw a place of the panorama, the median over its pixels
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    light: FloatArray  # (S,) mean gain of the light of each span, 1 in steady light
 
     def steps(self) -> SpanResiduals:
         """Solve for the motion of each span; the gain of the light is solved for, too, and left out."""
@@ -220,25 +204,16 @@ def _shift_noise_px(predictions: Predictions, homographies: FloatArray) -> float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Colour:
-    """Counts and prediction in one colour of the capture.
+    """Counts and prediction in one colour of the capture."""
 
-    Attributes:
-        source: its pixels.
-        prediction: the panorama in this colour.
-        masked: (H, W) 0, NaN for pixels of other colours and masked ones; None if there is none.
-        corrected: takes everything but the flux out of a sum of frames; None if there is nothing else.
-        dark: (H, W) what it subtracts for each frame.
-        extra: (H, W) the variance that this adds to the count of a frame.
-        slope: (H, W) factor of the counts; None for frames of grey levels, and if there is nothing to correct.
-    """
-
-    source: Capture
-    prediction: Prediction
-    masked: FluxImage | None
+    source: Capture  # its pixels
+    prediction: Prediction  # the panorama in this colour
+    masked: FluxImage | None  # (H, W) 0, NaN for pixels of other colours and masked ones; None if there is none
+    # takes everything but the flux out of a sum of frames; None if there is nothing else
     corrected: Callable[[Counts, int], FluxImage] | None
-    dark: FluxImage
-    extra: FluxImage
-    slope: FluxImage | None
+    dark: FluxImage  # (H, W) what it subtracts for each frame
+    extra: FluxImage  # (H, W) the variance that this adds to the count of a frame
+    slope: FluxImage | None  # (H, W) factor of the counts; None for frames of grey levels, and if there is nothing to correct
 
     @classmethod
     def of(cls, source: Capture, prediction: Prediction) -> _Colour:

@@ -28,31 +28,21 @@ class Prediction:
 
     The panorama is smoothed, and then sharpened by as much as smoothing and interpolation have blurred it, to second order. So
     its noise is low and its edges are where they were.
-
-    Attributes:
-        canvas: of the panorama.
-        mean: (H, W) float32, expected count of a frame; NaN where the panorama was not seen. Of a full turn, it has `margin`
-            columns more on each side, which continue on the other side.
-        precision: (H, W) float32, 1 / variance of the count of a frame; 0 where the panorama was not seen.
-        trajectory: the motion.
-        frame_shape: (height, width) of a frame.
-        frames_seen: frames that saw a place of the panorama, the median over its pixels.
-        response: of the camera.
-        light: the gain of each frame; None in steady light.
-        ideal: (H, W, 3) homogeneous ideal pixels of the pixels of a frame; None if homographies map them to the panorama.
-        margin: see `mean`.
     """
 
-    canvas: Canvas
+    canvas: Canvas  # of the panorama
+    # (H, W) float32, expected count of a frame; NaN where the panorama was not seen. Of a full turn, it has `margin` columns
+    # more on each side, which continue on the other side.
     mean: FluxImage
-    precision: FluxImage
+    precision: FluxImage  # (H, W) float32, 1 / variance of the count of a frame; 0 where the panorama was not seen
     trajectory: Trajectory
-    frame_shape: tuple[int, int]
-    frames_seen: float
-    response: Response
-    light: Light | None = None
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    frames_seen: float  # frames that saw a place of the panorama, the median over its pixels
+    response: Response  # of the camera
+    light: Light | None = None  # the gain of each frame; None in steady light
+    # (H, W, 3) homogeneous ideal pixels of the pixels of a frame; None if homographies map them to the panorama
     ideal: FloatArray | None = None
-    margin: int = 0
+    margin: int = 0  # see `mean`
 
     @classmethod
     def of(
@@ -165,13 +155,9 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predictions:
-    """The predictions of all colours of a capture: a `PanoramaView`. A grey capture has one.
+    """The predictions of all colours of a capture: a `PanoramaView`. A grey capture has one."""
 
-    Attributes:
-        parts: the source of each colour, with its prediction. Their motion is the same.
-    """
-
-    parts: tuple[tuple[Capture, Prediction], ...]
+    parts: tuple[tuple[Capture, Prediction], ...]  # the source of each colour, with its prediction. Their motion is the same.
 
     @classmethod
     def of(

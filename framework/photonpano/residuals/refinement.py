@@ -27,55 +27,34 @@ _WORSE_RATIO, _WORSE_MISFIT = 1.05, 0.01
 
 @dataclass(frozen=True, slots=True)
 class NamedRefiner:
-    """A refiner of a run.
-
-    Attributes:
-        name: as in the spec.
-        component: the refiner.
-        origin: who provides it, such as "refiner 'short-spans' of photonpano 0.1.0".
-    """
+    """A refiner of a run."""
 
     name: str
     component: Refiner
-    origin: str
+    origin: str  # who provides it, such as "refiner 'short-spans' of photonpano 0.1.0"
 
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """What a refiner did.
+    """What a refiner did."""
 
-    Attributes:
-        name: of the refiner.
-        rounds: the summary of each correction that was used.
-        change_px: mean displacement of the corners of the frames by all of them.
-        kept_out: why its last motion was not used; empty if it was.
-    """
-
-    name: str
-    rounds: tuple[str, ...]
-    change_px: float
-    kept_out: str = ""
+    name: str  # of the refiner
+    rounds: tuple[str, ...]  # the summary of each correction that was used
+    change_px: float  # mean displacement of the corners of the frames by all of them
+    kept_out: str = ""  # why its last motion was not used; empty if it was
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explained:
-    """The refined motion, and the residuals of the photons from the panorama along it.
+    """The refined motion, and the residuals of the photons from the panorama along it."""
 
-    Attributes:
-        motion: of every frame; its expected error covers what the residuals show.
-        panorama: rendered along the motion, for the residuals; in colour, with an image for each colour of the filter array.
-        canvas: of the panorama.
-        residuals: observed minus predicted photons.
-        ratio: see `residual_ratio`.
-        refinements: what each refiner did.
-    """
-
-    motion: FrameMotion
+    motion: FrameMotion  # of every frame; its expected error covers what the residuals show
+    # rendered along the motion, for the residuals; in colour, with an image for each colour of the filter array
     panorama: Panorama
-    canvas: Canvas
-    residuals: Residuals
-    ratio: float
-    refinements: tuple[Refinement, ...]
+    canvas: Canvas  # of the panorama
+    residuals: Residuals  # observed minus predicted photons
+    ratio: float  # see `residual_ratio`
+    refinements: tuple[Refinement, ...]  # what each refiner did
 
 
 class MotionFit:

@@ -28,21 +28,13 @@ _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why a run is doubtful.
+    """Why a run is doubtful."""
 
-    Attributes:
-        what: what was found, in a clause.
-        figure: the number that decided.
-        threshold: the largest number that is trusted.
-        where: the frames, pixels or places, in a clause; empty if it is everywhere.
-        what_to_do: advice, in a clause.
-    """
-
-    what: str
-    figure: float
-    threshold: float
-    where: str
-    what_to_do: str
+    what: str  # what was found, in a clause
+    figure: float  # the number that decided
+    threshold: float  # the largest number that is trusted
+    where: str  # the frames, pixels or places, in a clause; empty if it is everywhere
+    what_to_do: str  # advice, in a clause
 
     def __str__(self) -> str:
         where = f" ({self.where})" if self.where else ""
@@ -51,17 +43,11 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether motion and panorama explain the photons.
+    """Whether motion and panorama explain the photons."""
 
-    Attributes:
-        status: "trusted" or "doubtful".
-        reasons: why it is doubtful, the most telling first.
-        residual_ratio: scatter of the shifts of short spans, in units of what noise explains; None if it is unknown.
-    """
-
-    status: Literal["trusted", "doubtful"]
-    reasons: tuple[Reason, ...]
-    residual_ratio: float | None
+    status: Literal["trusted", "doubtful"]  # "trusted" or "doubtful"
+    reasons: tuple[Reason, ...]  # why it is doubtful, the most telling first
+    residual_ratio: float | None  # scatter of the shifts of short spans, in units of what noise explains; None if it is unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -44,31 +44,18 @@ class NotLocated:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """A pair of virtual exposures in the motion graph, with its motion.
+    """A pair of virtual exposures in the motion graph, with its motion."""
 
-    Attributes:
-        moving: index of the exposure that is mapped.
-        fixed: index of the exposure that it is mapped to.
-        motion: the map in pixels of frames (not of rescaled exposures), or the reason why there is none.
-        locator: the name of the locator that found the motion; empty where none did.
-    """
-
-    moving: int
-    fixed: int
-    motion: Located | NotLocated
-    locator: str = ""
+    moving: int  # index of the exposure that is mapped
+    fixed: int  # index of the exposure that it is mapped to
+    motion: Located | NotLocated  # the map in pixels of frames (not of rescaled exposures), or the reason why there is none
+    locator: str = ""  # the name of the locator that found the motion; empty where none did
 
 
 @dataclass(frozen=True, slots=True)
 class Ambiguity:
-    """Pairs of a level that fit a scene that repeats at more than one place, and that nothing decided between.
-
-    Attributes:
-        level: its number, from 1.
-        pairs: (moving, fixed) numbers of the exposures of each pair, in order.
-        alternative_px: how far from the motion taken the other one is, in px of a frame: the median of the pairs.
-    """
+    """Pairs of a level that fit a scene that repeats at more than one place, and that nothing decided between."""
 
     level: int
-    pairs: tuple[tuple[int, int], ...]
-    alternative_px: float
+    pairs: tuple[tuple[int, int], ...]  # (moving, fixed) numbers of the exposures of each pair, in order
+    alternative_px: float  # how far from the motion taken the other one is, in px of a frame: the median of the pairs

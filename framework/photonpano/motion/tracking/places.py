@@ -15,17 +15,11 @@ from photonpano.values import FloatArray, Group, Homography
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where an exposure lies.
+    """Where an exposure lies."""
 
-    Attributes:
-        segment: number of the first exposure of those that are tied to this one.
-        homography: (3, 3), pixels of its frame to those of that exposure's frame.
-        velocity: (2,) shift of the middle of the image per frame period, px, along the last pair that was located; None where
-            none was.
-    """
-
-    segment: int
-    homography: Homography
+    segment: int  # number of the first exposure of those that are tied to this one
+    homography: Homography  # (3, 3), pixels of its frame to those of that exposure's frame
+    # (2,) shift of the middle of the image per frame period, px, along the last pair that was located; None where none was
     velocity: FloatArray | None
 
 

@@ -21,17 +21,11 @@ _BLOCK = 32  # sums that are tracked in one task
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SumTrack:
-    """Sums of successive frames with light, and the shifts of the image between them.
+    """Sums of successive frames with light, and the shifts of the image between them."""
 
-    Attributes:
-        spans: (N,) of the sums, in order.
-        next_px: (N - 1, 2) shifts from each to the next, in binned px.
-        second_px: (N - 2, 2) shifts from each to the second next.
-    """
-
-    spans: Sequence[FrameSpan]
-    next_px: FloatArray
-    second_px: FloatArray
+    spans: Sequence[FrameSpan]  # (N,) of the sums, in order
+    next_px: FloatArray  # (N - 1, 2) shifts from each to the next, in binned px
+    second_px: FloatArray  # (N - 2, 2) shifts from each to the second next
 
     @property
     def centres(self) -> FloatArray:

@@ -48,19 +48,12 @@ _TIE = 4.0  # difference of the log likelihoods of hypotheses below which both a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses:
-    """Possible velocities of the image within one window.
+    """Possible velocities of the image within one window."""
 
-    Attributes:
-        velocities: (P, 2) in px of a frame per frame period, likeliest first.
-        heights: (P,) of the peaks, as shares of the highest.
-        px_per_frame: velocity that moves the image by one binned pixel between spans.
-        suspect: whether a part of the image may move otherwise than the likeliest velocity of its peaks.
-    """
-
-    velocities: FloatArray
-    heights: FloatArray
-    px_per_frame: float
-    suspect: bool = False
+    velocities: FloatArray  # (P, 2) in px of a frame per frame period, likeliest first
+    heights: FloatArray  # (P,) of the peaks, as shares of the highest
+    px_per_frame: float  # velocity that moves the image by one binned pixel between spans
+    suspect: bool = False  # whether a part of the image may move otherwise than the likeliest velocity of its peaks
 
     @property
     def apart(self) -> float:
@@ -71,21 +64,13 @@ class Hypotheses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StartingMotion:
-    """A motion without rotation, from the velocity of the image in windows of the length of a group.
+    """A motion without rotation, from the velocity of the image in windows of the length of a group."""
 
-    Attributes:
-        instants: (N,) centres of the windows in which the velocity was found.
-        velocities: (N, 2) of the image there, in px of a frame per frame period.
-        alternatives: (N, 2) velocities that are as likely; NaN where there is none.
-        reach: frames from the nearest of these instants within which the motion is known.
-        timeline: where the image jumps; None if it is not known to.
-    """
-
-    instants: FloatArray
-    velocities: FloatArray
-    alternatives: FloatArray
-    reach: float
-    timeline: Timeline | None = None
+    instants: FloatArray  # (N,) centres of the windows in which the velocity was found
+    velocities: FloatArray  # (N, 2) of the image there, in px of a frame per frame period
+    alternatives: FloatArray  # (N, 2) velocities that are as likely; NaN where there is none
+    reach: float  # frames from the nearest of these instants within which the motion is known
+    timeline: Timeline | None = None  # where the image jumps; None if it is not known to
 
     def between(self, moving: float, fixed: float) -> FloatArray | None:
         """Return the homography from the frame at one instant to that at another: (3, 3); None where it is not known."""

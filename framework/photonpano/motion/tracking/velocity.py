@@ -48,16 +48,11 @@ class Velocity:
 
     Convention:
         Points are (x, y), y down, integers are pixel centres. A positive turn is clockwise as one sees the picture.
-
-    Attributes:
-        turn: of the image, in radians per frame period.
-        shift: (2,) velocity of what is at `middle`, in px per frame period.
-        middle: (2,) point of the frame.
     """
 
-    turn: float
-    shift: FloatArray
-    middle: FloatArray
+    turn: float  # of the image, in radians per frame period
+    shift: FloatArray  # (2,) velocity of what is at `middle`, in px per frame period
+    middle: FloatArray  # (2,) point of the frame
 
     @property
     def centre(self) -> FloatArray:
@@ -109,19 +104,12 @@ def mean_shift(shift: FloatArray, angle: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundVelocity:
-    """A velocity that was found, and how certain it is.
-
-    Attributes:
-        velocity: of the image.
-        covariance: (3, 3) of the turn and the shift, from the scatter of the spans.
-        significance: height of the peak, in standard deviations over all velocities.
-        halves: the velocities that the first and second half of the capture show each by itself.
-    """
+    """A velocity that was found, and how certain it is."""
 
     velocity: Velocity
-    covariance: FloatArray
-    significance: float
-    halves: tuple[Velocity, Velocity]
+    covariance: FloatArray  # (3, 3) of the turn and the shift, from the scatter of the spans
+    significance: float  # height of the peak, in standard deviations over all velocities
+    halves: tuple[Velocity, Velocity]  # the velocities that the first and second half of the capture show each by itself
 
     @property
     def std_turn(self) -> float:
