@@ -46,11 +46,7 @@ def order_warning(source: Source) -> str | None:
 
 @contextmanager
 def naming_obstacles(source: Source, decisions: Sequence[Decision]) -> Iterator[None]:
-    """Add the obstacles of a capture to the error of a block that could not locate its exposures.
-
-    Raises:
-        LocationError: with the sentences of `obstacles` at its end.
-    """
+    """Append the sentences of `obstacles` to the `LocationError` of a block."""
     try:
         yield
     except LocationError as error:
@@ -60,12 +56,7 @@ def naming_obstacles(source: Source, decisions: Sequence[Decision]) -> Iterator[
 
 
 def obstacles(source: Source, decisions: Sequence[Decision]) -> list[str]:
-    """Return sentences about what makes a capture hard to locate; empty if nothing is found.
-
-    Args:
-        source: the capture.
-        decisions: what was chosen from the capture; of them, the share of the frame that stands still is used.
-    """
+    """Return sentences about what makes a capture hard to locate; `decisions` hold the share of the frame that stands still."""
     return [*_standing(decisions), *_repeating(source)]
 
 
@@ -109,13 +100,9 @@ def _sum(source: Source, span: FrameSpan) -> NDArray[Any]:
 
 
 def repetition_px(first: NDArray[Any], second: NDArray[Any]) -> float | None:
-    """Return the distance after which an image repeats; None if it does not.
+    """Return the distance after which an image repeats, from two sums of frames (H, W); None if it does not.
 
-    Two sums of frames are compared, so that photon noise, which they do not share, plays no part.
-
-    Args:
-        first: (H, W) sum of frames.
-        second: (H, W) sum of the frames that follow.
+    Photon noise plays no part, since the two sums do not share it.
     """
     height, width = first.shape
     padded = 2 * height, 2 * width

@@ -60,10 +60,7 @@ def pictures(source: Source, spans: Sequence[FrameSpan], style: Style, threads: 
 
 
 def still_exposure(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the flux of the sum of some frames, without any motion: (H, W), or (H, W, 3) behind a filter array.
-
-    Pixels that are masked are NaN.
-    """
+    """Return the flux of the sum of some frames, without motion: (H, W), or (H, W, 3) in colour; NaN where masked."""
     still = Chunk(span, np.eye(3))
 
     def merged(each: Source) -> Panorama:
@@ -86,11 +83,7 @@ def _label(span: FrameSpan, info: StreamInfo) -> NDArray[np.uint8]:
 
 
 def require_sharp_views(source: Source) -> Capture:
-    """Return a capture that knows what its frames show without noise.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Return a capture that knows its frames without noise, or raise an `InputError`."""
     capture = capture_of(source)
     if capture.has_sharp_views:
         return capture

@@ -22,12 +22,9 @@ _FEWEST_NEW = 20
 
 
 def timeline_of(source: Source, context: Context) -> Timeline:
-    """Return the timeline of a capture, in which repeated frames take no time.
+    """Return the timeline of a capture, in which repeated frames take no time; raise an `InputError` if all are copies.
 
     Only packed frames are compared: others would have to be read twice.
-
-    Raises:
-        InputError: all frames are copies of the first one.
     """
     capture, n_frames = capture_of(source), source.info.n_frames
     if not capture.is_packed:

@@ -36,22 +36,10 @@ def write_folder(
     progress: Callable[[int], object] | None = None,
     threads: int = 2,
 ) -> tuple[Path, ...]:
-    """Write a binary source as a folder, whole or not at all, in constant memory; its truth as `write_packed` does.
-
-    Args:
-        source: the capture.
-        path: the folder, which must not be there.
-        write: writes the frames into an empty folder: the `write` of a source, with its last argument.
-        progress: called with the number of frames written since the last call.
-        threads: how many threads read the source.
-
-    Returns:
-        The folder, and the file of the truth if there is one.
+    """Write a binary source as a folder by `write`, whole or not at all, in constant memory; otherwise as `write_packed`.
 
     Raises:
-        InputError: as `write_packed`.
         OutputError: there is something under that name, or the folder cannot be written, or does not fit on the disk.
-        PluginError: as `write_packed`.
     """
     _require_bits(source, path)
     packed, truth = PackedFrames(source), _truth_of(source)
@@ -192,11 +180,7 @@ class PackedFrames:
             yield FrameSpan(start, min(start + step, last))
 
     def of(self, span: FrameSpan) -> NDArray[np.uint8]:
-        """Return the frames of a span: (n, H, ceil(W / 8)) uint8, contiguous.
-
-        Raises:
-            PluginError: the source returns an array of another shape or type.
-        """
+        """Return the frames of a span, (n, H, ceil(W / 8)) uint8, contiguous; a `PluginError` if the source returns others."""
         packed = self._capture.packed(span)
         expected = (len(span), *self._frame)
         if packed.shape != expected or packed.dtype != np.uint8:
@@ -209,7 +193,7 @@ class PackedFrames:
     def found_in(self, file: BinaryIO, threads: int) -> int | None:
         """Return how many frames of this source a file begins with; None if it is another file.
 
-        Every frame is compared. The first of them that differs ends what is found: it was damaged, or half written.
+        Every frame is compared. The first that differs, damaged or half written, ends what is found.
         """
         file.seek(0)
         start = file.read(len(self.header))

@@ -18,14 +18,13 @@ from photonpano.values import FloatArray
 
 @contextmanager
 def attributing(origin: str, where: str) -> Iterator[None]:
-    """Attribute errors of the block to a component. Errors that are written for users, and interrupts, pass unchanged.
+    """Raise a `PluginError` that names a component for errors of the block.
+
+    Errors that are written for users, and interrupts, pass unchanged.
 
     Args:
         origin: who provides the component, such as "merger 'photon-mle' of photonpano 0.1.0".
         where: what it works on, such as "level 2" or "frames 0 to 15".
-
-    Raises:
-        PluginError: the component failed, or broke its contract.
     """
     try:
         yield
@@ -40,13 +39,7 @@ def attributing(origin: str, where: str) -> Iterator[None]:
 
 
 class AttributedTrajectory:
-    """A trajectory whose errors name its interpolator, and whose homographies are checked.
-
-    Args:
-        trajectory: what the interpolator fitted.
-        origin: who provides the interpolator, such as "interpolator 'geodesic' of photonpano 0.1.0".
-        level: the number of the level that it was fitted at.
-    """
+    """A trajectory fitted at a level, whose errors name its interpolator, and whose homographies are checked."""
 
     def __init__(self, trajectory: Trajectory, origin: str, level: int) -> None:
         self._trajectory = trajectory
@@ -54,11 +47,7 @@ class AttributedTrajectory:
         self._level = level
 
     def at(self, frame_indices: ArrayLike) -> FloatArray:
-        """Return the homographies of N instants: (N, 3, 3).
-
-        Raises:
-            PluginError: the trajectory failed, or returned anything but N finite homographies.
-        """
+        """Return the homographies of N instants, (N, 3, 3), or raise a `PluginError`."""
         frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
         with attributing(self._origin, f"level {self._level}"):
             found = HOMOGRAPHIES.require(np.asarray(self._trajectory.at(frame_indices)), frames)

@@ -31,14 +31,9 @@ def is_inverse_covariance(matrix: object) -> bool:
 
 
 def why_undetermined(motion: Located, frame_shape: tuple[int, int]) -> str | None:
-    """Return why the images of a pair do not determine its motion, as those of stripes that move along themselves.
+    """Return why the images of a pair do not determine its motion, in px of a frame; None if they do.
 
-    Args:
-        motion: in px of a frame.
-        frame_shape: (height, width) of a frame.
-
-    Returns:
-        A clause if the expected error of a corner exceeds `UNDETERMINED` times the longer side of a frame.
+    The expected error of a corner exceeds `UNDETERMINED` times the longer side, as of stripes that move along themselves.
     """
     worst_px, limit_px = motion.residual_px or 0.0, UNDETERMINED * max(frame_shape)
     if motion.information is not None:

@@ -80,11 +80,7 @@ GROUPS: Contract[tuple[Group, ...]] = Contract(
 
 
 def require_groups(found: Iterable[Any], n_frames: int) -> tuple[Group, ...]:
-    """Return the groups that a resampler returned for a capture, if they keep the contract.
-
-    Raises:
-        BrokenContract: there is none, or they are not in order, or lie outside the capture.
-    """
+    """Return the groups that a resampler returned for a capture, or raise `BrokenContract`."""
     return GROUPS.require(tuple(islice(found, 2 * n_frames)), n_frames)  # a generator may have no end
 
 
@@ -204,11 +200,7 @@ def contract_for(found: object) -> Contract[Any]:
 
 
 def require_valid(found: object) -> Located | NotLocated:
-    """Return what a locator returned for a pair, if it keeps the contract.
-
-    Raises:
-        BrokenContract: it is neither `Located` with finite numbers nor `NotLocated`.
-    """
+    """Return what a locator returned for a pair, or raise `BrokenContract`."""
     motion: Located | NotLocated = contract_for(found).require(found)
     return motion
 
@@ -225,34 +217,16 @@ _MOVING: Contract[float] = Contract(
 
 
 def require_no_standstill(motion: Located, expected: Homography | None, frame_shape: tuple[int, int]) -> None:
-    """Refuse the identity, or nearly the identity, as the motion of a pair if the motion known so far is far from it.
-
-    Args:
-        motion: what a locator returned, in any unit: the identity is the same in all.
-        expected: (3, 3) the motion known so far, in px of a frame; None at the first level.
-        frame_shape: (height, width) of a frame.
-
-    Raises:
-        BrokenContract: the locator returned the identity instead of a failure.
-    """
+    """Raise `BrokenContract` for nearly the identity if the motion known so far, in px of a frame, is far from it."""
     if expected is not None and np.abs(motion.homography - np.eye(3)).max() <= STILL_PX:
         _MOVING.require(float(corner_displacements(expected, np.eye(3), frame_shape).mean()), frame_shape)
 
 
 def why_still(homographies: Sequence[Homography], frame_shape: tuple[int, int], seen_px: Callable[[], float]) -> str | None:
-    """Return why the located pairs of a level cannot all stand still: the locator does not report its failures.
+    """Return why the located pairs of a level cannot all stand still, as a clause; None if they may.
 
     Because of photon noise, a camera that stands still gives nearly the identity, and never exactly. Nearly the identity is
-    refused if short spans of frames show that the image moves.
-
-    Args:
-        homographies: of the pairs that were located.
-        frame_shape: (height, width) of a frame.
-        seen_px: returns by how much the image moves between two exposures, as short spans of frames show it; called only if
-            every pair is nearly the identity.
-
-    Returns:
-        A clause; None if they may be right.
+    refused if `seen_px`, which is called only then, returns that short spans of frames show a motion between exposures.
     """
     if not homographies:
         return None

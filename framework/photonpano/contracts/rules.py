@@ -18,11 +18,9 @@ class BrokenContract(Exception):  # noqa: N818 - it is not raised to callers
 
 
 class Contract(Generic[T]):
-    """The rules for what one kind of component returns.
+    """The rules for what one kind of component returns: `rules` for runs, each of which may rely on those before it.
 
-    Args:
-        rules: what a run refuses; each may rely on those before it.
-        strict: what only the conformance kit refuses, while a run converts it or can do without.
+    `strict` are those of the conformance kit alone: a run converts such a value, or can do without it.
     """
 
     def __init__(self, rules: Sequence[Rule], strict: Sequence[Rule] = ()) -> None:
@@ -30,11 +28,7 @@ class Contract(Generic[T]):
         self.strict = tuple(strict)
 
     def require(self, found: Any, facts: Any = None) -> T:
-        """Return a value that keeps the rules of a run.
-
-        Raises:
-            BrokenContract: it does not; the message is that of the first rule that it breaks.
-        """
+        """Return a value that keeps the rules of a run, or raise `BrokenContract` with the sentence of the first broken one."""
         for sentence, check in self.rules:
             if wrong := check(found, facts):
                 raise BrokenContract(_filled(sentence, wrong))

@@ -25,7 +25,7 @@ def corrected_source(
     blame: Callable[[int, str], Exception] | None = None,
     look: bool = True,
 ) -> Capture:
-    """Return a capture with corrections. Frames and counts stay whole numbers, as they were recorded.
+    """Return a capture with corrections, in order. Frames and counts stay whole numbers, as they were recorded.
 
     Args:
         source: the capture as it is read; closing the corrected one closes it.

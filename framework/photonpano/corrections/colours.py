@@ -101,11 +101,7 @@ def _line(response: Response, mean: float, gain: float) -> tuple[float, float]:
 def _clear_mix(sums: NDArray[np.float32], n_frames: int, pixels: list[BoolArray], response: Response) -> FloatArray:
     """Estimate the factors of red, green and blue in clear pixels, from squares of the sensor: least squares with a prior.
 
-    Args:
-        sums: (S, H, W) of spans.
-        n_frames: of a span.
-        pixels: (H, W) masks of the colours.
-        response: the camera's response.
+    `sums` (S, H, W) are of `n_frames` each; `pixels` (H, W) are masks of the colours.
     """
     if not pixels[3].any():
         return np.ones(3)

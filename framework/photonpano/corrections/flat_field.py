@@ -97,14 +97,10 @@ def write_vignette(folder: Path, vignette: Vignette) -> None:
 
 
 def read_vignette(folder: Path, source: Source) -> Vignette | None:
-    """Read the vignette by which a run has divided its capture; None if it found none.
-
-    Args:
-        folder: the run folder.
-        source: the capture.
+    """Read the vignette of a run folder; None if there is none.
 
     Raises:
-        InputError: vignette.npz is damaged, or of frames of another size.
+        InputError: the file is damaged, or of frames of another size.
     """
     path = folder / VIGNETTE_FILE
     if not path.exists():

@@ -25,7 +25,7 @@ class Rearrangement(Correction):
 
     @abstractmethod
     def moved(self, pixels: Index) -> Index:
-        """Move the numbers of pixels, (H, W): -1 stands for a pixel that the sensor does not have.
+        """Move the numbers of pixels, (H, W): -1 stands for a pixel that the sensor lacks.
 
         Raises:
             InputError: the frame is too small.

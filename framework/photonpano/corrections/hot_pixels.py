@@ -68,16 +68,10 @@ class HotPixels(Correction):
 
 
 def hot_in_the_dark(dark: DarkFrames, threshold: float, valid: BoolArray) -> tuple[BoolArray, float]:
-    """Return the pixels that have far more dark counts than most.
+    """Return the pixels (H, W) that have far more dark counts than most, and the rate above which pixels are hot.
 
-    Args:
-        dark: the dark counts.
-        threshold: standard deviations above the median from which a pixel is hot. The standard deviation comes from the median
-            absolute deviation, and is at least that of photon noise.
-        valid: (H, W) the pixels that count for the median.
-
-    Returns:
-        (H, W) mask of hot pixels, and the rate above which pixels are hot.
+    The limit lies `threshold` standard deviations above the median of the `valid` pixels. The standard deviation comes from the
+    median absolute deviation, and is at least that of photon noise.
     """
     rates = dark.rates[valid]
     if not rates.size:
@@ -105,15 +99,12 @@ def _standing_out(pixels: Pixels, capture: Capture, threshold: float) -> tuple[B
 
 
 def outliers(image: FluxImage, noise_std: float, threshold: float) -> BoolArray:
-    """Return the pixels that are brighter or darker than their neighbours.
+    """Return the pixels that are brighter or darker than their neighbours: (H, W) bool, False at unknown pixels.
 
     Args:
         image: (H, W), on the scale on which photon noise is uniform; NaN at pixels that must not be used.
         noise_std: standard deviation of photon noise.
         threshold: smallest deviation, in robust standard deviations of the other pixels.
-
-    Returns:
-        (H, W) bool, False at unknown pixels.
     """
     around = sorted_neighbours(image, reach_of(image))
     differences = np.abs(image - brightest(around, 0.5))
@@ -145,12 +136,7 @@ def sorted_neighbours(image: FluxImage, reach: int = _REACH) -> FluxImage:
 
 
 def brightest(around: FluxImage, share: float) -> FluxImage:
-    """Return, for each pixel, the value that the brightest share of its neighbours reach; NaN where fewer than 6 are known.
-
-    Args:
-        around: (H, W, N), from `sorted_neighbours`.
-        share: fraction of the neighbours.
-    """
+    """Return the value that the brightest share of the neighbours (H, W, N) of each pixel reach; NaN with fewer than 6."""
     known = _n_known(around)
     return _picked(around, known, known - np.floor(known * share))
 

@@ -61,11 +61,7 @@ class Pixels:
         return replace(self, valid=self.valid & ~bad)
 
     def require(self, shape: tuple[int, ...], what: object) -> None:
-        """Refuse a file whose size differs from that of frames after the corrections so far.
-
-        Raises:
-            InputError: the sizes differ.
-        """
+        """Raise an `InputError` for a file whose size differs from that of frames after the corrections so far."""
         if shape != self.shape:
             given = "x".join(map(str, shape)) + " px" if len(shape) == 2 and all(shape) else f"the shape {shape}"
             here = "x".join(map(str, self.shape))
@@ -86,11 +82,8 @@ class Correction(Config, ABC):
     def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
         """Apply the correction to the pixels that the corrections before it have left.
 
-        Args:
-            pixels: the pixels so far.
-            capture: as it is read.
-            decide: records what was chosen because of the capture or a file. None means that no frame may be read yet: the
-                correction leaves out what depends on frames.
+        `capture` is as it is read. `decide` records what was chosen because of the capture or a file; with None, no frame may
+        be read yet, and the correction leaves out what depends on frames.
 
         Raises:
             InputError: the correction does not suit the pixels, or a file holds something else.

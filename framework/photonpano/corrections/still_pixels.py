@@ -171,11 +171,7 @@ class _Parts:
 
 
 def _variation(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> tuple[FluxImage, FluxImage, FluxImage]:
-    """Blur the sums against photon noise; return their mean, their noise, and their variance over time without that noise.
-
-    Returns:
-        Mean of the blurred sums per frame, and variance of the photon noise of one of them; variance, averaged over squares.
-    """
+    """Return mean and photon noise of the blurred sums per frame, and their variance over time without noise, over squares."""
     n_spans, total, known = len(sums), len(sums) * n_frames, usable.astype(np.float32)
     near = np.maximum(_blurred(known), np.float32(1e-3)) * n_frames
 

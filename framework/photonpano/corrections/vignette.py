@@ -30,17 +30,10 @@ _SURE = 6.0  # standard errors by which a vignette must differ from none: the sc
 
 
 def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None:
-    """Compare what different pixels saw of the same places.
+    """Compare what different pixels saw of the same places; None where there is no vignette, or no motion that could show it.
 
     A square of the sensor with the gain g, which sees a place of the scene of the flux S in the light L of the time, gets the
     flux `g S L` on average. In logarithms these are linear equations with Poisson weights; S and L are eliminated.
-
-    Args:
-        source: a capture of binary frames.
-        trajectory: its motion, known to a few pixels.
-
-    Returns:
-        None where there is no vignette, or nothing moves that could show it.
     """
     capture = capture_of(source)
     spans = _spans(capture, trajectory)
@@ -110,7 +103,7 @@ def _spans(capture: Capture, trajectory: Trajectory) -> list[FrameSpan]:
 def _solved(
     flux: FloatArray, weight: FloatArray, cells: NDArray[np.intp], times: NDArray[np.intp], shape: FloatArray
 ) -> FloatArray | None:
-    """Solve `log flux = shape @ c + (a number for each cell) + (a number for each time)` for c.
+    """Solve `log flux = shape @ c + (a number for each cell) + (a number for each time)` for c, (P,); None if c may be 0.
 
     Args:
         flux: (N,) positive.
@@ -118,9 +111,6 @@ def _solved(
         cells: (N,) index of the cell.
         times: (N,) index of the time.
         shape: (N, P).
-
-    Returns:
-        (P,); None if c does not differ from 0 with certainty.
     """
     n_cells, n_times, n_shape = cells.max() + 1, times.max() + 1, shape.shape[1]
     logarithm, robust = np.log(flux), np.ones_like(flux)

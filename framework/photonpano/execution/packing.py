@@ -12,15 +12,7 @@ _CAPTURE = "capture"
 
 
 def packed(value: object, capture: object) -> bytes:
-    """Pickle a value.
-
-    Args:
-        value: what it holds of the capture travels as a name.
-        capture: the source that stands for the capture.
-
-    Raises:
-        PluginError: something that the value holds cannot be pickled.
-    """
+    """Pickle a value, in which the capture travels as a name; a `PluginError` says what cannot be pickled."""
     buffer = io.BytesIO()
     try:
         _Packer(buffer, capture).dump(value)
@@ -32,12 +24,7 @@ def packed(value: object, capture: object) -> bytes:
 
 
 def unpacked(data: bytes, capture: object) -> Any:
-    """Return a value from what `packed` returned.
-
-    Args:
-        data: the value.
-        capture: takes the place of the capture.
-    """
+    """Return a value from what `packed` returned; `capture` takes the place of the capture."""
     return _Unpacker(io.BytesIO(data), capture).load()
 
 

@@ -172,12 +172,7 @@ def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
 
 
 def _work(of_two: Sequence[bool], *given: Any) -> Any:
-    """Work on a task, in the process of a worker.
-
-    Args:
-        of_two: which of the things that are given are results of two values, the first of which is meant.
-        given: the function, and its arguments.
-    """
+    """Work on a task, a function and its arguments, in a worker; `of_two` marks results of two values, whose first is meant."""
     meant = (each[0] if first else each for first, each in zip(of_two, given, strict=True))
     work, *values = (each.value() if isinstance(each, _Sent) else each for each in meant)
     return work(*values)

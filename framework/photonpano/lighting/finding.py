@@ -25,13 +25,7 @@ _SPAN_PX = 4.0  # the image moves by no more than this in a span
 
 
 def find_light(source: Source, trajectory: Trajectory, context: Context) -> Light | None:
-    """Measure the light of a capture; None if it is steady.
-
-    Args:
-        source: the capture.
-        trajectory: its motion, known to a few pixels.
-        context: threads.
-    """
+    """Measure the light of a capture along its motion, known to a few pixels; None if it is steady."""
     n_frames = source.info.n_frames
     longest = max(1, min(_PROBE_FRAMES, int(_SPAN_PX / max(speed_px(source, trajectory), 1e-9)), n_frames // _PROBES))
     gains = _gains(source, trajectory, _spread(n_frames, longest), context)
@@ -44,13 +38,7 @@ def changes(gains: Gains) -> bool:
 
 
 def measure_light(source: Source, trajectory: Trajectory, context: Context) -> Light:
-    """Measure the gain of each frame of a capture.
-
-    Args:
-        source: the capture.
-        trajectory: its motion, known to a few pixels.
-        context: threads.
-    """
+    """Measure the gain of each frame of a capture along its motion, known to a few pixels."""
     n_frames = source.info.n_frames
     length = min(n_frames, max(_FEWEST_FRAMES, -(-n_frames // _MOST_SPANS)))
     bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
@@ -65,7 +53,7 @@ def measure_light(source: Source, trajectory: Trajectory, context: Context) -> L
 
 
 def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray, std: FloatArray) -> Light:
-    """Correct light by what the panorama in it does not explain.
+    """Correct light by what the panorama rendered in it does not explain.
 
     Squares of the scene are brighter and darker inside, so that a sensor that saturates sees too little of their changes; a
     panorama has every pixel. Lamps over parts of the scene stay as they are.

@@ -42,17 +42,12 @@ class PixelGain:
 
 
 def measure_pixel_gain(source: Source, trajectory: Trajectory, context: Context) -> PixelGain:
-    """Compare what different pixels saw of the same places.
+    """Compare what different pixels saw of the same places, along a motion known to a few pixels.
 
     A square c of the scene sends `exposure exp(s_c + l_t + sum_k a_k b_k(x))` photons in the span t, in which it lies at the
     pixel x of the sensor. The knots a_k of the logarithm of the gain are found by iterated least squares, together with the
     light l_t; the brightness s_c is eliminated. Their prior is a Gaussian whose spread is that of the knots themselves, so that
     what the motion leaves open stays flat, as does the field of a sensor whose pixels are alike.
-
-    Args:
-        source: the capture.
-        trajectory: its motion, known to a few pixels.
-        context: threads.
 
     Raises:
         InputError: the motion cannot tell the gain from the scene, or the camera turns too far for a plane.
@@ -139,11 +134,7 @@ class _Solved:
 
 
 def _solved(seen: SeenCells, basis: Any, correlation: FloatArray) -> _Solved:
-    """Solve for the knots.
-
-    Raises:
-        InputError: they stay unknown.
-    """
+    """Solve for the mean (K,) and covariance (K, K) of the knots, or raise an `InputError` if they stay unknown."""
     n_times, n_knots = len(seen.spans), basis.shape[1]
     root = np.linalg.cholesky(correlation)
     every, ones = np.arange(len(seen.cells)), np.ones(len(seen.cells))
@@ -190,11 +181,7 @@ def _solved(seen: SeenCells, basis: Any, correlation: FloatArray) -> _Solved:
 
 
 def _require_known(information: FloatArray, correlation: FloatArray) -> None:
-    """Refuse a gain that stays unknown.
-
-    Raises:
-        InputError: photons and motion do not determine enough of its variance.
-    """
+    """Raise an `InputError` if photons and motion do not determine enough of the variance of the gain."""
     seen = np.diag(information) > 0
     left = np.linalg.inv(information + np.linalg.inv(correlation * _WIDEST**2))
     # The mean of the gain is that of the scene.

@@ -106,12 +106,7 @@ def _is_local(gains: Gains, frequency: float) -> bool:
 
 
 def measure_local_flicker(gains: Gains, frequency: float) -> LocalFlicker:
-    """Fit the amplitude and the phase of each square of the scene.
-
-    Args:
-        gains: of spans much shorter than a period.
-        frequency: in cycles per frame.
-    """
+    """Fit the amplitude and the phase of each square of the scene at a frequency; spans must be much shorter than a period."""
     seen = gains.seen
     lengths = np.array([len(span) for span in seen.spans], float)
     phase = 2 * np.pi * frequency * seen.instants

@@ -83,13 +83,9 @@ class Gains:
 
 
 def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan], context: Context) -> SeenCells:
-    """Sum the photons of squares of the scene in spans of frames, along a motion.
+    """Sum the photons of squares of the scene in spans of frames, along a motion known to a few pixels.
 
-    Args:
-        source: the capture.
-        trajectory: its motion, known to a few pixels.
-        spans: so short that the image hardly moves in them; those that a plane can hardly show are left out.
-        context: threads.
+    The image must hardly move in a span; spans that a plane can hardly show are left out.
     """
     shape = source.info.frame_shape
     motions = trajectory.at([span.centre for span in spans])
@@ -121,12 +117,7 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
 
 
 def _least_weight(source: Source, side: int) -> float:
-    """Return what the faintest square of the sensor is worth: masked pixels, and those of faint colours, cover less everywhere.
-
-    Args:
-        source: the capture.
-        side: of a square, px.
-    """
+    """Return what the faintest square of `side` px is worth: masked pixels, and those of faint colours, cover less."""
     weights = weights_of(source)
     if weights is None:
         return 1.0
@@ -239,11 +230,9 @@ def _first_guess(seen: SeenCells) -> tuple[FloatArray, FloatArray]:
 
 
 def _step(seen: SeenCells, weight: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Solve `step = s_c + l_t` for both.
+    """Solve `step = s_c + l_t` for changes of the light (S,) and of the squares (C,).
 
-    Returns:
-        Changes of the light, (S,), and of the squares, (C,); the covariance of the light, (S, S); and how much two spans saw of
-        the same squares, (S, S), in weights.
+    Also return the covariance of the light, (S, S), and how much two spans saw of the same squares, (S, S), in weights.
     """
     n_times = len(seen.spans)
     matrix = np.zeros((seen.n_cells, n_times))

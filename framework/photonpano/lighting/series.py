@@ -21,9 +21,7 @@ _DARKEST = 0.02  # least gain of spans from which slow changes are fitted
 def flicker_frequency(instants: FloatArray, gain: FloatArray) -> float:
     """Return the frequency of the strongest line in the spectrum of a series, in cycles per frame; 0 if none stands out.
 
-    Args:
-        instants: (S,) evenly spaced, in frames.
-        gain: (S,) gain of the light, or (S, N) several series of one frequency.
+    The instants (S,) are evenly spaced, in frames; `gain` is (S,), or (S, N) for several series of one frequency.
     """
     n = len(instants)
     if n < _FEWEST_SPANS:
