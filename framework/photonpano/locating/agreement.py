@@ -35,13 +35,8 @@ def rotation_of_most(moving: FloatArray, fixed: FloatArray, camera: Camera, thre
     """Return the homography K R K^-1 of the rotation R on which most matches agree; None if no two of them determine one.
 
     Every two matches determine a rotation. Those of all pairs, or of a sample, are scored by the squared distances that they
-    leave, each at most that of the threshold; the best is fitted to the matches that agree with it.
-
-    Args:
-        moving: (N, 2) points of the moving image.
-        fixed: (N, 2) their partners.
-        camera: with the matrix K, in px of the images, without distortion.
-        threshold_px: distance within which a match agrees.
+    leave, each at most that of the threshold; the best is fitted to the matches that agree with it. Points are (N, 2) in px of
+    images without distortion.
     """
     rays, partners = camera.directions(moving), camera.directions(fixed)
     first, second = _pairs(len(moving))
@@ -71,19 +66,12 @@ def rotation_of_most(moving: FloatArray, fixed: FloatArray, camera: Camera, thre
 def agreeing_by_chance(
     moving: FloatArray, fixed: FloatArray, homography: Homography, threshold_px: float, search_px: float
 ) -> int:
-    """Return the largest number of matches that may agree on a rotation by chance.
+    """Return the largest number of matches, (N, 2) points and partners, that may agree on a rotation by chance.
 
     This is an a-contrario test (Moisan and Stival 2004). Two of N matches determine a rotation; each other one agrees with it
     by chance with a probability p. More than the number returned do so for `_FALSE_ALARMS` of all N (N - 1) / 2 rotations on
-    average. Where partners are searched within a radius, p is the share of its area. In the whole image, p is the share of
-    matches that would agree if they exchanged their partners; it is large where keypoints cluster.
-
-    Args:
-        moving: (N, 2) points of the moving image.
-        fixed: (N, 2) their partners.
-        homography: (3, 3) of the rotation, moving to fixed.
-        threshold_px: distance within which a match agrees.
-        search_px: radius within which partners were searched; infinite for the whole image.
+    average. Where partners are searched within a radius, p is the share of its area. If that is infinite, for the whole image,
+    p is the share of matches that would agree if they exchanged their partners; it is large where keypoints cluster.
     """
     count = len(moving)
     if np.isfinite(search_px):

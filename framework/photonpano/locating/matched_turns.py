@@ -123,15 +123,7 @@ class _Fit:
 
 
 def _fit(moving: FloatArray, fixed: FloatArray, start: Homography, camera: Camera, threshold_px: float) -> _Fit:
-    """Fit a rotation to the matches that agree with it, by least squares with the soft L1 loss.
-
-    Args:
-        moving: (N, 2) points of the moving image.
-        fixed: (N, 2) their partners.
-        start: (3, 3) of the initial rotation.
-        camera: without distortion.
-        threshold_px: distance within which a match agrees.
-    """
+    """Fit a rotation to the matches, (N, 2) points and partners, that agree with it, by least squares with the soft L1 loss."""
     homography = start
     for _ in range(_ITERATIONS):
         agrees, residuals, scale = _residuals(moving, fixed, homography, threshold_px)
@@ -160,12 +152,8 @@ def _information(lengths: FloatArray, scale: float, threshold_px: float) -> floa
     """Return the information of a match on each coordinate of its position, in px^-2: that of an M-estimator (Huber 1981).
 
     A match beyond the threshold has no influence. So a shift of the fit gains matches on one side and loses them on the other,
-    which cancels the information of the others where matches are spread evenly, as chance spreads them.
-
-    Args:
-        lengths: (N,) of the residuals of all matches, the same in all directions.
-        scale: of the loss, in px.
-        threshold_px: distance within which a match agrees.
+    which cancels the information of the others where matches are spread evenly, as chance spreads them. `lengths` are those of
+    the residuals of all matches, the same in all directions; `scale` is that of the loss.
     """
     inner = lengths[lengths < threshold_px]
     if not len(inner):

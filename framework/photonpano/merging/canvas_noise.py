@@ -38,14 +38,7 @@ class CanvasNoise:
 
     @classmethod
     def of(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
-        """Lay the noise of a source on a canvas, as it is on average over the frames that see each place.
-
-        Args:
-            source: the capture.
-            trajectory: frame pixels to reference pixels.
-            span: the frames that are rendered.
-            canvas: the pixel grid.
-        """
+        """Lay the noise of a source on a canvas, as it is on average over the frames of the span that see each place."""
         capture = capture_of(source)
         averaging = Averaging.of(trajectory, span, capture.info.frame_shape, canvas, capture.camera)
         if capture.colour is None:
@@ -82,14 +75,7 @@ class CanvasNoise:
         return cls(source.response, on_slope, on_offset, reduction)
 
     def std(self, flux: FluxImage, weight: FluxImage, top: int = 0, left: int = 0) -> FluxImage:
-        """Return the standard deviation of the flux of a part of the canvas.
-
-        Args:
-            flux: (h, w) or (h, w, 3).
-            weight: the same shape.
-            top: first row of the part.
-            left: first column.
-        """
+        """Return the standard deviation of the flux, (h, w) or (h, w, 3), of a part of the canvas that begins at `top`, `left`."""
         slope, offset = (self._part(each, flux, top, left) for each in (self.slope, self.offset))
         std = flux_std(flux, weight, self.response, slope, offset)
         if self.averaging is None:
@@ -119,7 +105,7 @@ class CanvasNoise:
 def laid(
     canvas: Canvas, camera: Camera | None, homographies: FloatArray, images: Sequence[FluxImage], valid: BoolArray
 ) -> tuple[FluxImage, FluxImage]:
-    """Lay images that move with a camera on a canvas, and add them up.
+    """Lay images that move with a camera on a canvas, and add them up: (K, H, W), and what is known, (H, W).
 
     Args:
         canvas: the grid.
@@ -127,9 +113,6 @@ def laid(
         homographies: (N, 3, 3), (ideal) pixels of the frame to pixels of the reference plane at N instants.
         images: K images of a frame, (h, w) each.
         valid: (h, w), True where they are known.
-
-    Returns:
-        The sums of the images, (K, H, W), and of what is known, (H, W).
     """
     sums, share = np.zeros((len(images), *canvas.shape), np.float32), np.zeros((1, *canvas.shape), np.float32)
     grid, once, never = Grid.zeros(canvas, 1)._replace(coverages=share), np.ones(1), np.zeros(1)

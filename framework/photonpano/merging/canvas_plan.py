@@ -70,8 +70,7 @@ def plan_canvas(
         scale: pixels of the canvas per pixel of the reference frame.
         memory: bytes that rendering may take.
         bytes_per_pixel: bytes that rendering takes for a pixel of the canvas.
-        extent: the part, by default everything. A box is in pixels of the reference frame on a plane, and in degrees of a and
-            b otherwise.
+        extent: a box is in pixels of the reference frame on a plane, and in degrees of a and b otherwise.
         view: how the panorama is projected; on a plane by default.
 
     Raises:
@@ -98,12 +97,7 @@ def plan_canvas(
 
 
 def box_of(extent: Extent, frame_shape: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return the box of a part of a planar panorama, in pixels of the reference frame.
-
-    Args:
-        extent: the part; not the whole panorama.
-        frame_shape: (height, width) of a frame.
-    """
+    """Return the box of a part of a planar panorama, not of the whole one, in pixels of the reference frame."""
     return (0, 0, *frame_shape[::-1]) if isinstance(extent, str) else extent
 
 
@@ -178,11 +172,7 @@ def _plane(
 
 
 def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Canvas:
-    """Return the canvas of a box in pixels of the reference frame.
-
-    Raises:
-        ExtentError: it lies outside the whole canvas.
-    """
+    """Return the canvas of a box in pixels of the reference frame; an `ExtentError` if it lies outside the whole canvas."""
     part = canvas_of_box(box, scale)
     ends = np.array([[0.0, 0.0], [whole.width - 1, whole.height - 1]])
     (left, top), (right, bottom) = np.rint(transform_points(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
@@ -196,11 +186,7 @@ def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Can
 
 
 def _part_around(whole: Canvas, covered: Covered, box: tuple[int, int, int, int]) -> Canvas:
-    """Return the part of a canvas of a cylinder or a sphere between a0, b0 and a1, b1 in degrees.
-
-    Raises:
-        ExtentError: it lies outside the whole canvas, or is more than the sphere.
-    """
+    """Return the part of a canvas of a cylinder or a sphere between a0, b0 and a1, b1 in degrees, or raise an `ExtentError`."""
     a0, b0, a1, b1 = box
     (first, last), (low, high) = np.degrees(covered.a), np.degrees(covered.b)
     if a1 - a0 > _TURN or b0 < -_TURN / 4 or b1 > _TURN / 4:

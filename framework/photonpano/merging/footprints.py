@@ -65,14 +65,7 @@ def by_homographies(canvas: Canvas, camera: Camera | None, homographies: FloatAr
 def footprints_of(
     canvas: Canvas, camera: Camera | None, homographies: FloatArray, frame_shape: tuple[int, int]
 ) -> list[Footprint]:
-    """Return the footprint of each frame on a canvas.
-
-    Args:
-        canvas: the grid.
-        camera: of the frames; None if it is not known.
-        homographies: (N, 3, 3), (ideal) pixels of each frame to pixels of the reference plane.
-        frame_shape: (height, width) of a frame.
-    """
+    """Return the footprint of each frame on a canvas; (N, 3, 3) map (ideal) pixels to pixels of the reference plane."""
     if not by_homographies(canvas, camera, homographies, frame_shape):
         return _Remap(canvas, camera if camera is not None and camera.distorts else None, frame_shape).footprints(homographies)
     to_grid = canvas.transform @ homographies

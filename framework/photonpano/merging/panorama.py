@@ -75,9 +75,8 @@ class Tile:
 def tiles_of(canvas: Canvas, memory: int, bytes_per_pixel: int = BYTES_PER_PIXEL) -> tuple[tuple[Tile, ...], int]:
     """Divide the longer side of a canvas into tiles that are rendered one by one within the memory.
 
-    Returns:
-        The tiles, one if the whole canvas fits; and the factor by which a `Thumbnail` that fits beside a tile is smaller than
-        the canvas. Tiles begin at multiples of that factor.
+    Also return the factor by which a `Thumbnail` that fits beside a tile is smaller than the canvas. Tiles begin at multiples
+    of that factor; it is 1 if the whole canvas fits.
     """
     fits = memory // bytes_per_pixel
     n_pixels = canvas.height * canvas.width
@@ -104,19 +103,10 @@ def render(
     context: Context,
     renderer: Renderer | None = None,
 ) -> Panorama:
-    """Render the frames of a span on a canvas that is not divided.
+    """Render the frames of a span on a canvas that is not divided; by default, all frames are merged.
 
     Flux and weight of a capture in colour are (H, W, C), an image for each of its colours; `composed` makes red, green and blue
     of them.
-
-    Args:
-        source: the capture.
-        trajectory: frame pixels to reference pixels.
-        span: the frames to render.
-        canvas: the pixel grid.
-        tolerance_px: motion within which frames are summed before they are warped, in px of a frame.
-        context: threads and progress.
-        renderer: by default, it merges all frames.
     """
     renderer = renderer or MergeRenderer(context.in_order)
     (panorama,) = render_tiles(renderer, source, trajectory, span, [Tile(0, 0, canvas)], tolerance_px, context)
@@ -147,12 +137,7 @@ def render_tiles(
 
 
 class Thumbnail:
-    """A panorama downscaled by a whole factor, put together tile by tile.
-
-    Args:
-        canvas: the canvas that the tiles are parts of.
-        reduction: squares of this many pixels a side are averaged; tiles begin at multiples of it. 1 keeps the only tile.
-    """
+    """A panorama downscaled by a whole factor, put together tile by tile; with a factor of 1, it is the only tile."""
 
     def __init__(self, canvas: Canvas, reduction: int) -> None:
         self._reduction = reduction
@@ -239,9 +224,7 @@ def render_panorama(
 
     Raises:
         ExtentError: no frame shows the extent.
-        CanvasTooLargeError: the panorama has more than `MAX_EXCESS` times the pixels that fit into memory.
-        LocationError: frames reach the horizon of the reference plane.
-        ProjectionError: the motion does not suit the projection.
+        CanvasTooLargeError, LocationError, ProjectionError: see `plan_canvas`.
     """
     start = time.perf_counter()
     bytes_per_pixel = (bytes_per_pixel + bytes_of_light(source)) * channels_of(source)

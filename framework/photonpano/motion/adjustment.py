@@ -129,12 +129,7 @@ class Adjustment(ABC, Generic[StateT]):
         return np.linalg.solve(homographies[self._fixed], homographies[self._moving])
 
     def minimise(self, state: StateT, kept: BoolArray) -> tuple[StateT, FloatArray]:
-        """Return the state of least cost, and the norm of the whitened residual of each edge, (E,).
-
-        Args:
-            state: where to start.
-            kept: (E,) False for outliers.
-        """
+        """Return the state of least cost, and the norm of the whitened residual of each edge, (E,); outliers are not `kept`."""
         # Equal weights at first: the start fits half of the edges exactly, so that robust weights would reject the others.
         weights = kept.astype(np.float64)
         for _ in range(MAX_ITERATIONS):
@@ -282,15 +277,10 @@ class Adjustment(ABC, Generic[StateT]):
 
 
 def _solved(normal: sparse.csr_array, right: FloatArray, draws: bool = False) -> FloatArray:
-    """Solve a positive semidefinite system; the symmetric ordering keeps the factors of a graph with loop closures sparse.
+    """Solve a positive semidefinite system (N, N) for (N,) or (N, S) right sides; the ordering keeps the factors sparse.
 
-    Unknowns that nothing determines stay where they are: a singular system is damped.
-
-    Args:
-        normal: (N, N).
-        right: (N,) or (N, S).
-        draws: whether the right sides are drawn with `normal` as their covariance; unknowns that nothing determines then get
-            draws as wide as the damping.
+    Unknowns that nothing determines stay where they are: a singular system is damped. If the right sides are `draws` with
+    `normal` as their covariance, such unknowns get draws as wide as the damping.
     """
     with suppress(RuntimeError), np.errstate(all="ignore"):
         solution = _factorised(normal).solve(right)
@@ -324,12 +314,7 @@ def _roots(information: FloatArray) -> FloatArray:
 
 
 def _whitening(motions: Sequence[Located], rows: FloatArray) -> FloatArray:
-    """Return the maps from residuals at the corners, in px, to residuals of unit variance: (E, 8, 8).
-
-    Args:
-        motions: of the edges.
-        rows: (3, 4) the corners in homogeneous coordinates.
-    """
+    """Return the maps from residuals at the corners, (3, 4) in homogeneous px, to residuals of unit variance: (E, 8, 8)."""
     whitening = np.array([np.eye(8) / max(motion.residual_px or 1.0, 1e-3) for motion in motions])
     informed = [index for index, motion in enumerate(motions) if motion.information is not None]
     if informed:

@@ -88,12 +88,7 @@ class ExposureTasks:
     def describe(self, indices: Sequence[int], keep: bool) -> tuple[dict[int, Described], tuple[list[Contrast], Notes]]:
         """Merge exposures, and have the first locator describe them; a blank exposure is not described.
 
-        Args:
-            indices: the numbers of the exposures.
-            keep: whether the exposures themselves are kept.
-
-        Returns:
-            What stays in this process, by exposure; and the contrast of each.
+        Return what stays in this process, by exposure, with the exposures themselves if they are to `keep`; and the contrasts.
         """
         clock, described = Stopwatch(1), dict[int, Described]()
         for index in indices:
@@ -117,13 +112,9 @@ class ExposureTasks:
         places: Mapping[int, Place],
         *described: Descriptions,
     ) -> tuple[Tracked, Notes]:
-        """Register exposures of the first level, in order: first with the nearest partner, whose motion predicts the others.
+        """Register exposures of the first level with earlier ones, in order; the motion to the nearest predicts the others.
 
-        Args:
-            start: see `Track`.
-            partners: the exposures, each with earlier ones.
-            places: of partners that are not among the exposures, and of exposures that were placed before.
-            described: all of them.
+        `places` are those of partners that are not among the exposures, and of exposures that were placed before.
         """
         clock, known = Stopwatch(1), _joined(described)
         track = Track(start, self.exposures.groups, self.exposures.frame_shape, places)

@@ -31,11 +31,7 @@ class Recorder:
         self._decisions, self._waiting = decisions, list[Decision]()
 
     def __call__(self, what: str, value: DecisionValue, reason: str) -> None:
-        """Record a decision.
-
-        Raises:
-            TypeError: the value is no plain one.
-        """
+        """Record a decision; a `TypeError` if its value is no plain one."""
         if not isinstance(value, bool | int | float | str):
             raise TypeError(f"the value of a decision is a number, a text, true or false; {what} is a {type(value).__name__}")
         self.add(Decision(what, value, reason))
@@ -81,11 +77,7 @@ class Level:
         return _for_tasks, (self.number, self.scale, self.merger, self.locators, self.origins, self.recorder)
 
     def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:
-        """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator.
-
-        Raises:
-            PluginError: the component failed, or broke its contract.
-        """
+        """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator: `attributing`."""
         origin = self.origins[component] if isinstance(component, str) else component.origin
         return attributing(origin, f"level {self.number}")
 

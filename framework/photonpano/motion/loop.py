@@ -107,11 +107,7 @@ def through_lens(source: Source, model: MotionModel) -> Source:
 
 
 def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]:
-    """Choose the groups of a level (paper, section 4, "Re-sample").
-
-    Raises:
-        PluginError: the resampler failed, or its groups are not in order, or lie outside the capture.
-    """
+    """Choose the groups of a level (paper, section 4, "Re-sample"), or raise a `PluginError`."""
     with clock("resample"), level.attributing("resampler"):
         return require_groups(level.resampler.groups(n_frames, level.number), n_frames)
 

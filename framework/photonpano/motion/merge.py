@@ -36,11 +36,9 @@ class VirtualExposures:
         return None if self.previous is None else self.previous.at(np.arange(self.source.info.n_frames))
 
     def merged(self, index: int, clock: Stopwatch | None = None) -> VirtualExposure:
-        """Merge a group along the motion known so far. Nothing is cached: a second call merges it again.
+        """Merge a group, given by its index, along the motion known so far; a second call merges it again.
 
-        Args:
-            index: of the group.
-            clock: adds up the time, in place of that of the level.
+        `clock` adds up the time, by default that of the level.
 
         Raises:
             PluginError: the merger failed, or returned anything but an exposure of the group at the level's scale.

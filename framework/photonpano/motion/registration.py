@@ -47,13 +47,7 @@ class Registrar:
     """
 
     def __init__(self, exposures: VirtualExposures, log: Log, context: Context) -> None:
-        """Prepare to register.
-
-        Args:
-            exposures: of the level.
-            log: the first exposures in order, as `Registered`; receives the others.
-            context: its executor merges, describes and registers.
-        """
+        """Prepare to register; `log` has the first exposures in order, as `Registered`, and receives the others."""
         self._executor, self._exposures, self._clock, self._log = context.executor, exposures, exposures.clock, log
         self._at_once = context.executor.at_once(len(exposures.groups))
         tasks = ExposureTasks(exposures, independent_share(exposures.groups))
@@ -75,13 +69,9 @@ class Registrar:
     def edges(
         self, pairs: Sequence[tuple[int, int]], pool: ThreadPoolExecutor, threads: int, advance: Callable[[int], None]
     ) -> Iterator[Edge]:
-        """Register pairs, and yield them in order.
+        """Register pairs (moving, fixed), ordered by the moving exposure, the later one, and yield them in order.
 
-        Args:
-            pairs: (moving, fixed), ordered by the moving exposure, which is the later one.
-            pool: waits for tasks.
-            threads: how many exposures are worked on ahead.
-            advance: called with 1 after each moving exposure.
+        `threads` exposures are worked on ahead, and `advance` is called with 1 after each moving exposure.
         """
         partners: dict[int, list[int]] = {moving: [] for moving in range(len(self._exposures.groups))}
         needed_until = {index: index + BRIDGE for index in partners}
@@ -110,14 +100,14 @@ class Registrar:
     def closures(
         self, pairs: Sequence[tuple[int, int]], homographies: FloatArray, pool: ThreadPoolExecutor, log: Log
     ) -> Iterator[Edge]:
-        """Register candidates for loop closures; pairs that are not similar once aligned are not located.
+        """Register candidates (moving, fixed) for loop closures; pairs that are not similar once aligned are not located.
 
-        Both exposures of a pair are merged and described again.
+        Both exposures of a pair are merged and described again, at the same time.
 
         Args:
-            pairs: (moving, fixed), ordered by the moving exposure.
+            pairs: ordered by the moving exposure.
             homographies: (N, 3, 3) solution of the graph without these pairs, frame pixels to a common plane.
-            pool: waits for tasks: the two exposures of a pair are described at the same time.
+            pool: waits for tasks.
             log: the first pairs in order, as `Edge`; receives the others.
         """
         self._kept.clear()

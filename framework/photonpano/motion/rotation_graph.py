@@ -64,10 +64,7 @@ class LensShift:
     def of_corners(self, relative: FloatArray, camera: Camera, assumed: Camera) -> FloatArray:
         """Return the change of corner displacement caused by undistorting with the wrong lens: (E, 4, 2) px.
 
-        Args:
-            relative: (E, 3, 3) homographies of the ideal pixels of the camera.
-            camera: the true one.
-            assumed: camera used to undistort the pixels.
+        `relative` (E, 3, 3) map ideal pixels of the true camera; pixels were undistorted with the one that was `assumed`.
         """
         ideal = camera.ideal(assumed.distorted(self.points))
         there = assumed.ideal(camera.distorted(transform_points(relative, ideal)))
@@ -96,12 +93,9 @@ class RotationAdjustment(Adjustment[Rotations]):
     _n_node = 3
 
     def __init__(self, problem: Problem, assumed: Camera, unknown: tuple[int, ...]) -> None:
-        """Set up the problem.
+        """Set up the problem, whose homographies are those of ideal pixels of the `assumed` camera.
 
-        Args:
-            problem: its homographies are those of ideal pixels of `assumed`.
-            assumed: camera used to undistort the pixels.
-            unknown: what is to be found of the camera: 0 for the focal length, 1 to 4 for k1, k2, p1, p2.
+        Unknown may be 0 for the focal length, and 1 to 4 for k1, k2, p1, p2.
         """
         super().__init__(problem, n_shared=len(unknown))
         self._assumed, self._unknown = assumed, unknown

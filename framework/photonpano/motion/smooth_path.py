@@ -15,19 +15,11 @@ _NEAR = 0.5  # a frame counts if its corners have more than this part of the dep
 
 
 def smooth_view(motion: FrameMotion, instant: float, std: float) -> Homography:
-    """Return where a camera without tremor would look from at an instant.
+    """Return where a camera without tremor would look from: (3, 3), pixels of a view as large as a frame to reference pixels.
 
     The motions between the frame of the instant and those around it are smoothed by lines of least squares with Gaussian
-    weights, so that a camera that pans evenly is followed without lag, also at the ends of the span. Smoothed are the rotation
-    vectors of a camera that turns, and the places of the corners of any other.
-
-    Args:
-        motion: of every frame.
-        instant: in frames.
-        std: of the weights, in frames.
-
-    Returns:
-        (3, 3), pixels of the view, which is as large as a frame, to reference pixels.
+    weights of the given standard deviation in frames, so that a camera that pans evenly is followed without lag, also at the
+    ends of the span. Smoothed are the rotation vectors of a camera that turns, and the places of the corners of any other.
     """
     here: Homography = motion.trajectory.at([instant])[0]
     frame, instants = corners(motion.frame_shape), _instants(instant, motion.span, std)
@@ -53,11 +45,7 @@ def _instants(instant: float, span: FrameSpan, std: float) -> FloatArray:
 
 
 def _at_zero(times: FloatArray, std: float) -> FloatArray | None:
-    """Return the weights with which values at some times add up to their line of least squares at time 0.
-
-    Returns:
-        Weights with a sum of 1; None for fewer than two times.
-    """
+    """Return the weights, of sum 1, that give a line of least squares at time 0; None for fewer than two times."""
     weights = np.exp(-0.5 * (times / std) ** 2)
     sum_0, sum_1, sum_2 = (float((weights * times**power).sum()) for power in range(3))
     determinant = sum_0 * sum_2 - sum_1**2

@@ -71,11 +71,7 @@ class Timeline:
 
     @classmethod
     def with_repeats(cls, repeated: BoolArray) -> Timeline:
-        """Return that of a capture without missing frames.
-
-        Args:
-            repeated: (T,), True for frames that are copies of the frame before.
-        """
+        """Return that of a capture without missing frames; (T,) True for frames that are copies of the frame before."""
         return cls(np.cumsum(~repeated).astype(np.float64) - 1.0)
 
     @property
@@ -109,12 +105,7 @@ class Timeline:
         return tuple(found[time] for time in sorted(found))
 
     def fit(self, interpolate: Callable[[slice, FloatArray], Trajectory], instants: FloatArray) -> Trajectory:
-        """Interpolate each piece between two cuts by itself.
-
-        Args:
-            interpolate: fits some of the knots, given their times.
-            instants: (N,) of the knots, in frames.
-        """
+        """Interpolate each piece between two cuts by itself; `interpolate` fits some of the (N,) knots, given their times."""
         pieces, times = self.knot_pieces(instants), self.times(instants)
         # A piece without a knot goes on as the nearest one.
         known = [number for number, piece in enumerate(pieces) if piece.start < piece.stop]

@@ -30,14 +30,7 @@ class Uncertainty:
     std_camera: FloatArray | None
 
     def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, timeline: Timeline) -> None:
-        """Compare a level with the one before.
-
-        Args:
-            located: the exposures of the level.
-            trajectory: the motion after the level.
-            previous: the motion after the level before; None at the first level.
-            timeline: of the capture. Beyond a cut, nothing is known from the other side.
-        """
+        """Compare a level with the one before, None at the first; beyond a cut, nothing is known from the other side."""
         self.std_camera = _std_camera(located, camera_of_motion(previous))
         self._instants = located.instants
         self._std_px = located.std_px

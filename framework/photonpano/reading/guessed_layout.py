@@ -96,13 +96,9 @@ def sampled_spans(n_frames: int, frame_values: int) -> list[FrameSpan]:
 
 
 def unpacked_content(samples: Sequence[NDArray[Any]]) -> Content | None:
-    """Return what the values of an array are if they are not bytes of eight pixels each.
+    """Return what the values of runs of frames (n, rows, columns), integers or bool, are.
 
-    Args:
-        samples: runs of consecutive frames, each (n, rows, columns), of integers or bool.
-
-    Returns:
-        None for packed pixels, and where too few pixels are lit.
+    None if they are bytes of eight pixels each, and where too few pixels are lit.
     """
     lowest, highest = (int(edge) for edge in (min(each.min() for each in samples), max(each.max() for each in samples)))
     n_values = sum(each.size for each in samples)
@@ -221,14 +217,7 @@ class Channel(NamedTuple):
 
 
 def with_channel(read: Callable[[int | None], Capture]) -> tuple[Capture, Channel] | None:
-    """Read a capture without channels, or the middle one of three.
-
-    Args:
-        read: reads the capture with a `channel`, and raises an `InputError` if the capture does not have it.
-
-    Returns:
-        What `read` returned, and the channel; None if it raised for both.
-    """
+    """Return what `read` returns without a channel, or for the middle one of three; None if both raise an `InputError`."""
     for channel in (None, _MIDDLE):
         try:
             found = read(channel)

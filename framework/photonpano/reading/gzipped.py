@@ -22,11 +22,7 @@ _BLOCK_BYTES = 1024**2
 
 
 def local(path: Location) -> Path:
-    """Return the path of a compressed file.
-
-    Raises:
-        InputError: it is a URL: a compressed file can only be read from its beginning.
-    """
+    """Return the path of a compressed file; an `InputError` for a URL, of which it can only be read from its beginning."""
     if isinstance(path, Url):
         raise InputError(f"{path} is compressed with gzip, and cannot be read in parts; unpack it there, or download it")
     return path

@@ -41,11 +41,7 @@ class NpyHeader(NamedTuple):
 
 
 def npy_header(path: Location) -> NpyHeader:
-    """Read the header of a .npy file.
-
-    Raises:
-        InputError: the file cannot be read, or is something else.
-    """
+    """Read the header of a .npy file; an `InputError` if it cannot be read, or is something else."""
     if isinstance(path, Url):
         start = read_range(path, 0, _HEADER_BYTES)
         header = read_npy_header(BytesIO(start))
@@ -60,11 +56,7 @@ def npy_header(path: Location) -> NpyHeader:
 
 
 def read_npy_header(file: IO[bytes] | GzipFile) -> NpyHeader | None:
-    """Return the header at the beginning of an open file; None if it is damaged or missing.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return the header at the beginning of an open file; None if it is damaged or missing. An `OSError` passes."""
     try:
         version = np.lib.format.read_magic(file)
         # Version 3 differs only for structured types, which no capture has.
@@ -78,11 +70,7 @@ def read_npy_header(file: IO[bytes] | GzipFile) -> NpyHeader | None:
 
 
 def require_whole(path: Location, header: NpyHeader) -> None:
-    """Refuse a .npy file that is shorter than its header promises.
-
-    Raises:
-        InputError: the file is shorter.
-    """
+    """Raise an `InputError` for a .npy file that is shorter than its header promises."""
     size = size_of(path)
     if size < header.file_bytes:
         raise InputError(
@@ -92,16 +80,7 @@ def require_whole(path: Location, header: NpyHeader) -> None:
 
 
 def require_frames(path: Location, header: NpyHeader, axes: str) -> None:
-    """Refuse an array without values, or one that is not in C order.
-
-    Args:
-        path: the file, for the message.
-        header: its header.
-        axes: the names of the axes, such as "frames, height, width".
-
-    Raises:
-        InputError: it is so.
-    """
+    """Raise an `InputError` for an array without values, or not in C order; `axes` is such as "frames, height, width"."""
     if min(header.shape) < 1:
         raise InputError(f"{path} is empty: its shape is {header.shape} ({axes})")
     if header.fortran_order:

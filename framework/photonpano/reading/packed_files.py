@@ -44,12 +44,7 @@ class StoredFrames:
     """
 
     def __init__(self, files: Sequence[FrameFile], shape: tuple[int, ...]) -> None:
-        """Take files in the order of their frames.
-
-        Args:
-            files: at least one, each long enough for its frames, of which it has at least one.
-            shape: that of the bytes of a frame.
-        """
+        """Take at least one file, in the order of frames, each long enough; `shape` is that of the bytes of a frame."""
         self._parts, self._shape, self._frame_bytes = tuple(files), shape, math.prod(shape)
         self._starts = list(accumulate((file.n_frames for file in files), initial=0))
         self.n_frames = self._starts[-1]
@@ -104,13 +99,7 @@ class PackedFileSource(BinarySource):
     """Binary frames in one file or in many."""
 
     def __init__(self, files: Sequence[FrameFile], layout: FrameLayout, frame_rate_hz: float | None = None) -> None:
-        """Take files in the order of their frames; see `StoredFrames`.
-
-        Args:
-            files: at least one.
-            layout: order of the pixels of a frame in its bytes.
-            frame_rate_hz: frames per second; None if unknown.
-        """
+        """Take at least one file, in the order of frames; see `StoredFrames`."""
         self._stored = StoredFrames(files, layout.stored_shape)
         super().__init__(self._stored.n_frames, layout, frame_rate_hz)
 

@@ -149,14 +149,9 @@ def add_pixel_sums(
     residual: NDArray[np.float32],
     total: NDArray[np.float32],
 ) -> None:
-    """Add residuals, and expected counts, to the sums of each pixel; unknown pixels are NaN in `counts` or `mean`.
+    """Add residuals and expected counts to the sums (H, W) of each pixel; unknown pixels are NaN in `counts` or `mean`.
 
-    Args:
-        counts: (H, W) summed counts.
-        n_frames: frames of the span.
-        mean: (H, W) expected count of a frame.
-        residual: (H, W) sum of residuals; added to.
-        total: (H, W) sum of expected counts; added to.
+    `counts` are summed over `n_frames`, `mean` is the expected count of one.
     """
     n, zero = np.float32(n_frames), np.float32(0)
     for y in range(mean.shape[0]):

@@ -61,11 +61,6 @@ def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ..
     Places come into question where spans stand out from the motion. There, sums of a few frames are tracked by phase
     correlation, from frames alone. Where a shift is an outlier, each frame is compared with templates from before and after,
     and a jump at each frame with fast motions: see `_located`.
-
-    Args:
-        source: the capture.
-        fit: the result of the loop, and what it does not explain.
-        context: threads and progress.
     """
     size = _size_of_sums(fit)
     suspect = _suspect(fit, _MARGIN * size)
@@ -243,12 +238,9 @@ def _moved(image: FluxImage, shift: FloatArray) -> FluxImage:
 
 
 def _log_likelihoods(image: FluxImage, expected: FloatArray, n_pixels: int) -> FloatArray:
-    """Return the log likelihoods of a frame, up to a constant, for each of P expectations: (P,).
+    """Return the log likelihoods (P,) of a frame, up to a constant, for P expectations (P, h, w), NaN where unknown.
 
-    Args:
-        image: (h, w) mean counts, binned.
-        expected: (P, h, w), NaN where nothing is known.
-        n_pixels: pixels of a binned one.
+    A binned pixel (h, w) is the mean of `n_pixels`.
     """
     seen = np.isfinite(expected).all(axis=0) & np.isfinite(image)
     variance = np.maximum(expected[:, seen].mean(axis=0), _NOISE_FLOOR) / n_pixels
@@ -258,9 +250,8 @@ def _log_likelihoods(image: FluxImage, expected: FloatArray, n_pixels: int) -> F
 def _likelihoods_of(likelihood: FloatArray, ramp: int) -> FloatArray:
     """Return the log likelihood of motions that take `ramp` frames from the old path to the new one, for each middle: (M,).
 
-    Args:
-        likelihood: (T, steps + 1) log likelihood of each frame, from the old path to the new one.
-        ramp: 0 for a jump, whose middle m is its first frame.
+    `likelihood` is (T, steps + 1), that of each frame from the old path to the new one. Of a jump, whose ramp is 0, the middle
+    is its first frame.
     """
     n_frames, steps = likelihood.shape[0], likelihood.shape[1] - 1
     frames, middles = np.arange(n_frames), np.arange(n_frames + 1)

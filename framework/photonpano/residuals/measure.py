@@ -90,10 +90,9 @@ class Residuals:
         return solved[:, N_STEPS], np.sqrt(covariance[:, N_STEPS, N_STEPS])
 
     def block_shifts(self) -> tuple[FloatArray, FloatArray]:
-        """Return the mean shift of each block of the sensor against the panorama, and its information.
+        """Return the mean shift of each block of the sensor against the panorama, (h, w, 2) in px, and its information.
 
-        Returns:
-            (h, w, 2) in px, and (h, w, 2, 2) inverse covariances by photon noise, 0 where a block carries no shift.
+        That is (h, w, 2, 2), inverse covariances by photon noise, 0 where a block carries no shift.
         """
         information = np.stack([self.blocks[..., [GXX, GXY]], self.blocks[..., [GXY, GYY]]], axis=-2)
         right = self.blocks[..., [GX_R, GY_R]]
@@ -104,13 +103,7 @@ class Residuals:
 
 
 def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Residuals:
-    """Compare the frames of a span with what the panorama predicts, each pixel in its colour.
-
-    Args:
-        span: the located frames.
-        predictions: the panorama along the motion, for each colour of the capture.
-        context: threads and progress; the result does not depend on the number of threads.
-    """
+    """Compare the located frames with what the panorama predicts along the motion, each pixel in its colour."""
     spans = spans_of(span, predictions)
     # The mean over the frames, which is not the motion at the centre where frames are repeated, or tremble.
     starts = [each.start - span.start for each in spans]
@@ -156,12 +149,7 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
 
 
 def spans_of(span: FrameSpan, predictions: Predictions) -> tuple[FrameSpan, ...]:
-    """Divide frames into spans: long enough for the photons to carry a shift, short enough for the motion.
-
-    Args:
-        span: the frames to divide.
-        predictions: the panorama along the motion.
-    """
+    """Divide frames into spans: long enough for the photons to carry a shift, short enough for the motion."""
     frames = np.arange(span.start, span.stop)
     frame_shape = predictions.first.frame_shape
     homographies = predictions.first.trajectory.at(frames)

@@ -55,17 +55,7 @@ class Prediction:
         light: Light | None = None,
         camera: Camera | None = None,
     ) -> Prediction:
-        """Make the prediction of a panorama.
-
-        Args:
-            panorama: flux and weight, rendered along the trajectory.
-            canvas: on which it was rendered.
-            response: the response of the camera.
-            trajectory: frame pixels to reference pixels.
-            frame_shape: (height, width) of a frame.
-            light: the gain of each frame; None in steady light.
-            camera: of the frames; None if it is not known.
-        """
+        """Make the prediction of a panorama that was rendered along the trajectory, frame pixels to reference pixels."""
         margin = _MARGIN if canvas.is_full_turn else 0
         panorama = _continued(panorama, margin)
         seen = panorama.weight > 0
@@ -86,12 +76,9 @@ class Prediction:
         return cls(canvas, mean, precision, trajectory, frame_shape, frames_seen, response, light, ideal, margin)
 
     def view(self, homography: Homography, into: NDArray[np.float32], span: FrameSpan | None = None) -> None:
-        """Sample both images at the pixels of a frame.
+        """Sample mean and precision at the pixels of a frame into (2, H, W) float32, NaN where the panorama was not seen.
 
-        Args:
-            homography: (3, 3), frame pixels to reference pixels.
-            into: (2, H, W) float32, output: mean and precision, NaN where the panorama was not seen.
-            span: the frames whose light is predicted; None for the mean light.
+        `homography` maps frame pixels to reference pixels; `span` is of the frames whose light is predicted, None for the mean.
         """
         self._sample(homography, into)
         if self.light is not None and span is not None:
@@ -163,15 +150,7 @@ class Predictions:
     def of(
         cls, source: Source, panorama: Panorama, canvas: Canvas, trajectory: Trajectory, frame_shape: tuple[int, int]
     ) -> Predictions:
-        """Make the predictions of a panorama.
-
-        Args:
-            source: the capture.
-            panorama: flux and weight along the trajectory, as `render` returns them for the source.
-            canvas: on which it was rendered.
-            trajectory: frame pixels to reference pixels.
-            frame_shape: (height, width) of a frame.
-        """
+        """Make the predictions of a panorama that was rendered along the trajectory, as `render` returns it for the source."""
         capture = capture_of(source)
 
         def prediction(each: Capture, single: Panorama) -> Prediction:

@@ -69,14 +69,7 @@ class MotionFit:
     """
 
     def __init__(self, source: Source, motion: FrameMotion, tolerance_px: float, memory: int, context: Context) -> None:
-        """Measure the residuals.
-
-        Args:
-            source: the capture.
-            motion: of every frame.
-            tolerance_px: motion within which frames are summed before they are warped, in px of a frame.
-            memory: bytes that rendering may take.
-            context: threads, progress and checkpoints.
+        """Measure the residuals; frames are summed where the motion stays within `tolerance_px`. `memory` is in bytes.
 
         Raises:
             CanvasTooLargeError: the panorama is far larger than what fits into the memory.
@@ -117,11 +110,7 @@ class MotionFit:
         return float(self.residuals.misfit.mean())
 
     def explained(self, refinements: Sequence[Refinement] = ()) -> Explained:
-        """Return the motion with an expected error that covers the residuals, and what else a verdict needs.
-
-        Args:
-            refinements: what each refiner did.
-        """
+        """Return the motion with an expected error that covers the residuals, and what else a verdict needs."""
         std_px, residuals = self.motion.std_px, self.residuals
         std_px = np.hypot(bounded_std_px(std_px, residuals), unexplained_px(residuals, len(std_px)))
         motion = replace(self.motion, std_px=std_px)

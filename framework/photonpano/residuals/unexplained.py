@@ -27,10 +27,9 @@ _DARK = -0.5  # spans that are darker than predicted by half of the light or mor
 
 
 def residual_ratio(residuals: Residuals) -> float:
-    """Return the scatter of the shifts of short spans, divided by what photon noise and interpolation explain.
+    """Return the scatter of the shifts of short spans over that of photon noise and interpolation; NaN for fewer than 50.
 
     It is 1 where the motion is all there is. Slow changes are left out, since the panorama follows them.
-    NaN for fewer than 50 spans.
     """
     steps, variances = _series(residuals)
     shifts, expected = steps[:, :2], variances[:, :2]
@@ -44,14 +43,10 @@ def residual_ratio(residuals: Residuals) -> float:
 
 
 def unexplained_px(residuals: Residuals, n_frames: int) -> FloatArray:
-    """Return the corner error that the residuals show beyond photon noise, for every frame: (n_frames,).
+    """Return the corner error that the residuals show beyond photon noise, for every frame of the capture: (n_frames,).
 
     It is the root mean square over 33 spans around the frame, or the step of a single span if that stands out, as at a place
     where frames are missing; 0 where noise explains it.
-
-    Args:
-        residuals: of the motion.
-        n_frames: frames of the capture.
     """
     steps, variances = _series(residuals)
     known = np.isfinite(variances).all(axis=1)
@@ -74,14 +69,10 @@ def unexplained_px(residuals: Residuals, n_frames: int) -> FloatArray:
 
 
 def bounded_std_px(std_px: FloatArray, residuals: Residuals) -> FloatArray:
-    """Return the expected corner errors, no larger than the residuals allow: (T,).
+    """Return the expected corner errors (T,), infinite where not located, no larger than the residuals allow.
 
     A frame lies within its measured shift, roll and zoom of the panorama, and so of the surest frame that sees the same place.
     At the ends of a capture, where motion is extrapolated, this is less than what extrapolation lets expect.
-
-    Args:
-        std_px: (T,) expected corner error of each frame, infinite where it is not located.
-        residuals: of the motion.
     """
     steps, variances = _series(residuals)
     known = np.isfinite(variances).all(axis=1) & (residuals.gains()[0] > _DARK)

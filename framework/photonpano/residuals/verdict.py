@@ -106,13 +106,7 @@ def _doubtful_above(threshold: float, what: str, what_to_do: str) -> Callable[[_
 
 
 def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
-    """Test the result of a run.
-
-    Args:
-        explained: motion and residuals.
-        levels: the results of the loop; empty if they are not known.
-        decisions: what was chosen from the capture, such as the share of the frame that stands still.
-    """
+    """Test the result of a run; `levels` are empty if they are not known, `decisions` hold the share that stands still."""
     run = _Run(explained, levels, decisions)
     reasons = tuple(reason for test in TESTS if (reason := test.reason(test.find(run))) is not None)
     ratio = explained.ratio if np.isfinite(explained.ratio) else None
@@ -120,12 +114,7 @@ def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequen
 
 
 def contradictions(dropped: int, pairs: int) -> Reason | None:
-    """Judge the pairs of the last level.
-
-    Args:
-        dropped: pairs that contradict the others.
-        pairs: all pairs.
-    """
+    """Judge the pairs of the last level, of which some, `dropped`, contradict the others."""
     return _contradictions.reason(_contradicting(dropped, pairs))
 
 

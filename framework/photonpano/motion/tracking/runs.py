@@ -39,13 +39,7 @@ class SumTrack:
 
 
 def track_sums(source: Source, runs: Sequence[Sequence[FrameSpan]], context: Context) -> Iterator[SumTrack | None]:
-    """Yield the track of each run of sums that show something; None if they are too few.
-
-    Args:
-        source: the capture.
-        runs: the sums of each run, in order.
-        context: works on blocks of sums in tasks.
-    """
+    """Yield the track of each run of sums that show something, in order; None if they are too few."""
     blocks = [_blocks_of(spans) for spans in runs]
     parts = context.in_order(partial(_tracked_block, source), list(chain.from_iterable(blocks)))
     for spans, of_run in zip(runs, blocks, strict=True):

@@ -41,12 +41,7 @@ def noise_of_difference(source: Source, n_frames: float) -> float:
 
 
 def spectra_of(images: Sequence[FluxImage] | FluxImage, weight: FluxImage | None = None) -> Spectrum:
-    """Return the spectra of images of one shape, of weighted mean 0, under a Hann window: (S, h, w // 2 + 1).
-
-    Args:
-        images: (S, h, w).
-        weight: (h, w) of their pixels beside the window, 1 by default.
-    """
+    """Return the spectra of images (S, h, w), of weighted mean 0, under a Hann window: (S, h, w // 2 + 1)."""
     window = _window(images[0].shape)
     if weight is not None:
         window = window * weight
@@ -71,10 +66,8 @@ def shifted(image: FluxImage, shift: FloatArray) -> FluxImage:
 def following(moving: FluxImage, fixed: FluxImage, noise: float) -> Follows:
     """Find the part of an image that shows the same as another one, seen along a motion.
 
-    Args:
-        moving: (h, w) on the scale on which noise is uniform, NaN where nothing is seen.
-        fixed: (h, w) the other one.
-        noise: variance of their difference.
+    Both are (h, w) on the scale on which noise is uniform, NaN where nothing is seen; `noise` is the variance of their
+    difference.
     """
     seen = np.isfinite(moving) & np.isfinite(fixed)
     return follows(np.nan_to_num(moving), np.nan_to_num(fixed), np.where(seen, np.float32(noise), np.float32(np.inf)))
