@@ -52,8 +52,7 @@ class PluginError(PhotonpanoError):
     """A plugin is broken, missing a library, in conflict with another, or broke its contract."""
 
 
-_LONGEST = 200
-"""Characters of a path in a spec, or of an override, that a message shows."""
+_LONGEST = 200  # characters of a path in a spec, or of an override, that a message shows
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,7 +91,7 @@ def write_dark(path: Path, dark: DarkFrames) -> None:
 
 
 def read_dark(path: Path) -> DarkFrames:
-    """Read dark counts: an .npz archive of `write_dark`, or a .npy file of rates. An `InputError` says what is wrong."""
+    """Read dark counts: an .npz archive of `write_dark`, or a .npy file of rates. An `InputError` tells what is wrong."""
     arrays = read_arrays(path, "a file of dark counts", ("rates", "n_frames"))
     rates, n_frames = arrays.get("rates", arrays.get("")), arrays.get("n_frames")
     if rates is None:

@@ -75,7 +75,7 @@ class CanvasNoise:
         return cls(source.response, on_slope, on_offset, reduction)
 
     def std(self, flux: FluxImage, weight: FluxImage, top: int = 0, left: int = 0) -> FluxImage:
-        """Return the standard deviation of the flux, (h, w) or (h, w, 3), of a part of the canvas that begins at `top`, `left`."""
+        """Return the standard deviation of the flux, (h, w) or (h, w, 3), of a part of the canvas from `top`, `left` on."""
         slope, offset = (self._part(each, flux, top, left) for each in (self.slope, self.offset))
         std = flux_std(flux, weight, self.response, slope, offset)
         if self.averaging is None:

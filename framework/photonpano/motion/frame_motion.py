@@ -45,7 +45,7 @@ def view_of(motion: FrameMotion, source: Source, projection: str = "auto", *, le
 
 
 def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, reference: int) -> FrameMotion:
-    """Evaluate the result of the last of at least one level at every frame; `reference` is that whose motion is the identity."""
+    """Evaluate the result of the last level, of at least one, at every frame; that at `reference` is the identity."""
     last = levels[-1]
     frames, span = np.arange(stream.n_frames), last.located.covered
     located = (span.start <= frames) & (frames < span.stop)
