@@ -57,7 +57,7 @@ def remove_leftovers(directory: Path) -> None:
 
 
 def others_in(directory: Path, own: Iterable[str]) -> list[Path]:
-    """Return what lies in a folder beside its own files, whose paths in it are given; a folder without any of these is one entry."""
+    """Return what lies in a folder beside its own files, given as paths in it; a folder without any of these is one entry."""
     own = set(own)
     holders = {str(parent) for name in own for parent in PurePosixPath(name).parents}
     found, folders = [], [directory]

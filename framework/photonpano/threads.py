@@ -40,7 +40,7 @@ def thread_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
 def in_order(
     work: Callable[[ItemT], ResultT], items: Iterable[ItemT], threads: int, pool: ThreadPoolExecutor | None = None
 ) -> Iterator[ResultT]:
-    """Yield the results of `work` in the order of the items; `threads` items are worked on ahead, in the pool or one of its own.
+    """Yield the results of `work` in the order of the items; `threads` items are worked on ahead, in a pool.
 
     Unlike `Executor.map`, it holds at most one result for each thread beside the one that it yields. Items are drawn in the
     thread of the caller.

@@ -9,12 +9,14 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from photonpano.contracts.information import is_inverse_covariance
 from photonpano.contracts.rules import (
     STRICT_IMAGES,
     Contract,
     Rule,
+    attributing,
     has_h33_of_1,
     images,
     instance,
@@ -269,6 +271,22 @@ HOMOGRAPHIES: Contract[FloatArray] = Contract(
         ),
     ],
 )
+
+
+class AttributedTrajectory:
+    """A trajectory fitted at a level, whose errors name its interpolator, and whose homographies are checked."""
+
+    def __init__(self, trajectory: Trajectory, origin: str, level: int) -> None:
+        self._trajectory = trajectory
+        self._origin = origin
+        self._level = level
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the homographies of N instants, (N, 3, 3), or raise a `PluginError`."""
+        frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
+        with attributing(self._origin, f"level {self._level}"):
+            found = HOMOGRAPHIES.require(np.asarray(self._trajectory.at(frame_indices)), frames)
+            return np.asarray(found, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)

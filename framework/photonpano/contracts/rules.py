@@ -1,11 +1,15 @@
-"""State what a component may return as a table of rules, and check values against it."""
+"""State what a component may return as a table of rules, check values against it, and name the component that broke one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
+
+from photonpano.errors import PhotonpanoError, PluginError, described
+from photonpano.interrupts import is_interrupt
 
 T = TypeVar("T")
 # What is required, as a sentence for users, and a check of a value against facts, such as the number of frames of the capture.
@@ -15,6 +19,28 @@ Rule: TypeAlias = tuple[str, Callable[[Any, Any], object]]
 
 class BrokenContract(Exception):  # noqa: N818 - it is not raised to callers
     """What a component returned although its protocol does not allow it, as a clause; raised inside `attributing`."""
+
+
+@contextmanager
+def attributing(origin: str, where: str) -> Iterator[None]:
+    """Raise a `PluginError` that names a component for errors of the block.
+
+    Errors that are written for users, and interrupts, pass unchanged.
+
+    Args:
+        origin: who provides the component, such as "merger 'photon-mle' of photonpano 0.1.0".
+        where: what it works on, such as "level 2" or "frames 0 to 15".
+    """
+    try:
+        yield
+    except PhotonpanoError:
+        raise
+    except BrokenContract as error:
+        raise PluginError(f"{origin} broke its contract at {where}: {error}") from None
+    except BaseException as error:  # a plugin that calls sys.exit() must not end the program in silence
+        if is_interrupt(error):
+            raise
+        raise PluginError(f"{origin} failed at {where}: {described(error)}") from error
 
 
 class Contract(Generic[T]):

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from photonpano.geometry.homographies import corners, from_parameters, normalised, transform_points
+from photonpano.geometry.homographies import corners, from_parameters, normalised, transform_points, unit_coordinates
 from photonpano.geometry.rotations import nearest_rotations
-from photonpano.geometry.steps import unit_coordinates
 from photonpano.values import FloatArray, Homography
 
 # Evenly spaced frames to which the alignment is fitted. They are plenty: a homography has eight parameters, and each frame

@@ -1,4 +1,4 @@
-"""Render the panorama: divide its canvas into tiles that fit into memory, render all located frames on each."""
+"""Render the panorama: divide its canvas into tiles that fit into memory, merge all located frames on each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,42 @@ from numpy.typing import NDArray
 from photonpano.context import Context
 from photonpano.errors import ExtentError
 from photonpano.geometry import Canvas, Extent, rescaling
+from photonpano.merging.accumulate import accumulate
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, View, plan_canvas
+from photonpano.merging.chunks import chunks_of
 from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
 from photonpano.merging.light import bytes_of_light
-from photonpano.merging.merge_renderer import MergeRenderer
-from photonpano.photometry import Tone, WhiteBalance, balanced, picture_of
+from photonpano.photometry import Tone, WhiteBalance, balanced, debiased, picture_of
 from photonpano.protocols import Renderer, Source, Trajectory
+from photonpano.threads import InOrder
 from photonpano.values import FluxImage, FrameSpan, Panorama
+
+if TYPE_CHECKING:
+    from photonpano.geometry import Canvas
+
+
+class MergeRenderer:
+    """Warps the photons of all frames to the canvas, and estimates the flux of each pixel once (paper, equation 3)."""
+
+    def __init__(self, in_order: InOrder) -> None:
+        """Take what works on several parts at once, such as that of a `StageContext`; the result does not depend on it."""
+        self._in_order = in_order
+
+    def render(
+        self,
+        source: Source,
+        trajectory: Trajectory,
+        span: FrameSpan,
+        canvas: Canvas,
+        tolerance_px: float,
+        advance: Callable[[int], None],
+    ) -> Panorama:
+        """Merge the frames of a span on a canvas: see `Renderer`."""
+        chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
+        photons = accumulate(source, chunks, canvas, canvas.shape, advance, self._in_order)
+        flux, weight = photons.estimate(source.response)
+        return Panorama(debiased(flux, weight, source.response), weight, canvas.transform)
 
 
 class RenderOptions(Protocol):

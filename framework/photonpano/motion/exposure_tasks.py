@@ -13,8 +13,7 @@ from photonpano.contracts.loop import require_no_standstill, require_valid
 from photonpano.geometry import why_implausible
 from photonpano.motion.closures import exposure_similarity
 from photonpano.motion.diagnosis import Contrast, contrast_of
-from photonpano.motion.level import FrameHomography, NamedLocator
-from photonpano.motion.merge import VirtualExposures
+from photonpano.motion.level import FrameHomography, NamedLocator, VirtualExposures
 from photonpano.motion.pairs import shared_share
 from photonpano.motion.tracking import Place, StartingMotion, Track
 from photonpano.protocols import KeepsHypotheses

@@ -11,9 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from photonpano.geometry import inverse, nearest_rotations, normalised, scaled_ahead
+from photonpano.geometry import (
+    from_parameters,
+    generators,
+    inverse,
+    nearest_rotations,
+    normalised,
+    parameters,
+    scaled_ahead,
+    unit_coordinates,
+)
 from photonpano.motion.adjustment import Adjustment, Assessment, Problem
-from photonpano.motion.homography_graph import HomographyAdjustment
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
@@ -279,3 +287,40 @@ def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:
     """Return the (moving, fixed) of the located edges: (E, 2)."""
     located = [(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)]
     return np.array(located, dtype=int).reshape(-1, 2)
+
+
+class HomographyAdjustment(Adjustment[FloatArray]):
+    """The least-squares problem of a graph whose nodes have any homographies; its state is these, (N, 3, 3) with h33 = 1.
+
+    The unknowns of a node are p1..p8 of a small homography of its own frame, in coordinates of about unit size.
+    """
+
+    _n_node = 8
+
+    def homographies(self, state: FloatArray) -> FloatArray:
+        """Return the state."""
+        return state
+
+    def changed(self, state: FloatArray, nodes: FloatArray, shared: FloatArray) -> FloatArray:
+        """Return the homographies after a step; nothing is shared."""
+        del shared
+        unit = unit_coordinates(self._frame_shape)
+        return normalised(state @ (np.linalg.inv(unit) @ from_parameters(nodes) @ unit))
+
+    def anchored(self, state: FloatArray) -> FloatArray:
+        """Return the homographies, of which the anchor's is the identity."""
+        state[self._anchor] = np.eye(3)
+        return state
+
+    def generators(self, state: FloatArray) -> FloatArray:
+        """Return those of p1..p8 in unit coordinates: (8, 3, 3)."""
+        del state
+        return generators(self._frame_shape)
+
+    def information(self, state: FloatArray, blocks: FloatArray) -> FloatArray:
+        """Convert (N, 8, 8) information on changes of nodes to that on p1..p8 of their homographies."""
+        changed = state[:, None] @ generators(self._frame_shape)
+        slopes = changed - state[:, None] * changed[..., 2:, 2:]
+        to_parameters = parameters(np.eye(3) + slopes).transpose(0, 2, 1)
+        to_change = np.linalg.inv(to_parameters)
+        return np.asarray(to_change.transpose(0, 2, 1) @ blocks @ to_change)

@@ -15,8 +15,7 @@ from photonpano.geometry import corner_displacements, inverse
 from photonpano.motion.closures import closure_candidates
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.graph import Evidence, GraphOptions, GraphSolution, components, solve
-from photonpano.motion.level import Level
-from photonpano.motion.merge import VirtualExposures
+from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar

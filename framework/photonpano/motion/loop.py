@@ -8,13 +8,11 @@ from functools import partial
 
 from photonpano.capture import seen_through
 from photonpano.context import Context
-from photonpano.contracts.attribution import AttributedTrajectory
-from photonpano.contracts.loop import KNOTS, knot_errors, require_groups
+from photonpano.contracts.loop import KNOTS, AttributedTrajectory, knot_errors, require_groups
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
-from photonpano.motion.level import Level
+from photonpano.motion.level import Level, VirtualExposures, merge
 from photonpano.motion.locate import LocatedLevel, locate
-from photonpano.motion.merge import VirtualExposures, merge
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
 from photonpano.motion.timeline import Timeline

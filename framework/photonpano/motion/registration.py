@@ -13,8 +13,7 @@ from photonpano.geometry import inverse
 from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.diagnosis import Contrast
 from photonpano.motion.exposure_tasks import Descriptions, ExposureTasks, Notes, Pair
-from photonpano.motion.level import FrameHomography
-from photonpano.motion.merge import VirtualExposures
+from photonpano.motion.level import FrameHomography, VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of
 from photonpano.motion.tracking import Place, StartingMotion, starting_motion
 from photonpano.protocols import KeepsHypotheses

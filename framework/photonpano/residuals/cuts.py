@@ -12,11 +12,9 @@ from photonpano.context import Context
 from photonpano.geometry import steps_px
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.timeline import Cut
-from photonpano.motion.tracking.runs import DARK, SumTrack, track_sums
-from photonpano.motion.tracking.spans import span_image
+from photonpano.motion.tracking.spans import DARK, SumTrack, span_image, track_sums
 from photonpano.protocols import Source
-from photonpano.residuals.refinement import MotionFit
-from photonpano.residuals.unexplained import standing_out
+from photonpano.residuals.refinement import MotionFit, standing_out
 from photonpano.values import FloatArray, FluxImage, FrameSpan, true_spans
 
 # Sums searched on both sides of spans that stand out.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano.notebooks import facts, picture
 from photonpano.text import share
-from photonpano.values.arrays import FluxImage, Homography
+from photonpano.values.arrays import BoolArray, FluxImage, Homography
 from photonpano.values.frames import Group
 
 
@@ -90,3 +90,20 @@ class Panorama:
                 ("weight, median", f"{np.median(self.weight[seen]):,.0f} frames"),
             ]
         return picture(self.flux, "the panorama") + facts(rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PanoramaRows:
+    """Some rows of a panorama.
+
+    Attributes:
+        flux: (h, W), or (h, W, 3) of red, green and blue; float32, photons per pixel per frame, NaN where nothing was seen.
+        weight: the same shape, float32, number of frames in which each pixel was seen; 0 where nothing was seen.
+        std: the same shape, float32, standard deviation of the flux; NaN where nothing was seen.
+        saturated: the same shape, bool, pixels that were lit in every frame, whose flux is a lower bound.
+    """
+
+    flux: FluxImage
+    weight: FluxImage
+    std: FluxImage
+    saturated: BoolArray
