@@ -42,9 +42,9 @@ def timeline_of(source: Source, context: Context) -> Timeline:
     return Timeline.with_repeats(same)
 
 
-def _same_as_before(source: Capture, span: FrameSpan) -> BoolArray:
+def _same_as_before(capture: Capture, span: FrameSpan) -> BoolArray:
     """Return whether each frame of a span but the first equals the one before it."""
-    packed = source.packed(span)
+    packed = capture.packed(span)
     some = packed[:, ::_ROW_STRIDE]
     same = (some[1:] == some[:-1]).all(axis=(1, 2))
     for index in np.flatnonzero(same):

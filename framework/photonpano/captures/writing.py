@@ -107,48 +107,31 @@ def write_packed(
     _require_bits(source, path)
     if path.suffix != ".npy":
         raise OutputError(f"cannot write {path}: a packed capture is a .npy file; name it {path.name}.npy")
-    truth = _truth_of(source)
-    truth_bytes = sum(array.nbytes for array in truth.values())
-    with (atomic_path if resumed is None else resumable_path)(path) as temporary:
-        _write_capture(source, path, temporary, truth_bytes, progress, threads, resumed)
-        return (path, *_write_truth(path, truth))
-
-
-def _write_capture(
-    source: Source,
-    final: Path,
-    temporary: Path,
-    truth_bytes: int,
-    progress: Callable[[int], object] | None,
-    threads: int,
-    resumed: Callable[[int], object] | None,
-) -> None:
-    packed = PackedFrames(source)
-    there = temporary.stat().st_size
-    require_space(final, packed.n_bytes + truth_bytes - there)
-    with temporary.open("r+b") as file:
+    packed, truth = PackedFrames(source), _truth_of(source)
+    with (atomic_path if resumed is None else resumable_path)(path) as temporary, temporary.open("r+b") as file:
+        there = temporary.stat().st_size
+        require_space(path, packed.n_bytes + sum(array.nbytes for array in truth.values()) - there)
         done = packed.found_in(file, threads)
         if done is None:
             raise OutputError(
-                f"cannot write {final}: {temporary} is there, and holds something else than the first frames of this capture; "
+                f"cannot write {path}: {temporary} is there, and holds something else than the first frames of this capture; "
                 "remove it, or choose another name"
             )
-        if done and resumed is not None:
-            resumed(done)
-        if done and progress is not None:
-            progress(done)
-        if not done:
+        if done:
+            for notify in (resumed, progress):
+                if notify is not None:
+                    notify(done)
+        else:
             file.seek(0)
             file.write(packed.header)
         file.seek(packed.position(done))
         file.truncate()
-        for frames in in_order(packed.of, packed.blocks(done), threads):
+        for frames in _counted(in_order(packed.of, packed.blocks(done), threads), progress):
             file.write(frames.data)
-            if progress is not None:
-                progress(len(frames))
         # A full disk must be noticed before the truth gets its final name.
         file.flush()
         os.fsync(file.fileno())
+        return (path, *_write_truth(path, truth))
 
 
 class PackedFrames:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano.capture import Capture, Colours, LinearCorrection, capture_of
+from photonpano.photometry.similarity import sums_of_blocks
 from photonpano.reading import COLOURS
 from photonpano.values import Decision
 
@@ -105,8 +106,8 @@ def _clear_mix(sums: NDArray[np.float32], n_frames: int, pixels: list[BoolArray]
     """
     if not pixels[3].any():
         return np.ones(3)
-    area = np.stack([_cells(each[None].astype(np.float32))[0] for each in pixels])
-    photons = np.stack([_cells(sums * each) for each in pixels])
+    area = np.stack([sums_of_blocks(each.astype(np.float32), _CELL_PX) for each in pixels])
+    photons = np.stack([sums_of_blocks(sums * each, _CELL_PX) for each in pixels])
     seen = (area > 0).all(axis=0)
     if not seen.any():
         return np.ones(3)
@@ -124,11 +125,3 @@ def _clear_mix(sums: NDArray[np.float32], n_frames: int, pixels: list[BoolArray]
     normal = design.T @ (weight[:, None] * design) + np.eye(3) / (_MIX_STD * equal) ** 2
     right = design.T @ (weight * (clear - equal * design.sum(axis=1)))
     return np.asarray(np.maximum(equal + np.linalg.solve(normal, right), 0), np.float64)
-
-
-def _cells(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sum squares of pixels: (S, H, W) to (S, h, w); those that the border cuts are left out."""
-    n, height, width = images.shape
-    h, w = height // _CELL_PX, width // _CELL_PX
-    cut = images[:, : h * _CELL_PX, : w * _CELL_PX].reshape(n, h, _CELL_PX, w, _CELL_PX)
-    return np.asarray(cut.sum(axis=(2, 4)), np.float32)

@@ -11,6 +11,7 @@ from photonpano.capture import Capture, LinearCorrection, capture_of
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
 from photonpano.geometry import apply, corner_displacements, inverse
+from photonpano.photometry.similarity import sums_of_blocks
 from photonpano.reading import read_arrays
 from photonpano.robust import huber_weights, robust_std
 from photonpano.values import Decision, FrameSpan, Homography
@@ -169,7 +170,8 @@ class _Seen:
 
     @classmethod
     def of(cls, capture: Capture, span: FrameSpan, trajectory: Trajectory) -> _Seen:
-        photons, area = _binned(capture.corrected_counts(span) * capture.valid), _binned(capture.valid)
+        counts, valid = capture.corrected_counts(span) * capture.valid, capture.valid
+        photons, area = (sums_of_blocks(np.asarray(each, float), _CELL_PX) for each in (counts, valid))
         seen = (area == _CELL_PX**2) & (photons > 0)
         distance, (rows, columns) = _distances(capture.info.frame_shape, _CELL_PX)[seen], np.nonzero(seen)
         centres: FloatArray = (np.stack([columns, rows], axis=-1).astype(float) + 0.5) * _CELL_PX - 0.5
@@ -242,13 +244,6 @@ def _solved(
     found, covariance = solution[:n_shape], inverted[:n_shape, :n_shape] * scale**2
     certain = float(found @ np.linalg.solve(covariance, found))
     return found if certain > n_shape * _SURE**2 else None
-
-
-def _binned(image: NDArray[np.generic]) -> FloatArray:
-    """Sum squares of pixels; those that the border cuts are left out."""
-    height, width = (side // _CELL_PX for side in image.shape)
-    part = np.asarray(image[: height * _CELL_PX, : width * _CELL_PX], float)
-    return np.asarray(part.reshape(height, _CELL_PX, width, _CELL_PX).sum(axis=(1, 3)))
 
 
 def _distances(frame_shape: tuple[int, int], side: int) -> FloatArray:

@@ -112,18 +112,17 @@ class Turn(Rearrangement):
         return type(self).turn(pixels)
 
 
-def _turns() -> tuple[type[Turn], ...]:
-    table: tuple[tuple[str, Callable[[Index], Index], str], ...] = (
-        ("rot90", partial(np.rot90, k=-1), "Turns the frame by 90 degrees clockwise."),
-        ("rot180", partial(np.rot90, k=2), "Turns the frame upside down, by 180 degrees."),
-        ("rot270", partial(np.rot90, k=1), "Turns the frame by 270 degrees clockwise, which is 90 degrees counter-clockwise."),
-        ("flip-ud", np.flipud, "Mirrors the frame top to bottom."),
-        ("flip-lr", np.fliplr, "Mirrors the frame left to right."),
-    )
-    return tuple(type(name, (Turn,), {"name": name, "turn": staticmethod(turn), "__doc__": doc}) for name, turn, doc in table)
-
-
-TURNS = _turns()  # A class for each way to turn a frame
+_TURNS: tuple[tuple[str, Callable[[Index], Index], str], ...] = (
+    ("rot90", partial(np.rot90, k=-1), "Turns the frame by 90 degrees clockwise."),
+    ("rot180", partial(np.rot90, k=2), "Turns the frame upside down, by 180 degrees."),
+    ("rot270", partial(np.rot90, k=1), "Turns the frame by 270 degrees clockwise, which is 90 degrees counter-clockwise."),
+    ("flip-ud", np.flipud, "Mirrors the frame top to bottom."),
+    ("flip-lr", np.fliplr, "Mirrors the frame left to right."),
+)
+# A class for each way to turn a frame.
+TURNS: tuple[type[Turn], ...] = tuple(
+    type(name, (Turn,), {"name": name, "turn": staticmethod(turn), "__doc__": doc}) for name, turn, doc in _TURNS
+)
 
 
 class Preset(Rearrangement):

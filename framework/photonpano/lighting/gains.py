@@ -171,7 +171,8 @@ def solve_gains(seen: SeenCells) -> Gains:
     the motion between these steps.
     """
     n_times = len(seen.spans)
-    brightness, light = _first_guess(seen)
+    photons, exposure = (np.bincount(seen.cells, each, seen.n_cells) for each in (seen.photons, seen.exposure))
+    brightness, light = np.log((photons + 0.5) / np.maximum(exposure, 1)), np.zeros(n_times)
     shifted = np.zeros(len(seen.photons))
     robust = np.ones(len(seen.photons))
     for _ in range(_ROUNDS):
@@ -219,14 +220,6 @@ def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: 
             normal[:, i, j] = np.bincount(seen.times, weight * columns[i] * columns[j], len(seen.spans))
     shift = np.linalg.solve(normal + np.eye(3), right[..., None])[:, :2, 0]
     return np.asarray((shift[seen.times].T * gradient).sum(axis=0))
-
-
-def _first_guess(seen: SeenCells) -> tuple[FloatArray, FloatArray]:
-    """Return the brightness of each square in steady light, and no change of the light."""
-    photons = np.bincount(seen.cells, seen.photons, seen.n_cells)
-    exposure = np.bincount(seen.cells, seen.exposure, seen.n_cells)
-    flux = (photons + 0.5) / np.maximum(exposure, 1)
-    return np.log(flux), np.zeros(len(seen.spans))
 
 
 def _step(seen: SeenCells, weight: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -49,30 +49,30 @@ class CanvasNoise:
         return cls(capture.response, slope, offset, max(each.reduction for each in colours), averaging)
 
     @classmethod
-    def _corrected(cls, source: Capture, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
-        """Lay the corrections of a source on a canvas."""
-        if not source.corrects_sums:
-            return cls(source.response)
-        none = np.zeros(source.info.frame_shape, np.uint32)
-        offset = np.asarray(source.corrected(none, 1), np.float32)
-        slope = np.asarray(source.corrected(none + 1, 1) - offset, np.float32)
-        valid = source.valid
-        if source.weight is not None:
+    def _corrected(cls, capture: Capture, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
+        """Lay the corrections of a capture on a canvas."""
+        if not capture.corrects_sums:
+            return cls(capture.response)
+        none = np.zeros(capture.info.frame_shape, np.uint32)
+        offset = np.asarray(capture.corrected(none, 1), np.float32)
+        slope = np.asarray(capture.corrected(none + 1, 1) - offset, np.float32)
+        valid = capture.valid
+        if capture.weight is not None:
             # A count of weight w adds w to the weight and w^2 times its variance: in frames of weight 1, w times its variance.
-            slope, offset = slope * source.weight, offset * source.weight
+            slope, offset = slope * capture.weight, offset * capture.weight
         means = float(slope[valid].mean()), float(offset[valid].mean())
         if max(np.ptp(slope[valid]), np.ptp(offset[valid])) < _EVEN:
-            return cls(source.response, *means)
+            return cls(capture.response, *means)
         reduction = max(1.0, max(canvas.shape) / _LARGEST_PX)
         height, width = (int(np.ceil(side / reduction)) for side in canvas.shape)
         instants = np.unique(np.linspace(span.start, span.stop - 1, min(len(span), _INSTANTS)).round())
         coarse = replace(canvas, height=height, width=width, transform=rescaling(1 / reduction) @ canvas.transform)
-        sums, share = laid(coarse, source.camera, trajectory.at(instants), (slope, offset), valid)
+        sums, share = laid(coarse, capture.camera, trajectory.at(instants), (slope, offset), valid)
         on_slope, on_offset = (
             np.asarray(np.where(share > 0, total / np.maximum(share, np.float32(1e-6)), mean), np.float32)
             for total, mean in zip(sums, means, strict=True)
         )
-        return cls(source.response, on_slope, on_offset, reduction)
+        return cls(capture.response, on_slope, on_offset, reduction)
 
     def std(self, flux: FluxImage, weight: FluxImage, top: int = 0, left: int = 0) -> FluxImage:
         """Return the standard deviation of the flux, (h, w) or (h, w, 3), of a part of the canvas from `top`, `left` on."""

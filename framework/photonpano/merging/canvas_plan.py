@@ -88,7 +88,7 @@ def plan_canvas(
         fitting = scale * np.sqrt(MAX_EXCESS / excess)
         raise CanvasTooLargeError(
             f"the panorama would have {canvas.width} x {canvas.height} pixels, {excess:.0f} times what fits into the "
-            f"{_gib(memory)} of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
+            f"{memory / 1024**3:.2g} GiB of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
             "More often means that the motion is wrong. Raise run.memory, "
             f"lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
             "or choose a render.reference nearer to the middle of the motion"
@@ -206,10 +206,6 @@ def _part_around(whole: Canvas, covered: Covered, box: tuple[int, int, int, int]
     (left, right), (top, bottom) = ((int(np.floor(start + 1e-6)), int(np.ceil(stop - 1e-6))) for start, stop in (across, down))
     origin = np.rint(whole.transform[:2, 2] + 0.5).astype(int)
     return whole.part(left + int(origin[0]), top + int(origin[1]), bottom - top, right - left)
-
-
-def _gib(size: float) -> str:
-    return f"{size / 1024**3:.2g} GiB"
 
 
 def _rounded_down(scale: float) -> float:

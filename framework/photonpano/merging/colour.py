@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture import capture_of
+from photonpano.photometry import frame_variance
 from photonpano.protocols import Source
 from photonpano.values import BoolArray, FloatArray, FluxImage, Panorama, Response
 
@@ -21,8 +22,7 @@ _LARGEST = 8  # neighbourhoods are doubled at most this many times
 _ROUNDS = 3  # times that the sum of the colours, and their ratios to it, follow from each other
 _RATIO_PX = 1.5  # standard deviation of the Gaussian over which the ratio of a colour to the sum of all is averaged
 _WINDOW_PX = 1.5  # standard deviation of the Gaussian over which the detail of a colour's own is measured
-_RELATIVE_STEP = 0.02  # relative step of numerical derivatives
-_MANY_FRAMES = 1e4
+_DARKEST = np.float32(1e-4)  # least flux of which the noise is taken
 _FEWEST_FRAMES = 1e-3
 
 
@@ -104,7 +104,7 @@ def with_clear(flux: FluxImage, weight: FluxImage, mix: FloatArray, response: Re
     `f + v mix (c - mix . f) / (u + mix . v mix)`: (H, W, 4), the last one clear, become (H, W, 3).
     """
     colours, clear = flux[..., : len(COLOURS)], flux[..., -1]
-    variance = noise_of_a_frame(flux, response) / np.maximum(weight, np.float32(1e-3))
+    variance = frame_variance(np.maximum(flux, _DARKEST), response) / np.maximum(weight, np.float32(1e-3))
     factors = mix.astype(np.float32)
     gain = variance[..., :-1] * factors
     difference = clear - colours @ factors
@@ -130,21 +130,12 @@ def with_shared_detail(flux: FluxImage, weight: FluxImage, response: Response) -
     luminance = (brightness * mean.sum(axis=-1))[..., None]
     below = np.maximum(_blurred(weight * luminance, _RATIO_PX), np.float32(1e-9))
     expected = luminance * _blurred(photons, _RATIO_PX) / below
-    noise = noise_of_a_frame(np.asarray(expected, np.float32), response) / weight
+    noise = frame_variance(np.asarray(np.maximum(expected, _DARKEST), np.float32), response) / weight
     certain = 1 / np.maximum(noise, np.float32(1e-12))
     difference = flux - expected
     own = _blurred(difference**2 * certain - 1, _WINDOW_PX) / _blurred(certain, _WINDOW_PX)
     own = np.maximum(own, 0)
     return np.asarray(np.maximum(expected + own / np.maximum(own + noise, np.float32(1e-12)) * difference, 0), np.float32)
-
-
-def noise_of_a_frame(flux: FluxImage, response: Response) -> FluxImage:
-    """Return the variance of flux estimated from many frames, times their number, from the scale on which it is uniform."""
-    at = np.maximum(flux, np.float32(1e-4))
-    low, high = (np.asarray(at * factor, np.float32) for factor in (1 - _RELATIVE_STEP, 1 + _RELATIVE_STEP))
-    slope = np.asarray((response.stabilised(high, _MANY_FRAMES) - response.stabilised(low, _MANY_FRAMES)) / (high - low))
-    std = response.stabilised_std(_MANY_FRAMES) / np.maximum(slope, np.float32(1e-9))
-    return np.asarray(_MANY_FRAMES * std**2, np.float32)
 
 
 def _due(weight: FluxImage) -> FluxImage:

@@ -77,7 +77,8 @@ class Level:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave out what only the process of the loop needs: the resampler and the interpolator."""
-        return _for_tasks, (self.number, self.scale, self.merger, self.locators, self.origins, self.recorder)
+        components = None, self.merger, self.locators, None
+        return Level, (self.number, self.scale, *components, self.origins, self.recorder)
 
     def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:
         """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator: `attributing`."""
@@ -110,18 +111,6 @@ class Level:
             information = information * np.outer(units, units)
         residual_px = None if motion.residual_px is None else motion.residual_px / self.scale
         return replace(motion, homography=homography, information=information, residual_px=residual_px)
-
-
-def _for_tasks(
-    number: int,
-    scale: float,
-    merger: Merger,
-    locators: tuple[NamedLocator, ...],
-    origins: Mapping[str, str],
-    recorder: Recorder,
-) -> Level:
-    nothing: Any = None
-    return Level(number, scale, nothing, merger, locators, nothing, origins, recorder)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

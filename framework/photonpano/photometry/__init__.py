@@ -1,6 +1,6 @@
 """Camera responses and flux estimation, similarity of images, tone curves, and sums of packed bits."""
 
-from photonpano.photometry.noise import FluxRange, debiased, flux_std, measurable_range, saturated
+from photonpano.photometry.noise import FluxRange, debiased, flux_std, frame_variance, measurable_range, saturated
 from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits
 from photonpano.photometry.pictures import (
     Tone,
@@ -38,6 +38,7 @@ __all__ = [
     "balanced",
     "debiased",
     "flux_std",
+    "frame_variance",
     "grey_world",
     "hann_window",
     "linear_to_srgb",

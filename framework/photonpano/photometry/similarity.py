@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,7 +183,7 @@ def signal_to_noise(exposure: VirtualExposure) -> float:
     if not seen.any():
         return 0.0
     values = np.where(seen, exposure.response.stabilised(flux, weight), np.float32(0))
-    sums, counts = _block_sums(values), _block_sums(seen.astype(np.float32))
+    sums, counts = sums_of_blocks(values, _BLOCK), sums_of_blocks(seen.astype(np.float32), _BLOCK)
     full = counts == _BLOCK**2
     if np.count_nonzero(full) < 2:
         return 0.0
@@ -199,7 +199,8 @@ def _some_rows(image: np.ndarray) -> np.ndarray:
     return rows[::step].reshape(-1, image.shape[1])
 
 
-def _block_sums(image: np.ndarray) -> np.ndarray:
-    rows, columns = image.shape[0] // _BLOCK, image.shape[1] // _BLOCK
-    blocks = image[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK)
-    return np.asarray(blocks.sum(axis=(1, 3)))
+def sums_of_blocks(images: NDArray[Any], side: int) -> NDArray[Any]:
+    """Sum squares of pixels, (..., H, W) to (..., h, w); those that the border cuts are left out."""
+    rows, columns = (length // side for length in images.shape[-2:])
+    whole = images[..., : rows * side, : columns * side]
+    return np.asarray(whole.reshape(*images.shape[:-2], rows, side, columns, side).sum(axis=(-3, -1)))

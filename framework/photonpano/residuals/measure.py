@@ -194,7 +194,7 @@ def _shift_noise_px(predictions: Predictions, homographies: FloatArray) -> float
 class _Colour:
     """Counts and prediction in one colour of the capture."""
 
-    source: Capture  # its pixels
+    capture: Capture  # its pixels
     prediction: Prediction  # the panorama in this colour
     masked: FluxImage | None  # (H, W) 0, NaN for pixels of other colours and masked ones; None if there is none
     # takes everything but the flux out of a sum of frames; None if there is nothing else
@@ -204,15 +204,15 @@ class _Colour:
     slope: FluxImage | None  # (H, W) factor of the counts; None for frames of grey levels, and if there is nothing to correct
 
     @classmethod
-    def of(cls, source: Capture, prediction: Prediction) -> _Colour:
+    def of(cls, capture: Capture, prediction: Prediction) -> _Colour:
         shape = prediction.frame_shape
-        corrected = source.corrected if source.corrects_sums else None
+        corrected = capture.corrected if capture.corrects_sums else None
         zeros = np.zeros(shape, np.uint32)
         # Corrected counts are `slope * counts - n * dark`: counts of the dark, and of less sensitive pixels, add noise.
         dark = np.zeros(shape, np.float32) if corrected is None else -corrected(zeros, 1)
-        slope = corrected(zeros + 1, 1) + dark if corrected is not None and source.info.kind == "binary" else None
-        masked = None if source.valid.all() else np.where(source.valid, np.float32(0), np.float32(np.nan))
-        return cls(source, prediction, masked, corrected, dark, np.maximum(dark, 0), slope)
+        slope = corrected(zeros + 1, 1) + dark if corrected is not None and capture.info.kind == "binary" else None
+        masked = None if capture.valid.all() else np.where(capture.valid, np.float32(0), np.float32(np.nan))
+        return cls(capture, prediction, masked, corrected, dark, np.maximum(dark, 0), slope)
 
     def counted(self, raw: Counts, n_frames: int) -> NDArray[np.float32] | NDArray[np.int32]:
         """Return the counts of a span, corrected, NaN where masked: (H, W)."""
@@ -242,15 +242,15 @@ def _measured(
     row, column = np.mgrid[: grid[0], : grid[1]]
     middle = np.stack([_middles(column, width), _middles(row, height)], axis=-1)
     lever = middle - corners(shape).mean(axis=0)
-    colours = [_Colour.of(source, prediction) for source, prediction in predictions.parts]
-    source = colours[0].source
+    colours = [_Colour.of(*part) for part in predictions.parts]
+    capture = colours[0].capture
     normal, gradient, misfit = np.zeros((len(spans), 5, 5)), np.zeros((len(spans), 5)), np.zeros(len(spans))
     total = Totals.zeros(shape, first.canvas.shape)
     # A pixel adds to the image of its colour, which fewer frames have seen.
     frames_seen = max(predictions.frames_seen / len(colours), 1.0)
     images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
     for index, (span, homography) in enumerate(zip(spans, homographies, strict=True)):
-        raw = source.counts(span)
+        raw = capture.counts(span)
         sums[:] = 0
         for colour in colours:
             counts = colour.counted(raw, len(span))

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from photonpano.capture import Capture, capture_of
 from photonpano.geometry import Camera, Canvas, corners
 from photonpano.merging.light import gain_image
+from photonpano.photometry import frame_variance
 from photonpano.protocols import Source, Trajectory
 from photonpano.residuals.block_sums import sample_places, sample_view
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Panorama, Response
 
 _BLUR_PX = 0.7  # standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture
 _INTERPOLATION_PX2 = 1 / 6  # variance of the kernel of one linear interpolation, averaged over the fractions of a pixel
-_MANY_FRAMES = 1e4  # frames for which the variance of a count is derived; it is then divided by them
+_MANY_FRAMES = 1e4  # of a mean count that is exact
 _MARGIN = 4  # columns with which a full turn is continued on each side: more than the smoothing reaches
 _STRAIGHT_RUN_PX = 64  # from this length of straight runs on, the compiled interpolation is faster than OpenCV's
 
@@ -68,7 +69,7 @@ class Prediction:
         sharp = np.maximum(flux - blur / 2 * cv2.Laplacian(flux, cv2.CV_32F, ksize=1), 0)
         mean = response.mean_count(np.asarray(sharp, np.float32))
         mean[~inside] = np.nan
-        precision = np.asarray(1 / _variance(flux, response), np.float32)
+        precision = np.asarray(1 / frame_variance(flux, response, response.mean_count), np.float32)
         precision[~inside] = 0
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
         remapped = not canvas.planar or (camera is not None and camera.distorts)
@@ -91,7 +92,8 @@ class Prediction:
         flux = self.response.flux(np.where(known, mean, np.float32(0)), _MANY_FRAMES)
         lit = np.asarray(gain * flux, np.float32)
         mean[:] = np.where(known, self.response.mean_count(lit), np.float32(np.nan))
-        precision *= _variance(flux, self.response) / _variance(lit, self.response)
+        before, after = (frame_variance(each, self.response, self.response.mean_count) for each in (flux, lit))
+        precision *= before / after
 
     def _sample(self, homography: Homography, into: NDArray[np.float32]) -> None:
         if self.ideal is not None:
@@ -205,17 +207,3 @@ def _ideal(frame_shape: tuple[int, int], camera: Camera | None) -> FloatArray:
 
 def _smoothed(image: FluxImage) -> FluxImage:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR_PX, borderType=cv2.BORDER_CONSTANT), np.float32)
-
-
-def _variance(flux: FluxImage, response: Response) -> FluxImage:
-    """Return the variance of the count of a frame, for any response.
-
-    On the stabilised scale the noise is known; the derivative of that scale by the mean count converts it.
-    """
-    floor = max(1e-4 * float(flux.max(initial=0)), 1e-7)
-    low, high = np.maximum(flux * np.float32(0.98), floor), np.maximum(flux * np.float32(1.02), 2 * floor)
-    counts = response.mean_count(high) - response.mean_count(low)
-    steps = response.stabilised(high, _MANY_FRAMES) - response.stabilised(low, _MANY_FRAMES)
-    per_step = counts / np.maximum(steps, np.float32(1e-9))
-    std = response.stabilised_std(_MANY_FRAMES) * np.abs(per_step)
-    return np.asarray(np.maximum(_MANY_FRAMES * std**2, 1e-7), np.float32)

@@ -20,8 +20,8 @@ from photonpano.values import BoolArray, Decision
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
 NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
-# These need the pairs of the loop, which a run folder does not hold.
-MAX_CONTRAST = 0.02  # of residuals, as a share of the light, beyond which a large misfit counts
+# Contrast of the residuals, as a share of the light, beyond which a large reduced chi-square counts.
+MAX_CONTRAST = 0.02
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 
