@@ -22,11 +22,9 @@ class Progress(Protocol):
 
     def stage(self, title: str, total: int, unit: str) -> AbstractContextManager[Callable[[int], None]]:
         """Enter a stage of `total` units, such as "level 2: locate" of 81 exposures; call the value with units done."""
-        ...
 
     def note(self, message: str) -> None:
         """Show one line, such as the result of a level or a warning."""
-        ...
 
 
 class Quiet:
@@ -53,15 +51,12 @@ class Log(Protocol):
     @property
     def found(self) -> Sequence[Any]:
         """The results that were kept before; the first that is added is the next one."""
-        ...
 
     def add(self, result: Any) -> None:
         """Keep the next result."""
-        ...
 
     def finish(self) -> None:
         """Mark the step as finished: there are no more results."""
-        ...
 
 
 class Checkpoints(Protocol):
@@ -74,15 +69,12 @@ class Checkpoints(Protocol):
 
     def once(self, step: str, compute: Callable[[], ResultT], *given: Any) -> ResultT:
         """Return the result of a step: the one that was kept, or else the one that `compute` returns, which is kept."""
-        ...
 
     def log(self, step: str, *given: Any) -> Log:
         """Open the results of a step that has many of them."""
-        ...
 
     def within(self, *given: Any) -> Checkpoints:
         """Return checkpoints whose results depend on more."""
-        ...
 
 
 class NoLog:

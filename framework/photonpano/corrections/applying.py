@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from photonpano.capture import MISSING, Capture, Gather, Index, LinearCorrection, capture_of, numbered
-from photonpano.corrections.colour_filter import ColourFilter
-from photonpano.corrections.colours import with_colours
+from photonpano.corrections.colour_filter import ColourFilter, with_colours
 from photonpano.corrections.pixels import Correction, Decide, Pixels
 from photonpano.errors import InputError
 from photonpano.protocols import Source

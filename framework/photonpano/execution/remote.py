@@ -80,7 +80,6 @@ class Pending(Protocol):
         Raises:
             Exception: what the task raised.
         """
-        ...
 
 
 class Workers(Protocol):
@@ -93,20 +92,16 @@ class Workers(Protocol):
             function: of a module that workers can import.
             given: its arguments; a `Pending` is replaced by its result, which travels from worker to worker alone.
         """
-        ...
 
     @property
     def under_way(self) -> int:
         """How many tasks are worth having under way at once: more than there are workers, so that none waits for the next."""
-        ...
 
     def when_done(self, pending: Pending, call: Callable[[], object]) -> None:
         """Have a function called, in any thread, once a task has ended in whatever way."""
-        ...
 
     def close(self) -> None:
         """Cancel what is under way, and end the processes that were started."""
-        ...
 
 
 class Remote:

@@ -1,7 +1,11 @@
 from .alignment import align_planes as align_planes
 from .alignment import align_rotations as align_rotations
+from .camera import ROTATION_AXES as ROTATION_AXES
 from .camera import Camera as Camera
 from .camera import camera_matrix as camera_matrix
+from .camera import nearest_rotations as nearest_rotations
+from .camera import rotation_matrices as rotation_matrices
+from .camera import rotation_vectors as rotation_vectors
 from .canvas import PROJECTIONS as PROJECTIONS
 from .canvas import Canvas as Canvas
 from .canvas import Extent as Extent
@@ -31,10 +35,6 @@ from .homographies import transform_points as transform_points
 from .homographies import translation as translation
 from .homographies import unit_coordinates as unit_coordinates
 from .plausibility import why_implausible as why_implausible
-from .rotations import ROTATION_AXES as ROTATION_AXES
-from .rotations import nearest_rotations as nearest_rotations
-from .rotations import rotation_matrices as rotation_matrices
-from .rotations import rotation_vectors as rotation_vectors
 from .sampling import Run as Run
 from .sampling import run_from as run_from
 from .sampling import sample_run as sample_run

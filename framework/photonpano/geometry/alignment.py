@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from photonpano.geometry.camera import nearest_rotations
 from photonpano.geometry.homographies import corners, from_parameters, normalised, transform_points, unit_coordinates
-from photonpano.geometry.rotations import nearest_rotations
 from photonpano.values import FloatArray, Homography
 
 # Evenly spaced frames to which the alignment is fitted. They are plenty: a homography has eight parameters, and each frame

@@ -58,37 +58,30 @@ class RenderOptions(Protocol):
     @property
     def scale(self) -> float:
         """Pixels of the panorama per pixel of the reference frame."""
-        ...
 
     @property
     def tolerance_px(self) -> float:
         """Motion within which frames are summed before they are warped, in px of a frame."""
-        ...
 
     @property
     def white_quantile(self) -> float:
         """Quantile of the flux that is white in the picture."""
-        ...
 
     @property
     def white_balance(self) -> WhiteBalance:
         """What makes grey things grey in a picture in colour."""
-        ...
 
     @property
     def extent(self) -> Extent:
         """What the canvas holds."""
-        ...
 
     @property
     def tone(self) -> Tone:
         """How flux becomes the picture."""
-        ...
 
     @property
     def exposure_stops(self) -> float:
         """How much brighter the picture is, in powers of two."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -38,17 +38,14 @@ class GraphOptions(Protocol):
     @property
     def skips(self) -> tuple[float, ...]:
         """Each exposure is registered with those at these distances before and after it, in group lengths."""
-        ...
 
     @property
     def closure_overlap(self) -> float | None:
         """Least overlap of a loop closure, as a share of the field of view; None registers no loop closures."""
-        ...
 
     @property
     def disconnected(self) -> Literal["error", "largest"]:
         """Whether a graph that falls apart is an error, or its largest part is used."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

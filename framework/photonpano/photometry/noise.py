@@ -29,7 +29,6 @@ class KnowsNoise(Protocol):
         self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float, slope: Factor = 1.0, offset: Factor = 0.0
     ) -> NDArray[np.float32]:
         """Return the standard deviation of flux: see `flux_std`."""
-        ...
 
 
 @runtime_checkable
@@ -38,7 +37,6 @@ class Debiases(Protocol):
 
     def debiased(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return the flux without bias: see `debiased`."""
-        ...
 
 
 def debiased(flux: FluxImage, weight: FluxImage, response: Response) -> FluxImage:

@@ -27,7 +27,6 @@ class Arrangement(Protocol):
 
         The pixels of a byte stay together. The argument must not be changed.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True)

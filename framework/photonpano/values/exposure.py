@@ -22,22 +22,18 @@ class Response(Protocol):
 
     def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the expected count of one frame at this flux."""
-        ...
 
     def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return the maximum-likelihood flux of a mean count over `frames` frames; finite for finite input."""
-        ...
 
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Map flux estimated from `frames` frames to a scale on which its noise is uniform: see `stabilised_std`.
 
         The mean does not depend on the number of frames, so that exposures of different lengths are comparable.
         """
-        ...
 
     def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return the standard deviation, on that scale, of flux estimated from `frames` frames."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
