@@ -49,8 +49,8 @@ class Capture:
         first: the frame of the source that is frame 0 here.
         gather: rearranges the pixels of frames; None for frames as they are read.
         steps: take everything but the flux out of sums of frames, one after the other.
-        weight: (H, W) float32, not negative: how many frames of an ordinary pixel a frame of each pixel is worth; None for 1.
-            Ordinary is the best pixel behind a filter, and a pixel of gain 1 of a sensor whose pixels differ in gain.
+        weight: (H, W) float32, not negative: statistical weight of a frame of each pixel; None for 1. That of the best pixel
+            behind a filter is 1, and that of a pixel of gain 1 of a sensor whose pixels differ in gain.
         light: the gain of each frame; None for steady light. Frames are weighted by it, and predicted flux is multiplied by it.
         camera: frames are warped through its lens, and homographies map ideal pixels; None if it is not known.
         colour: what the filters of a filter array show; None for a grey capture.
@@ -127,7 +127,7 @@ class Capture:
         return self.corrected(self.counts(span), len(span))
 
     def weights(self) -> FluxImage:
-        """Return how many frames of an ordinary pixel a frame of each pixel is worth: (H, W) float32."""
+        """Return the statistical weight of a frame of each pixel: (H, W) float32, 1 for an ordinary pixel."""
         return np.ones(self.info.frame_shape, np.float32) if self.weight is None else self.weight
 
     def colours(self) -> Mapping[str, Capture]:

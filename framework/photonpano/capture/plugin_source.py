@@ -107,7 +107,7 @@ class PluginSource:
             return self._image("corrected", self.given.corrected(counts, n_frames), counts.shape)
 
     def weights(self) -> FluxImage:
-        """Return what a frame of each pixel is worth: see `photonpano.WeightedSource`."""
+        """Return the statistical weight of a frame of each pixel: see `photonpano.WeightedSource`."""
         with self._attributing("weights()"):
             return self._image("weights", self.given.weights(), self.info.frame_shape)
 

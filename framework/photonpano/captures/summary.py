@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,8 +34,7 @@ _TOLERANCE_PX = 1.5
 _CHECKED_PLACES, _CHECKED_FRAMES = 16, 16
 
 
-@dataclass(frozen=True, slots=True)
-class _Speed:
+class _Speed(NamedTuple):
     """The speed at one place, in px per frame, and the length of the spans that it was measured with, in frames."""
 
     px: float

@@ -10,7 +10,7 @@ from photonpano.contracts.rules import is_real
 from photonpano.geometry import corners, jacobian
 from photonpano.values import FloatArray, Located
 
-UNDETERMINED = 10.0  # a pair whose corners have an expected error of this many sides of a frame ties nothing
+UNDETERMINED = 10.0  # expected corner error of a pair, in sides of a frame, from which on it constrains nothing
 _SAFE = 0.01  # margin of the bound on errors that the smallest pivot gives
 _SMALLEST = 1e-100  # floor on eigenvalues
 _ASYMMETRY = 1e-3  # largest relative asymmetry that counts as rounding

@@ -135,8 +135,8 @@ def _no_flags(found: PoseEstimate, stream: StreamInfo) -> object:
 
 def _not_rigid(found: PoseEstimate, _: StreamInfo) -> object:
     located = np.asarray(found.located)
-    bent = np.flatnonzero(located)[~_are_rigid(found.camera_from_world[located])]
-    return bent.size and (bent[0],)
+    wrong = np.flatnonzero(located)[~_are_rigid(found.camera_from_world[located])]
+    return wrong.size and (wrong[0],)
 
 
 def _std(name: str) -> tuple[Rule, Rule]:

@@ -63,8 +63,7 @@ def measure_pixel_gain(source: Source, trajectory: Trajectory, context: Context)
         )
     knots = _Knots.of(shape)
     places = _on_sensor(seen, inverse(trajectory.at(seen.instants)), seen.to_cells)
-    found = _solved(seen, knots.basis(places), knots.correlation())
-    log_gain, variance = knots.image(found.mean, found.covariance, source.valid)
+    log_gain, variance = knots.image(*_solved(seen, knots.basis(places), knots.correlation()), source.valid)
     gain = np.exp(log_gain)
     gain /= gain[source.valid].mean()
     return PixelGain(gain.astype(np.float32), np.sqrt(variance).astype(np.float32), seen.spans)
@@ -125,15 +124,7 @@ class _Knots:
         return np.stack([row @ mean for row in rows]), np.maximum(np.stack(variance), 0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
-    """The knots: (K,), and their covariance."""
-
-    mean: FloatArray
-    covariance: FloatArray
-
-
-def _solved(seen: SeenCells, basis: Any, correlation: FloatArray) -> _Solved:
+def _solved(seen: SeenCells, basis: Any, correlation: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Solve for the mean (K,) and covariance (K, K) of the knots, or raise an `InputError` if they stay unknown."""
     n_times, n_knots = len(seen.spans), basis.shape[1]
     root = np.linalg.cholesky(correlation)
@@ -177,7 +168,7 @@ def _solved(seen: SeenCells, basis: Any, correlation: FloatArray) -> _Solved:
         # Smoothed squares share photons: their residuals are small, and correlated.
         noise = max(float(np.sqrt(np.mean(left**2))) * SMOOTHING, 1e-9)
     _require_known(information, correlation)
-    return _Solved(mean, covariance)
+    return mean, covariance
 
 
 def _require_known(information: FloatArray, correlation: FloatArray) -> None:

@@ -117,13 +117,13 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
 
 
 def _least_weight(source: Source, side: int) -> float:
-    """Return what the faintest square of `side` px is worth: masked pixels, and those of faint colours, cover less."""
+    """Return the least weight of a square of `side` px: masked pixels, and those of faint colours, weigh less."""
     weights = weights_of(source)
     if weights is None:
         return 1.0
-    worth, valid = (cv2.blur(each, (side, side)) for each in (weights, source.valid.astype(np.float32)))
+    weight, valid = (cv2.blur(each, (side, side)) for each in (weights, source.valid.astype(np.float32)))
     inside = valid >= min(0.5, float(valid.max()))
-    return float((worth[inside] / valid[inside]).min() * source.valid.mean())
+    return float((weight[inside] / valid[inside]).min() * source.valid.mean())
 
 
 def _seen(

@@ -16,7 +16,7 @@ from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range,
 from photonpano.protocols import Source, Trajectory
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Response
 
-_INSTANTS = 64  # largest number of instants at which the corrections of the sensor are laid on the canvas
+_INSTANTS = 64  # largest number of instants at which the corrections of the sensor are warped onto the canvas
 _LARGEST_PX = 1024  # longer side of the maps of corrections on a canvas; those of a larger canvas are coarser than its pixels
 _BLOCK = 2**18  # values of a tile that are looked at at once
 _EVEN = 1e-4  # corrections that differ by less than this are one number
@@ -38,7 +38,7 @@ class CanvasNoise:
 
     @classmethod
     def of(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
-        """Lay the noise of a source on a canvas, as it is on average over the frames of the span that see each place."""
+        """Average the noise model of a capture over the frames of a span that see each place of a canvas."""
         capture = capture_of(source)
         averaging = Averaging.of(trajectory, span, capture.info.frame_shape, canvas, capture.camera)
         if capture.colour is None:
@@ -50,7 +50,7 @@ class CanvasNoise:
 
     @classmethod
     def _corrected(cls, capture: Capture, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
-        """Lay the corrections of a capture on a canvas."""
+        """Average the corrections of a capture over the frames that see each place of a canvas."""
         if not capture.corrects_sums:
             return cls(capture.response)
         none = np.zeros(capture.info.frame_shape, np.uint32)
@@ -105,7 +105,7 @@ class CanvasNoise:
 def laid(
     canvas: Canvas, camera: Camera | None, homographies: FloatArray, images: Sequence[FluxImage], valid: BoolArray
 ) -> tuple[FluxImage, FluxImage]:
-    """Lay images that move with a camera on a canvas, and add them up: (K, H, W), and what is known, (H, W).
+    """Warp images that move with a camera onto a canvas, and add them up: (K, H, W), and what is known, (H, W).
 
     Args:
         canvas: the grid.

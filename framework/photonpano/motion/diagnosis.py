@@ -30,7 +30,7 @@ _START = "If the image turns or shifts at a constant velocity, write motion: {st
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """How much there is to see in an exposure."""
+    """Contrast of an exposure."""
 
     signal_to_noise: float  # standard deviation of the scene over that of a pixel's noise, see `photonpano.photometry`
     blank: str | None = None  # why nothing can be seen in it; None if something can
@@ -58,7 +58,7 @@ class UntiedError(LocationError):
 
 
 def contrast_of(exposure: VirtualExposure) -> Contrast:
-    """Measure how much there is to see in an exposure."""
+    """Measure the contrast of an exposure."""
     longest = exposure.weight.max()
     if longest == 0:
         return Contrast(0.0, "no pixel was seen")
@@ -93,7 +93,7 @@ def require_tied(
         groups: the groups of the level.
         edges: the pairs that were tried.
         parts: (N,) number of the connected component of each exposure, 0 for the largest.
-        contrasts: how much there is to see in each exposure.
+        contrasts: of each exposure.
         disconnected: the option of the spec.
         merged: returns an exposure by its number, for whoever looks at those that are lost.
         started: whether a motion was known before the level.

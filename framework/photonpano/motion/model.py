@@ -1,4 +1,4 @@
-"""What the motion of a camera may be: any homographies, or rotations of one camera."""
+"""The model of the motion: any homographies, or rotations of one camera."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FIRST_FOCAL = 3.0
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
-    """What the motion of a camera may be."""
+    """The model of the motion of a camera."""
 
     kind: ModelName = "homography"  # any homographies, rotations of one camera, or "auto": the model that the pairs support
     focal_px: float | None = None  # of the camera; None if it is to be found

@@ -131,7 +131,7 @@ class WeightedSource(Source, Protocol, metaclass=_Optional):
     """Its pixels carry different amounts of information, as those behind filters of different colours do."""
 
     def weights(self) -> FluxImage:
-        """Return how many frames of an ordinary pixel a frame of each pixel is worth: (H, W) float32; see `Capture`.
+        """Return the statistical weight of a frame of each pixel, 1 for an ordinary one: (H, W) float32; see `Capture`.
 
         Mergers weight the (corrected) counts of a pixel with it, and the number of frames in which it was seen.
         """
