@@ -25,7 +25,7 @@ from photonpano.contracts.rules import (
     shown,
     text,
 )
-from photonpano.geometry import apply, corner_displacements, corners
+from photonpano.geometry import corner_displacements, corners, transform_points
 from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray, Group, Homography, Located, NotLocated, Response, VirtualExposure
 
@@ -335,8 +335,8 @@ def knot_errors(
         frame_shape: (height, width) of a frame.
     """
     points = corners(frame_shape)
-    knots, between = apply(homographies, points), (instants[1:] + instants[:-1]) / 2
-    fitted = apply(trajectory.at(np.concatenate([instants, between])), points)
+    knots, between = transform_points(homographies, points), (instants[1:] + instants[:-1]) / 2
+    fitted = transform_points(trajectory.at(np.concatenate([instants, between])), points)
     strayed_px = _distance_px(fitted[len(instants) :], (knots[1:] + knots[:-1]) / 2) - _distance_px(knots[1:], knots[:-1])
     missed_px = float(np.median(_distance_px(fitted[: len(instants)], knots)))
     return KnotErrors(missed_px, float(np.median(strayed_px)) if len(between) else 0.0, float(np.median(std_px)))

@@ -10,7 +10,7 @@ import numpy as np
 from photonpano.capture import Capture, LinearCorrection, capture_of
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
-from photonpano.geometry import apply, corner_displacements, inverse
+from photonpano.geometry import corner_displacements, inverse, transform_points
 from photonpano.photometry.similarity import sums_of_blocks
 from photonpano.reading import read_arrays
 from photonpano.robust import huber_weights, robust_std
@@ -185,7 +185,7 @@ def _places(capture: Capture, homography: Homography, points: FloatArray) -> Flo
     """Return where (N, 2) pixels of a frame lie in the scene: (N, 2) on its plane, or around its camera if that is known."""
     camera = capture.camera
     if camera is None:
-        return apply(homography, points)
+        return transform_points(homography, points)
     rays = camera.directions(points) @ (np.linalg.inv(camera.matrix) @ homography @ camera.matrix).T
     x, y, z = rays.T
     return camera.focal_px * np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)

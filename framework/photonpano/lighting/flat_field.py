@@ -10,7 +10,7 @@ from scipy import sparse
 
 from photonpano.context import Context
 from photonpano.errors import InputError
-from photonpano.geometry import apply, inverse
+from photonpano.geometry import inverse, transform_points
 from photonpano.lighting.finding import speed_px
 from photonpano.lighting.gains import SMOOTHING, STRUCTURE, SeenCells, seen_cells
 from photonpano.protocols import Source, Trajectory
@@ -74,10 +74,10 @@ def _on_sensor(seen: SeenCells, to_frames: FloatArray, to_cells: Homography) -> 
     rows, columns = np.divmod(seen.cells, seen.shape[1])
     places = np.empty((len(seen.cells), 2))
     cells: FloatArray = np.stack([columns, rows], axis=-1).astype(float)
-    middles = apply(inverse(to_cells), cells)
+    middles = transform_points(inverse(to_cells), cells)
     for time, homography in enumerate(to_frames):
         of_time = seen.times == time
-        places[of_time] = apply(homography, middles[of_time])
+        places[of_time] = transform_points(homography, middles[of_time])
     return places
 
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photonpano.geometry import apply, corners, inverse
+from photonpano.geometry import corners, inverse, transform_points
 from photonpano.protocols import Trajectory
 from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, Group
 
@@ -33,7 +33,7 @@ class Cut:
         """Return this cut with the shift that a trajectory has there, beyond the motion from frame to frame beside it."""
         homographies = trajectory.at(self.frame + np.arange(-2, 2))
         middle = corners(frame_shape).mean(axis=0)
-        before, here, after = apply(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
+        before, here, after = transform_points(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
         return replace(self, shift_px=here - (before + after) / 2)
 
     @property
