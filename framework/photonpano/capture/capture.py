@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from photonpano.capture.pixels import Gather
 from photonpano.capture.plugin_source import PluginSource
+from photonpano.protocols import Closing
 from photonpano.values import BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, StreamInfo
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class Colours:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Capture:
+class Capture(Closing):
     """A capture as components see it. It is a `photonpano.Source`; methods may be called from several threads at once.
 
     A correction, a light, a camera or a part makes another record, with `dataclasses.replace`. A capture in colour is grey by
@@ -164,12 +165,6 @@ class Capture:
     def close(self) -> None:
         """Close the source; it is not used afterwards."""
         self.source.close()
-
-    def __enter__(self) -> Capture:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     @property
     def _is_part(self) -> bool:
