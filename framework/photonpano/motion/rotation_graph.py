@@ -185,21 +185,22 @@ class RotationAdjustment(Adjustment[Rotations]):
         chosen = np.unique(np.linspace(0, len(self._moving) - 1, _MOST_TRIED).astype(int))
         whitening, targets = self._whitening[chosen], self._targets[chosen]
         here = np.broadcast_to(self._corners, targets.shape)
-        rays = [_rays(camera, points) for points in (here, targets)]
+        rays = [Camera(camera.matrix).directions(points) for points in (here, targets)]
         # Of the rotations that bring four directions to four others, the one of least squares (Kabsch 1976); then one step.
         rotations = nearest_rotations(np.swapaxes(rays[1], -1, -2) @ rays[0])
         moves = camera.homographies(ROTATION_AXES)
+
+        def residuals_of(mapped: FloatArray) -> FloatArray:
+            away = transform_points(mapped, self._corners) - targets
+            return np.asarray(np.einsum("eij,ej->ei", whitening, away.reshape(-1, 8)))
+
         for _ in range(2):
             mapped = camera.homographies(rotations)
-            by_rotation = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))
-            residuals = np.einsum("eij,ej->ei", whitening, (transform_points(mapped, self._corners) - targets).reshape(-1, 8))
-            step = -np.linalg.solve(
-                np.swapaxes(by_rotation, -1, -2) @ by_rotation, np.einsum("eij,ei->ej", by_rotation, residuals)[..., None]
-            )
+            slope = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))
+            gradient = np.einsum("eij,ei->ej", slope, residuals_of(mapped))
+            step = -np.linalg.solve(np.swapaxes(slope, -1, -2) @ slope, gradient[..., None])
             rotations = rotations @ rotation_matrices(step[..., 0])
-        residuals = np.einsum(
-            "eij,ej->ei", whitening, (transform_points(camera.homographies(rotations), self._corners) - targets).reshape(-1, 8)
-        )
+        residuals = residuals_of(camera.homographies(rotations))
         squares = (residuals**2).sum(axis=1)
         return float(np.log1p(squares / 8).sum() + (_away(camera, 0, 2 * self._half) / _PRIOR_STD) ** 2)
 
@@ -226,9 +227,3 @@ def _changed(camera: Camera, index: int, step: float) -> Camera:
 def _away(camera: Camera, index: int, side_px: float) -> float:
     """Return how far a number of a camera is from where it may be expected."""
     return float(np.log(camera.focal_px / (_PRIOR_FOCAL * side_px)) if index == 0 else camera.distortion[index - 1])
-
-
-def _rays(camera: Camera, points: FloatArray) -> FloatArray:
-    """Return the unit vectors in which ideal pixels look: (..., 2) to (..., 3)."""
-    rays = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1) @ np.linalg.inv(camera.matrix).T
-    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
