@@ -42,11 +42,8 @@ def require_writable(path: Path, n_pictures: int) -> None:
 def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str], fps: float) -> None:
     """Write pictures of one size, (H, W) or (H, W, 3) with red first; uint8, or uint16 into a folder.
 
-    Args:
-        path: a new or empty folder for PNGs; a file that ends in .mp4, .webp or .gif for a film.
-        pictures: each is used once.
-        names: of the PNGs, without suffix, as many as there are pictures.
-        fps: pictures per second of a film; a GIF counts in 1/100 s.
+    The path is a new or empty folder for PNGs, or a film that ends in .mp4, .webp or .gif. `names` are those of the PNGs,
+    without suffix, as many as there are pictures; a GIF counts the time of a picture in 1/100 s.
 
     Raises:
         OutputError: see `require_writable`; or the files cannot be written. Nothing is left then.

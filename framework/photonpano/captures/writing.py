@@ -87,16 +87,11 @@ def write_packed(
 ) -> tuple[Path, ...]:
     """Write a binary source as uint8 (frames, height, ceil(width / 8)), packed along the width, in constant memory.
 
-    Args:
-        source: the capture; if its truth is known, it is written beside it, see `truth_path`. Packed frames are never unpacked.
-        path: the .npy file.
-        progress: called with the number of frames written since the last call.
-        threads: how many threads read the source.
-        resumed: makes the file resumable: after an interruption it stays as `part_path(path)`, and the next call compares its
-            frames with the source and continues it. Then this is called with the number of frames that it holds.
+    Packed frames are never unpacked. The truth of the source, if it is known, is written beside it, see `truth_path`; all
+    paths are returned, the capture first. `progress` is called with numbers of frames, and `threads` threads read the source.
 
-    Returns:
-        The files written, the capture first.
+    With `resumed`, an interrupted file stays as `part_path(path)`, and the next call compares its frames with the source and
+    continues it; then `resumed` is called with the number of frames that it holds.
 
     Raises:
         InputError: the source is not binary, or corrects its sums, which bits cannot hold.

@@ -327,12 +327,7 @@ def knot_errors(
 ) -> KnotErrors:
     """Compare a trajectory with the knots that it was fitted to: `KNOTS.require` refuses one that has nothing to do with them.
 
-    Args:
-        trajectory: what an interpolator fitted.
-        instants: (N,) of the knots.
-        homographies: (N, 3, 3) of the knots.
-        std_px: (N,) expected error of the knots; NaN where it is not known.
-        frame_shape: (height, width) of a frame.
+    The knots are (N, 3, 3) at (N,) instants, with (N,) expected errors, NaN where these are not known.
     """
     points = corners(frame_shape)
     knots, between = transform_points(homographies, points), (instants[1:] + instants[:-1]) / 2

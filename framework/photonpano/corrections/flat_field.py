@@ -207,12 +207,7 @@ def _solved(
 ) -> FloatArray | None:
     """Solve `log flux = shape @ c + (a number for each cell) + (a number for each time)` for c, (P,); None if c may be 0.
 
-    Args:
-        flux: (N,) positive.
-        weight: (N,) inverse variance of its logarithm.
-        cells: (N,) index of the cell.
-        times: (N,) index of the time.
-        shape: (N, P).
+    All arrays are (N,), but `shape` (N, P); `weight` is the inverse variance of the logarithm of the flux, which is positive.
     """
     n_cells, n_times, n_shape = cells.max() + 1, times.max() + 1, shape.shape[1]
     logarithm, robust = np.log(flux), np.ones_like(flux)

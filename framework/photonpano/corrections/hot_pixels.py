@@ -103,12 +103,9 @@ def _standing_out(pixels: Pixels, capture: Capture, threshold: float) -> tuple[B
 
 
 def outliers(image: FluxImage, noise_std: float, threshold: float) -> BoolArray:
-    """Return the pixels that are brighter or darker than their neighbours: (H, W) bool, False at unknown pixels.
+    """Return the pixels that are brighter or darker than their neighbours: (H, W) bool, False at unknown pixels, which are NaN.
 
-    Args:
-        image: (H, W), on the scale on which photon noise is uniform; NaN at pixels that must not be used.
-        noise_std: standard deviation of photon noise.
-        threshold: smallest deviation, in robust standard deviations of the other pixels.
+    Photon noise is uniform in the image, of the standard deviation `noise_std`; the threshold is in robust standard deviations.
     """
     around = sorted_neighbours(image, reach_of(image))
     differences = np.abs(image - brightest(around, 0.5))

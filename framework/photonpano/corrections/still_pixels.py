@@ -86,19 +86,15 @@ class Still:
 
 
 def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike: Sequence[BoolArray] | None = None) -> Still:
-    """Find what stands still while the rest of the frame moves.
+    """Find what stands still while the rest of the frame moves, from (M, H, W) sums of binary frames at M times of a capture.
 
     A pixel that sees one thing all the time varies by photon noise only; a pixel that the scene moves past varies by its
     contrast. To stand still, a part must have structure in all directions, which a motion would have turned into variation: a
     part that moves by s px (root mean square) over a mean squared gradient g varies by about g s^2. Single pixels stand if they
     differ from their neighbours all the time.
 
-    Args:
-        sums: (M, H, W) uint8, sums of binary frames at M times of the capture.
-        n_frames: frames of a sum.
-        usable: (H, W) bool, pixels to look at.
-        alike: (H, W) bool each, pixels that may be compared with each other, such as those of one colour; by default all. The
-            parts are those that most of the pixels show.
+    Pixels of each mask in `alike` may be compared with each other, such as those of one colour; by default all. The parts are
+    those that most of the pixels show.
     """
     colours = [usable & part for part in alike] if alike else [usable]
     single = np.logical_or.reduce([_single_pixels(sums, n_frames, part) for part in colours])

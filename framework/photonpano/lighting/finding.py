@@ -59,16 +59,11 @@ def measure_light(source: Source, trajectory: Trajectory, context: Context) -> L
 
 
 def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray, std: FloatArray) -> Light:
-    """Correct light by what the panorama rendered in it does not explain.
+    """Correct light by the (S,) changes of spans that the panorama rendered in it does not explain, with standard deviations.
 
-    Squares of the scene are brighter and darker inside, so that a sensor that saturates sees too little of their changes; a
-    panorama has every pixel. Lamps over parts of the scene stay as they are.
-
-    Args:
-        light: in which the panorama was rendered.
-        spans: S spans of frames.
-        change: (S,) their brightness relative to that of the panorama in this light, minus 1.
-        std: (S,) its standard deviation.
+    A change is the brightness of a span relative to that of the panorama in this light, minus 1. Squares of the scene are
+    brighter and darker inside, so that a sensor that saturates sees too little of their changes; a panorama has every pixel.
+    Lamps over parts of the scene stay as they are.
     """
     if light.has_lamps:
         return light
@@ -163,12 +158,8 @@ def gain_of_frames(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return the gain of each frame, (T,), its standard deviation, (T,), and the frequency of its flicker, 0 if there is none.
 
-    Args:
-        instants: (S,) centres of spans, in frames.
-        gain: (S,) mean gain of each.
-        std: (S,) standard deviation of its logarithm.
-        lengths: (S,) frames of each span, over which a flicker is averaged.
-        n_frames: T.
+    Given are the (S,) centres of spans, in frames, their mean gains, the standard deviations of the logarithms of these, and
+    the frames of each span, over which a flicker is averaged.
     """
     frames = np.arange(n_frames, dtype=float)
     at = np.clip(frames, instants[0], instants[-1])

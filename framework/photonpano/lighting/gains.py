@@ -131,12 +131,8 @@ def _seen(
 ) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
     """Return the squares that a span sees, the photons in them, and their exposures in frames and pixels.
 
-    Args:
-        source: the capture.
-        canvas: two pixels are the side of a square.
-        half: pixels of a frame in a pixel of the canvas.
-        covered: least share of the frames in which a square is seen.
-        place: the span, and where its frames lie.
+    A square has the side of two pixels of the canvas, each of which has the side of `half` pixels of a frame; it is seen in
+    the share `covered` of the frames at least. `place` is the span, and where its frames lie.
     """
     span, homography = place
     summed = accumulate(source, [Chunk(span, homography)], canvas, canvas.shape)

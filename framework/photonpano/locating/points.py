@@ -187,13 +187,8 @@ def fit_homography(
 ) -> Fit:
     """Fit a homography to matches by robust least squares, weighted by the inverse sizes of the keypoints.
 
-    Args:
-        moving: (N, 2) points of the moving image.
-        fixed: (N, 2) their partners.
-        sizes: (N,) diameters of the keypoints; position errors are proportional to them.
-        start: (3, 3) initial homography.
-        rounding_px: standard deviation of an error common to all matches: keypoints on whole pixels are all rounded alike where
-            the camera only shifts.
+    Position errors of the (N, 2) points are proportional to the (N,) diameters of the keypoints. `rounding_px` is the standard
+    deviation of an error common to all matches: keypoints on whole pixels are all rounded alike where the camera only shifts.
     """
     here, there = moving.astype(np.float64), fixed.astype(np.float64)
     by_size = (np.median(sizes) / sizes).astype(np.float64)

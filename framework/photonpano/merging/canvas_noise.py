@@ -107,12 +107,8 @@ def laid(
 ) -> tuple[FluxImage, FluxImage]:
     """Warp images that move with a camera onto a canvas, and add them up: (K, H, W), and what is known, (H, W).
 
-    Args:
-        canvas: the grid.
-        camera: of the frames; None if it is not known.
-        homographies: (N, 3, 3), (ideal) pixels of the frame to pixels of the reference plane at N instants.
-        images: K images of a frame, (h, w) each.
-        valid: (h, w), True where they are known.
+    `homographies` (N, 3, 3) map (ideal) pixels of the frame to pixels of the reference plane at N instants; the K images are
+    (h, w), known where `valid`.
     """
     sums, share = np.zeros((len(images), *canvas.shape), np.float32), np.zeros((1, *canvas.shape), np.float32)
     grid, once, never = Grid.zeros(canvas, 1)._replace(coverages=share), np.ones(1), np.zeros(1)

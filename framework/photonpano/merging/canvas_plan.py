@@ -63,15 +63,9 @@ def plan_canvas(
 ) -> Canvas:
     """Choose the canvas that holds every frame of a span, or a part of it, before anything of its size is allocated.
 
-    Args:
-        trajectory: the motion, frame pixels to reference pixels.
-        span: the frames to show.
-        frame_shape: (height, width) of a frame.
-        scale: pixels of the canvas per pixel of the reference frame.
-        memory: bytes that rendering may take.
-        bytes_per_pixel: bytes that rendering takes for a pixel of the canvas.
-        extent: a box is in pixels of the reference frame on a plane, and in degrees of a and b otherwise.
-        view: how the panorama is projected; on a plane by default.
+    `scale` is pixels of the canvas per pixel of the reference frame, `memory` the bytes that rendering may take, of which a
+    pixel takes `bytes_per_pixel`. A box is in pixels of the reference frame on a plane, and in degrees of a and b otherwise;
+    without a view, the canvas is a plane.
 
     Raises:
         ExtentError: no frame shows the extent.

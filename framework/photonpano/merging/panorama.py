@@ -228,20 +228,11 @@ def render_panorama(
     view: View | None = None,
     ready: tuple[Canvas, Panorama] | None = None,
 ) -> RenderedPanorama:
-    """Render the frames of a span, in tiles if the panorama exceeds the memory.
+    """Render the frames of a span, in tiles if the panorama exceeds the memory, in bytes.
 
-    Args:
-        renderer: renders each tile.
-        source: the capture.
-        trajectory: the motion, frame pixels to reference pixels.
-        span: the frames to render.
-        options: scale, extent, tolerance, and how the picture is made.
-        memory: bytes that rendering may take.
-        write_tile: called with each tile, its flux and weight, and the whole canvas.
-        context: threads and progress.
-        bytes_per_pixel: bytes that the renderer takes for a pixel of the canvas, in one colour.
-        view: how the panorama is projected; on a plane by default.
-        ready: what `render` would render of the same frames along the same motion, and its canvas; used if it is the same.
+    `write_tile` is called with each tile, its flux and weight, and the whole canvas. `bytes_per_pixel` is what the renderer
+    takes in one colour. What is `ready` was rendered of the same frames along the same motion, on its canvas; it is used if
+    that is the same.
 
     Raises:
         ExtentError: no frame shows the extent.

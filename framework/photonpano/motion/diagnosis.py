@@ -86,17 +86,8 @@ def require_tied(
     """Raise an `UntiedError` for a level where too many exposures are not tied to the others.
 
     Up to two exposures in a row may be lost, since the motion is interpolated across them. A longer run is an error, unless
-    `disconnected` is "largest". Fewer than two located exposures are always an error.
-
-    Args:
-        level: from 1.
-        groups: the groups of the level.
-        edges: the pairs that were tried.
-        parts: (N,) number of the connected component of each exposure, 0 for the largest.
-        contrasts: of each exposure.
-        disconnected: the option of the spec.
-        merged: returns an exposure by its number, for whoever looks at those that are lost.
-        started: whether a motion was known before the level.
+    `disconnected` is "largest". Fewer than two located exposures are always an error. `parts` (N,) numbers the connected
+    component of each exposure, 0 for the largest; `merged` returns an exposure to whoever looks at those that are lost.
     """
     tied = parts == 0
     if len(groups) == 1:

@@ -109,19 +109,11 @@ def solve(
     start: FloatArray | None = None,
     model: MotionModel = HOMOGRAPHIES,
 ) -> GraphSolution:
-    """Solve the graph: find the motions with the least residuals of all located edges.
+    """Solve the graph: find the motions with the least residuals of all located edges; that of the anchor is the identity.
 
     Robust least squares on the corners that each edge maps, weighted by the edge's information where it has one; Gauss-Newton
-    with Cauchy weights, from a tree of edges between near exposures unless a start is given. Outliers are dropped, unless the
-    graph would fall apart, and it is solved again.
-
-    Args:
-        n_nodes: number of exposures.
-        edges: pairs of exposures; those that are not located are skipped.
-        anchor: the node whose homography is the identity.
-        frame_shape: (height, width) of a frame.
-        start: (N, 3, 3) homographies to any plane, such as those of a solution without some of the edges.
-        model: what the motion of a node may be.
+    with Cauchy weights, from a tree of edges between near exposures unless a start is given: (N, 3, 3) homographies to any
+    plane. Outliers are dropped, unless the graph would fall apart, and it is solved again.
     """
     tied = _Tied.of(n_nodes, edges, anchor, frame_shape)
     if not len(tied.motions):

@@ -58,20 +58,13 @@ def estimate_motion(
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level (paper, section 4).
 
-    `merge` only plans the virtual exposures of a level. `locate` merges each of them in its pool of threads, has it described,
-    and releases it; the description is kept until the last pair of the exposure is registered. Memory therefore does not grow
-    with the number of groups. An exposure that a fallback locator or a loop closure needs is merged again.
+    Virtual exposures are planned first. `locate` merges each of them in its pool of threads, has it described, and releases
+    it; the description is kept until the last pair of the exposure is registered. Memory therefore does not grow with the
+    number of groups. An exposure that a fallback locator or a loop closure needs is merged again.
 
-    Args:
-        source: the capture.
-        levels: the components of each level.
-        graph: which pairs are registered, and whether some exposures may remain disconnected.
-        reference: the frame whose homography is the identity.
-        context: threads, progress, and `on_level`, which is called with each result.
-        until_converged: stop as soon as a level changes the motion by no more than its expected error.
-        previous: the motion that is known so far; None at level 1.
-        timeline: repeated frames, and where the motion is cut; None for a capture without gaps.
-        model: what the motion of the camera may be.
+    The homography of the frame `reference` is the identity. With `until_converged`, the loop ends as soon as a level changes
+    the motion by no more than its expected error. `previous` is the motion known so far; without a timeline, no frame is
+    missing or repeated.
 
     Raises:
         LocationError: too few exposures could be located.

@@ -101,13 +101,9 @@ class Registrar:
     ) -> Iterator[Edge]:
         """Register candidates (moving, fixed) for loop closures; pairs that are not similar once aligned are not located.
 
-        Both exposures of a pair are merged and described again, at the same time.
-
-        Args:
-            pairs: ordered by the moving exposure.
-            homographies: (N, 3, 3) solution of the graph without these pairs, frame pixels to a common plane.
-            pool: waits for tasks.
-            log: the first pairs in order, as `Edge`; receives the others.
+        Both exposures of a pair are merged and described again, at the same time. The pairs are ordered by the moving exposure;
+        `homographies` (N, 3, 3), frame pixels to a common plane, are those without them. `log` has the first pairs in order, as
+        `Edge`, and receives the others.
         """
         self._kept.clear()
         needed_until = {index: position for position, pair in enumerate(pairs) for index in pair}
