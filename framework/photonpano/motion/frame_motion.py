@@ -84,13 +84,13 @@ def smooth_view(motion: FrameMotion, instant: float, std: float) -> Homography:
     # A common factor is the scale of the matrices; the frame of the instant has depth 1.
     points = np.concatenate([frame, np.ones((4, 1))], axis=1) @ np.swapaxes(relative, 1, 2)
     near = (points[..., 2] > _NEAR).all(axis=1)
-    share = _at_zero(instants[near] - instant, std)
-    if share is None:
+    if np.count_nonzero(near) < 2:
         return here
+    times = instants[near] - instant
     if motion.camera is not None:
-        vector = share @ rotation_vectors(nearest_rotations(motion.camera.rotations(relative[near])))
-        return np.asarray(here @ motion.camera.homographies(rotation_matrices(vector)))
-    smooth = np.tensordot(share, points[near, :, :2] / points[near, :, 2:], axes=1)
+        vectors = rotation_vectors(nearest_rotations(motion.camera.rotations(relative[near])))
+        return np.asarray(here @ motion.camera.homographies(rotation_matrices(_at_zero(times, vectors, std))))
+    smooth = _at_zero(times, points[near, :, :2] / points[near, :, 2:], std)
     to_frame = cv2.getPerspectiveTransform(frame.astype(np.float32), smooth.astype(np.float32))
     return np.asarray(here @ normalised(to_frame))
 
@@ -101,11 +101,7 @@ def _instants(instant: float, span: FrameSpan, std: float) -> FloatArray:
     return np.unique(np.linspace(first, last, max(number, 1)).round())
 
 
-def _at_zero(times: FloatArray, std: float) -> FloatArray | None:
-    """Return the weights, of sum 1, that give a line of least squares at time 0; None for fewer than two times."""
-    weights = np.exp(-0.5 * (times / std) ** 2)
-    sum_0, sum_1, sum_2 = (float((weights * times**power).sum()) for power in range(3))
-    determinant = sum_0 * sum_2 - sum_1**2
-    if len(times) < 2 or determinant <= 1e-9 * sum_0**2:
-        return None
-    return np.asarray(weights * (sum_2 - sum_1 * times) / determinant)
+def _at_zero(times: FloatArray, values: FloatArray, std: float) -> FloatArray:
+    """Return the value at time 0 of the line of least squares through (N, ...) values, with Gaussian weights."""
+    line = np.polyfit(times, values.reshape(len(times), -1), 1, w=np.exp(-0.25 * (times / std) ** 2))
+    return np.asarray(line[1].reshape(values.shape[1:]))

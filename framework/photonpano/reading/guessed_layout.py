@@ -173,12 +173,9 @@ def _last_is_longest(first: int, second: int, last: int) -> bool:
 
 def _last_is_alike(samples: Sequence[NDArray[Any]], block: tuple[int, int, int]) -> bool:
     """Return whether neighbouring blocks of values correlate most along the last axis."""
-    first, second, last = np.sum([_moments(_blocks(each, block)) for each in samples], axis=0)
-    correlations = [_correlation(moments) for moments in (first, second, last)]
-    if not all(correlations):
-        return False
-    lead = correlations[2] - max(correlations[:2])
-    return lead > _MIN_LEAD * math.sqrt(2 / float(last[0]))
+    blocks = [_blocks(each, block) for each in samples]
+    (first, _), (second, _), (last, number) = (_correlation(blocks, axis) for axis in range(3))
+    return bool(first and second and last) and last - max(first, second) > _MIN_LEAD * math.sqrt(2 / number)
 
 
 def _blocks(frames: NDArray[Any], block: tuple[int, int, int]) -> NDArray[np.float64]:
@@ -189,23 +186,12 @@ def _blocks(frames: NDArray[Any], block: tuple[int, int, int]) -> NDArray[np.flo
     return np.asarray(in_blocks.mean(axis=(1, 3, 5)))
 
 
-def _moments(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (3, 6) sums over neighbours along the first, second and last axis: 1, x, y, x^2, y^2, x y."""
-    rows = []
-    for axis in range(3):
-        along = np.moveaxis(blocks, axis, 0)
-        x, y = along[:-1], along[1:]
-        rows.append([x.size, *(each.sum() for each in (x, y, x * x, y * y, x * y))])
-    return np.array(rows, np.float64)
-
-
-def _correlation(moments: NDArray[np.float64]) -> float:
-    """Return the correlation of neighbours; 0 if there are none, or no scatter."""
-    if not moments[0]:
-        return 0.0
-    x, y, xx, yy, xy = moments[1:] / moments[0]
-    scatter = float(np.sqrt(max(0.0, (xx - x * x) * (yy - y * y))))
-    return float(xy - x * y) / scatter if scatter > 0 else 0.0
+def _correlation(blocks: Sequence[NDArray[np.float64]], axis: int) -> tuple[float, int]:
+    """Return the correlation of neighbours along an axis, 0 if there are none, or no scatter; and how many there are."""
+    along = [np.moveaxis(each, axis, 0) for each in blocks]
+    x, y = (np.concatenate([each[part].ravel() for each in along]) for part in (slice(None, -1), slice(1, None)))
+    scatter = float(x.std() * y.std()) if x.size else 0.0
+    return (float(((x - x.mean()) * (y - y.mean())).mean()) / scatter if scatter > 0 else 0.0), x.size
 
 
 class Channel(NamedTuple):
