@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from photonpano.lighting.gains import STRUCTURE, Gains, SeenCells
+from photonpano.lighting.gains import STRUCTURE, Gains, SeenCells, equations_of_groups
 from photonpano.values import FloatArray, FluxImage
 
 _PERIODS = 2.5  # periods for which a place must be in view
@@ -144,12 +144,7 @@ def _fitted(seen: SeenCells, waves: FloatArray, slow: FloatArray) -> FloatArray:
     exposure = seen.exposure * slow[seen.times]
     weight = 1 / (flux[seen.cells] / exposure + (STRUCTURE * flux[seen.cells]) ** 2)
     columns = waves[:, seen.times]
-    normal = np.zeros((seen.n_cells, 3, 3))
-    right = np.zeros((seen.n_cells, 3))
-    for i in range(3):
-        right[:, i] = np.bincount(seen.cells, weight * columns[i] * seen.photons / exposure, seen.n_cells)
-        for j in range(3):
-            normal[:, i, j] = np.bincount(seen.cells, weight * columns[i] * columns[j], seen.n_cells)
+    normal, right = equations_of_groups(seen.cells, seen.n_cells, columns, weight, seen.photons / exposure)
     normal[:, 0, 0] += 1e-12
     for i in (1, 2):
         normal[:, i, i] += 1 / (_SPREAD * flux) ** 2

@@ -208,14 +208,18 @@ def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: 
     image = np.where(unseen, np.nan, brightness).reshape(seen.shape)
     gradient = np.stack([np.nan_to_num(each).ravel() for each in np.gradient(image)])[:, seen.cells]
     columns = np.concatenate([gradient, np.ones((1, len(left)))])
-    normal = np.empty((len(seen.spans), 3, 3))
-    right = np.empty((len(seen.spans), 3))
-    for i in range(3):
-        right[:, i] = np.bincount(seen.times, weight * columns[i] * left, len(seen.spans))
-        for j in range(3):
-            normal[:, i, j] = np.bincount(seen.times, weight * columns[i] * columns[j], len(seen.spans))
+    normal, right = equations_of_groups(seen.times, len(seen.spans), columns, weight, left)
     shift = np.linalg.solve(normal + np.eye(3), right[..., None])[:, :2, 0]
     return np.asarray((shift[seen.times].T * gradient).sum(axis=0))
+
+
+def equations_of_groups(
+    groups: NDArray[np.intp], number: int, columns: FloatArray, weight: FloatArray, target: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the least-squares equations of each group of observations, for K columns (K, N): (G, K, K) and (G, K)."""
+    normal = np.array([[np.bincount(groups, weight * one * other, number) for other in columns] for one in columns])
+    right = np.array([np.bincount(groups, weight * one * target, number) for one in columns])
+    return np.moveaxis(normal, -1, 0), right.T
 
 
 def _step(seen: SeenCells, weight: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -36,19 +36,12 @@ _TURN = 360
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """How a panorama is projected.
+    """How a panorama is projected."""
 
-    Attributes:
-        projection: "planar", "cylindrical", "spherical", or "auto".
-        level: whether the horizon is level, or that of the reference frame.
-        camera: of the frames; None if it is not known.
-        turns: whether the camera only turns, so that a cylinder or a sphere can show what it sees.
-    """
-
-    projection: str = "auto"
-    level: bool = False
-    camera: Camera | None = None
-    turns: bool = False
+    projection: str = "auto"  # "planar", "cylindrical", "spherical", or "auto"
+    level: bool = False  # whether the horizon is level, or that of the reference frame
+    camera: Camera | None = None  # of the frames; None if it is not known
+    turns: bool = False  # whether the camera only turns, so that a cylinder or a sphere can show what it sees
 
 
 def plan_canvas(
