@@ -28,11 +28,9 @@ CORRECTIONS = {correction.name: correction for correction in _ALL}  # all correc
 __all__ = [
     "CORRECTIONS",
     "Correction",
-    "DarkCounts",
     "DarkFrames",
     "FlatField",
     "HotPixels",
-    "StillPixels",
     "Vignette",
     "corrected_source",
     "divided_by",

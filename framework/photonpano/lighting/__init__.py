@@ -3,7 +3,6 @@
 from photonpano.capture import in_light
 from photonpano.lighting.finding import (
     LIGHT_DECISION,
-    LIGHT_FILE,
     corrected_light,
     decision_of,
     find_light,
@@ -15,7 +14,6 @@ from photonpano.lighting.flat_field import PixelGain, measure_pixel_gain
 
 __all__ = [
     "LIGHT_DECISION",
-    "LIGHT_FILE",
     "PixelGain",
     "corrected_light",
     "decision_of",

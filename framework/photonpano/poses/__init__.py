@@ -8,7 +8,6 @@ from photonpano.poses.formats import (
     colmap,
     in_standard_world,
     nerfstudio,
-    path_length,
     ply,
     tum,
 )
@@ -21,7 +20,6 @@ __all__ = [
     "colmap",
     "in_standard_world",
     "nerfstudio",
-    "path_length",
     "ply",
     "tum",
 ]
