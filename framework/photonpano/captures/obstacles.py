@@ -30,6 +30,11 @@ _MOST_PEAKS = 200  # most peaks that are compared
 _REACH = 1 / 3  # largest shift that is looked at, as a share of the frame
 _FILTER_BLUR_PX = 1.0  # standard deviation of the Gaussian that blurs a colour filter array
 _STANDING = 0.3  # share of the frame from which what stands still is named
+_BLOCK_FRAMES = 256  # frames that are compared at a time
+_ROW_STRIDE = 16  # frames are compared on every 16th row first
+# Frames that are repeated differ from the frame before by this many newly lit pixels, and as many that went dark: dark frames
+# are alike by chance, and so are saturated ones.
+_FEWEST_NEW = 20
 
 
 def order_warning(source: Source) -> str | None:
@@ -124,13 +129,6 @@ def repetition_px(first: NDArray[Any], second: NDArray[Any]) -> float | None:
     along = ndimage.map_coordinates(surface, np.moveaxis(between, -1, 0)[::-1], order=1, mode="grid-wrap")
     apart = np.hypot(*(shifts[1:] - shifts[0]).T)[along.min(axis=0, initial=np.inf) < _DIP * surface.max()]
     return float(apart.min()) if apart.size else None
-
-
-_BLOCK_FRAMES = 256  # frames that are compared at a time
-_ROW_STRIDE = 16  # frames are compared on every 16th row first
-# Frames that are repeated differ from the frame before by this many newly lit pixels, and as many that went dark: dark frames
-# are alike by chance, and so are saturated ones.
-_FEWEST_NEW = 20
 
 
 def timeline_of(source: Source, context: Context) -> Timeline:

@@ -28,6 +28,12 @@ if TYPE_CHECKING:
 
 Colour = Literal["red", "green", "blue", "clear"]
 _ALL = "all"
+_SPANS, _SPAN_FRAMES = 16, 256  # gains are measured in 16 spans of 256 frames all over the capture
+_CELL_PX = 16  # side of the squares of the sensor in which clear and coloured pixels are compared
+_MOSTLY = 0.5  # share of clear pixels from which on the motion is estimated from them alone
+_LEAST_GAIN = 0.05  # a colour is brightened by 20 at most: in the light of a red lamp, blue pixels see noise
+_MIX_STD = 0.3  # prior standard deviation of the factors of a clear pixel, relative to their mean
+_MANY_FRAMES = 1e6
 
 
 class ColourFilter(Correction):
@@ -102,14 +108,6 @@ class ColourFilter(Correction):
             )
         as_read = bayer_array(capture.info.bayer, capture.info.frame_shape)
         return as_read.ravel()[pixels.index], f"the array of the capture, {capture.info.bayer},"
-
-
-_SPANS, _SPAN_FRAMES = 16, 256  # gains are measured in 16 spans of 256 frames all over the capture
-_CELL_PX = 16  # side of the squares of the sensor in which clear and coloured pixels are compared
-_MOSTLY = 0.5  # share of clear pixels from which on the motion is estimated from them alone
-_LEAST_GAIN = 0.05  # a colour is brightened by 20 at most: in the light of a red lamp, blue pixels see noise
-_MIX_STD = 0.3  # prior standard deviation of the factors of a clear pixel, relative to their mean
-_MANY_FRAMES = 1e6
 
 
 def with_colours(source: Source, places: NDArray[np.int8], look: bool = True) -> Capture:

@@ -27,6 +27,14 @@ if TYPE_CHECKING:
 
 VIGNETTE_DECISION, FLAT_FIELD_DECISION = "vignette_gain", "flat_field"  # names of the decisions in a record
 VIGNETTE_FILE = "vignette.npz"
+_SPANS, _SPAN_FRAMES = 48, 64  # spans all over the capture, and most frames of each
+_SPAN_PX = 8.0  # the image moves by about this in a span, at most
+_CELL_PX = 8  # side of the squares of the sensor and of the scene that are compared
+_POWERS = (2, 4, 6)  # the logarithm of the gain is a polynomial of these powers of the distance from the middle of the frame
+_ROUNDS = 6  # of iteratively reweighted least squares
+_OUTLIER = 3.0  # standard deviations from which a square is down-weighted (Huber)
+_LEAST_RMS = 0.03  # smaller vignettes (root mean square) cost nothing, and are ignored
+_SURE = 6.0  # standard errors by which a vignette must differ from none: the scene within squares adds correlated errors
 
 
 class FlatField(Correction):
@@ -118,16 +126,6 @@ def read_vignette(folder: Path, source: Source) -> Vignette | None:
             held = "missing" if image is None else f"{image.dtype} of shape {image.shape}"
             raise InputError(f"{path}: {name} must be float32 of shape {shape}, as the frames, and is {held}; run again")
     return Vignette(arrays["gain"], arrays["mean"], (), arrays.get("std"))
-
-
-_SPANS, _SPAN_FRAMES = 48, 64  # spans all over the capture, and most frames of each
-_SPAN_PX = 8.0  # the image moves by about this in a span, at most
-_CELL_PX = 8  # side of the squares of the sensor and of the scene that are compared
-_POWERS = (2, 4, 6)  # the logarithm of the gain is a polynomial of these powers of the distance from the middle of the frame
-_ROUNDS = 6  # of iteratively reweighted least squares
-_OUTLIER = 3.0  # standard deviations from which a square is down-weighted (Huber)
-_LEAST_RMS = 0.03  # smaller vignettes (root mean square) cost nothing, and are ignored
-_SURE = 6.0  # standard errors by which a vignette must differ from none: the scene within squares adds correlated errors
 
 
 def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None:

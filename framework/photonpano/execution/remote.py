@@ -15,6 +15,11 @@ from photonpano.errors import PluginError
 from photonpano.interrupts import interrupted
 
 _CAPTURE = "capture"
+_POLL_S = 0.2  # from one check for an interrupt to the next, in threads that wait
+# Items of a task. An exposure takes some ten milliseconds, and a task costs about one in the scheduler and in the client.
+_MOST_AT_ONCE = 8
+# Items are worked on at once where there are so many tasks for each one under way, so that no worker waits for the last.
+_TASKS_UNDER_WAY = 4
 
 
 def packed(value: object, capture: object) -> bytes:
@@ -54,11 +59,6 @@ class _Unpacker(pickle.Unpickler):
         return self._capture
 
 
-_POLL_S = 0.2  # from one check for an interrupt to the next, in threads that wait
-# Items of a task. An exposure takes some ten milliseconds, and a task costs about one in the scheduler and in the client.
-_MOST_AT_ONCE = 8
-# Items are worked on at once where there are so many tasks for each one under way, so that no worker waits for the last.
-_TASKS_UNDER_WAY = 4
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 

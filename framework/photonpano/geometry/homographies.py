@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from photonpano.values import FloatArray, Homography
 
 BLOCK_FRAMES = 8192  # what is computed of all frames of a capture is computed for this many at a time, which bounds the memory
+_PARAMETERS = ((0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1))  # row and column of p1..p8
 
 
 def normalised(matrices: ArrayLike) -> Homography:
@@ -177,9 +178,6 @@ def from_parameters(p: ArrayLike) -> Homography:
     for index, (row, column) in enumerate(_PARAMETERS):
         h[..., row, column] += p[..., index]
     return h
-
-
-_PARAMETERS = ((0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1))  # row and column of p1..p8
 
 
 @cache

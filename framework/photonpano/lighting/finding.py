@@ -28,6 +28,14 @@ _LEAST_SIGMAS = 3.0  # least ratio of these changes to their noise
 _PROBES, _PROBE_FRAMES = 128, 16  # spans all over the capture, and frames of each, that are compared to find out
 _MOST_SPANS, _FEWEST_FRAMES = 640, 4  # most spans, and fewest frames of each, with which the light is measured
 _SPAN_PX = 4.0  # the image moves by no more than this in a span
+_HARMONICS = 3  # harmonics of a flicker that are fitted
+_FEWEST_PERIODS, _FEWEST_SPANS = 2.5, 32  # of the capture, for a flicker to be searched for
+_FINER = 16  # oversampling of frequency: steps per 1/T, for a capture of the duration T
+_LINE_SHARE = 0.6  # least share of the changes of the light, without a slow curve, that a flicker explains
+_SMALLEST = 0.01  # least root mean square of a flicker, relative to the light
+_DARKEST = 0.02  # least gain of spans from which slow changes are fitted
+LIGHT_FILE = "light.npz"
+_ARRAYS = ("gain", "waves", "maps", "to_map", "frequency", "std")
 
 
 def find_light(source: Source, trajectory: Trajectory, context: Context) -> Light | None:
@@ -120,14 +128,6 @@ def speed_px(source: Source, trajectory: Trajectory) -> float:
     return float(moved) / max(float(instants[1]), 1e-9)
 
 
-_HARMONICS = 3  # harmonics of a flicker that are fitted
-_FEWEST_PERIODS, _FEWEST_SPANS = 2.5, 32  # of the capture, for a flicker to be searched for
-_FINER = 16  # oversampling of frequency: steps per 1/T, for a capture of the duration T
-_LINE_SHARE = 0.6  # least share of the changes of the light, without a slow curve, that a flicker explains
-_SMALLEST = 0.01  # least root mean square of a flicker, relative to the light
-_DARKEST = 0.02  # least gain of spans from which slow changes are fitted
-
-
 def flicker_frequency(instants: FloatArray, gain: FloatArray) -> float:
     """Return the frequency of the strongest line in the spectrum of a series, in cycles per frame; 0 if none stands out.
 
@@ -208,10 +208,6 @@ def _smooth(instants: FloatArray, values: FloatArray, std: FloatArray) -> Callab
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a closer fit was not found in its limit of steps
         return UnivariateSpline(instants, values, w=1 / np.maximum(std, 1e-4), k=3, s=len(values))
-
-
-LIGHT_FILE = "light.npz"
-_ARRAYS = ("gain", "waves", "maps", "to_map", "frequency", "std")
 
 
 def write_light(folder: Path, light: Light) -> None:

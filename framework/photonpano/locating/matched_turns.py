@@ -31,6 +31,14 @@ _LEAST_SHARE = 0.2
 # deviation in every direction must be a minimum share of the shorter side of the image.
 _LEAST_SPREAD = 0.1
 _ITERATIONS = 10  # steps of reweighted least squares; the last ones change the rotation by far less than its error
+# Pairs of matches that are tried at most; of more, as many are drawn, 200 of them right if a fifth of the matches are.
+_MOST_PAIRS = 5000
+_MOST_SCORED = 500_000  # rotations are scored until they have mapped this many points
+_BASELINE = 10.0  # two matches determine a rotation if they are further apart than this, in units of the threshold
+_ROUNDS = 3  # how often the best rotation is fitted to the matches that agree with it
+# Expected number of rotations, of all that two matches determine, on which as many matches agree by chance.
+_FALSE_ALARMS = 1e-4
+_FAR_PX = 1e6  # points that are mapped further away are taken to lie there
 
 
 def turn_of(
@@ -172,16 +180,6 @@ def _information(lengths: FloatArray, scale: float, threshold_px: float) -> floa
     slope = (weights - weights**3 * (inner / scale) ** 2 / 2).sum() - ring / np.sqrt(1 + (threshold_px / scale) ** 2)
     square = ((weights * inner) ** 2 + MIN_NOISE_PX**2).sum() / max(1, 2 * len(inner) - 3)
     return float(max(slope, 0.0) / len(inner)) ** 2 / float(square)
-
-
-# Pairs of matches that are tried at most; of more, as many are drawn, 200 of them right if a fifth of the matches are.
-_MOST_PAIRS = 5000
-_MOST_SCORED = 500_000  # rotations are scored until they have mapped this many points
-_BASELINE = 10.0  # two matches determine a rotation if they are further apart than this, in units of the threshold
-_ROUNDS = 3  # how often the best rotation is fitted to the matches that agree with it
-# Expected number of rotations, of all that two matches determine, on which as many matches agree by chance.
-_FALSE_ALARMS = 1e-4
-_FAR_PX = 1e6  # points that are mapped further away are taken to lie there
 
 
 def distinct(moving: FloatArray, fixed: FloatArray, threshold_px: float) -> BoolArray:

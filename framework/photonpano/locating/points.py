@@ -15,6 +15,10 @@ from photonpano.robust import robust_std, soft_l1_weights
 from photonpano.values import FloatArray, Homography, Located, NotLocated
 
 Points = NDArray[np.floating]
+# Rounds of reweighting; after 4 the weights of the soft L1 loss change the result by a few per cent of its error.
+REWEIGHTINGS = 4
+# Lower bound of the position error of a keypoint, px; the residuals of a few matches may be smaller by chance.
+MIN_NOISE_PX = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,12 +155,6 @@ def motion_from_points(
     if reason := why_implausible(homography, shape):
         return NotLocated(f"{reason}, from {found['inliers']:.0f} inliers", found)
     return Located(homography, fit.information, fit.residual_px, found)
-
-
-# Rounds of reweighting; after 4 the weights of the soft L1 loss change the result by a few per cent of its error.
-REWEIGHTINGS = 4
-# Lower bound of the position error of a keypoint, px; the residuals of a few matches may be smaller by chance.
-MIN_NOISE_PX = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)

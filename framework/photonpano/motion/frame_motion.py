@@ -23,6 +23,10 @@ from photonpano.motion.loop import LevelResult
 from photonpano.protocols import Source, Trajectory, camera_of, camera_of_motion
 from photonpano.values import BoolArray, FloatArray, FrameSpan, Homography, StreamInfo
 
+_REACH = 3.0  # instants up to this many standard deviations away count
+_MOST_INSTANTS = 400
+_NEAR = 0.5  # a frame counts if its corners have more than this part of the depth of the instant's; others look elsewhere
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameMotion:
@@ -64,11 +68,6 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     trajectory = FrameTrajectory(homographies)
     camera = camera_of_motion(last.trajectory)
     return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, camera)
-
-
-_REACH = 3.0  # instants up to this many standard deviations away count
-_MOST_INSTANTS = 400
-_NEAR = 0.5  # a frame counts if its corners have more than this part of the depth of the instant's; others look elsewhere
 
 
 def smooth_view(motion: FrameMotion, instant: float, std: float) -> Homography:

@@ -9,6 +9,15 @@ from numpy.typing import NDArray
 
 # Factors of red, green and blue in a picture: all 1, those that make the mean grey, or given ones.
 WhiteBalance: TypeAlias = Literal["none", "grey-world"] | tuple[float, float, float]
+# Range of OpenCV's operators, in powers of ten: what is darker than 1e-4 of the brightest pixel is black in them.
+_OPENCV_DECADES = 4.0
+_FLOOR_QUANTILE = 0.01  # quantile of the positive flux that is the darkest in a picture; below, there is mostly noise
+_EVEN = 1.01  # an image that is not brighter than its darkest pixels by this factor has no range to compress
+_WHITE_QUANTILE = 0.995  # quantile that is white after an operator that has a brightness of its own
+_ERRORS = 2  # the log level of OpenCV at which it writes errors only
+_BASE_STOPS = 4.5  # range to which `local` compresses the light without its details, in powers of two
+_BASE_SHARE = 1 / 60  # radius of the details that `local` keeps, as a share of the longer side
+_BASE_EDGE = 1.0  # steps of more than this many stops count as edges of the light, not as details
 
 
 def srgb_to_linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -57,16 +66,6 @@ def tone_mapped(flux: NDArray[np.float32], white: float, *, srgb: bool = True) -
 
 # How flux becomes a picture: the sRGB curve, three operators of OpenCV, and one that keeps local contrast.
 Tone = Literal["srgb", "reinhard", "drago", "mantiuk", "local"]
-
-# Range of OpenCV's operators, in powers of ten: what is darker than 1e-4 of the brightest pixel is black in them.
-_OPENCV_DECADES = 4.0
-_FLOOR_QUANTILE = 0.01  # quantile of the positive flux that is the darkest in a picture; below, there is mostly noise
-_EVEN = 1.01  # an image that is not brighter than its darkest pixels by this factor has no range to compress
-_WHITE_QUANTILE = 0.995  # quantile that is white after an operator that has a brightness of its own
-_ERRORS = 2  # the log level of OpenCV at which it writes errors only
-_BASE_STOPS = 4.5  # range to which `local` compresses the light without its details, in powers of two
-_BASE_SHARE = 1 / 60  # radius of the details that `local` keeps, as a share of the longer side
-_BASE_EDGE = 1.0  # steps of more than this many stops count as edges of the light, not as details
 
 
 def picture_of(flux: NDArray[np.float32], white: float, tone: Tone = "srgb", stops: float = 0.0) -> NDArray[np.uint8]:

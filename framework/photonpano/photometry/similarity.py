@@ -18,6 +18,8 @@ _LAGS = 4  # the largest lag of an autocorrelation is the side of the image over
 # flux 0.02 and 0.1, pale and blurred ones among them, those that `direct` aligned scored 6.6 and more; of 370 pairs of smears
 # or of different places none reached 5.2, at correlations of up to 0.77. Repeated texture, such as windows, may pass.
 _MIN_SCORE = 5.5
+_ROWS = 16  # rows of blocks that are sampled
+_BLOCK = 4  # side of the blocks, px, whose averages separate scene and noise: averaging reduces the noise and hardly the scene
 
 
 def hann_window(shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -167,10 +169,6 @@ def similarity_of(
     observed = covariance[0, 1] / math.sqrt(max(covariance[0, 0] * covariance[1, 1], np.finfo(float).tiny))
     score = math.atanh(min(float(observed), 1 - 1e-9)) * math.sqrt(max(0.0, structures - 3))
     return Similarity(noise_free_correlation(covariance, noise, independent), structures, score)
-
-
-_ROWS = 16  # rows of blocks that are sampled
-_BLOCK = 4  # side of the blocks, px, whose averages separate scene and noise: averaging reduces the noise and hardly the scene
 
 
 def signal_to_noise(exposure: VirtualExposure) -> float:

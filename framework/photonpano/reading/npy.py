@@ -25,6 +25,7 @@ from photonpano.reading.remote import read_range
 
 _HEADER_BYTES = 4096  # bytes of a URL that are read for the header; that of a capture has 128
 _SHORTEST_HEADER = 128  # bytes of the shortest header that numpy writes
+_BLOCK_BYTES = 1024**2
 
 
 class NpyHeader(NamedTuple):
@@ -126,8 +127,6 @@ def _guess(start: bytes) -> str:
 
 
 logger = logging.getLogger(__name__)
-
-_BLOCK_BYTES = 1024**2
 
 
 def local(path: Location) -> Path:

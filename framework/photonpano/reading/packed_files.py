@@ -26,6 +26,8 @@ _ENDS = 64  # ends of spans remembered: a span that begins at one of them contin
 _SMALL = 4  # a span below 1/4 of a piece is fetched alone, unless it continues another
 
 Fetch = Callable[[FrameSpan], NDArray[np.uint8]]
+_READ_BYTES = 1024**2  # read at once: they stay in the cache of a core until they are summed
+_PIECE_BYTES = 4 * 1024**2  # fetched from a URL at once: a request takes milliseconds, whatever its size
 
 
 class Pieces:
@@ -94,10 +96,6 @@ class Pieces:
         """Forget the pieces, and fetch no more of them."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         self._kept.clear()
-
-
-_READ_BYTES = 1024**2  # read at once: they stay in the cache of a core until they are summed
-_PIECE_BYTES = 4 * 1024**2  # fetched from a URL at once: a request takes milliseconds, whatever its size
 
 
 @dataclass(frozen=True, slots=True)

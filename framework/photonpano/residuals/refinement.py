@@ -36,6 +36,8 @@ _STANDS_OUT = 30.0
 _BOUND_SPANS, _NEAR_SPANS = 3, 1.0
 
 _DARK = -0.5  # spans that are darker than predicted by half of the light or more show too little to be measured
+# A motion is worse if the scatter of the shifts grows by this factor, or the reduced chi-square of the photons by this much.
+_WORSE_RATIO, _WORSE_MISFIT = 1.05, 0.01
 
 
 def residual_ratio(residuals: Residuals) -> float:
@@ -124,10 +126,6 @@ def _series(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     with np.errstate(divide="ignore"):
         variances = to_px**2 / information + SYSTEMATIC_PX**2
     return found.steps * to_px, variances
-
-
-# A motion is worse if the scatter of the shifts grows by this factor, or the reduced chi-square of the photons by this much.
-_WORSE_RATIO, _WORSE_MISFIT = 1.05, 0.01
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,9 @@ SHORTEST = {"binary": 4, "intensity": 1}  # frames of the shortest span: sums of
 PEAK_PX = 1.5  # standard deviation of the peak of the phase correlation, in binned pixels
 
 Spectrum = NDArray[np.complexfloating]
+_MIN_SUMS = 6  # of a track
+DARK = 0.2  # sums, and frames, with less than this share of the usual light show nothing
+_BLOCK = 32  # sums that are tracked in one task
 
 
 def span_image(source: Source, span: FrameSpan) -> FluxImage:
@@ -79,11 +82,6 @@ def following(moving: FluxImage, fixed: FluxImage, noise: float) -> Follows:
 @cache
 def _window(shape: tuple[int, ...]) -> NDArray[np.float32]:
     return hann_window(shape)
-
-
-_MIN_SUMS = 6  # of a track
-DARK = 0.2  # sums, and frames, with less than this share of the usual light show nothing
-_BLOCK = 32  # sums that are tracked in one task
 
 
 @dataclass(frozen=True, slots=True, eq=False)
