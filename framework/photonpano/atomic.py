@@ -40,17 +40,8 @@ def atomic_path(final: Path, *, flushed: bool = True) -> Iterator[Path]:
     """Lend a temporary path beside `final`, which becomes `final` when the block ends well.
 
     When the block raises, Ctrl-C included, the temporary file is removed, and an older `final` stays as it was. The temporary
-    name keeps the suffix of `final`, by which writers of images and archives choose their format.
-
-    Args:
-        final: the path of the whole file.
-        flushed: whether to wait until it is on the disk. A file that is not may be damaged after a power failure.
-
-    Example:
-        ```python
-        with atomic_path(folder / "trajectory.npz") as temporary:
-            np.savez(temporary, homographies=homographies)
-        ```
+    name keeps the suffix of `final`, by which writers of images and archives choose their format. A file that is not `flushed`
+    to the disk may be damaged after a power failure.
 
     Raises:
         OutputError: the file cannot be written. Every `OSError` of the block counts as one of writing.
@@ -67,13 +58,12 @@ def part_path(final: Path) -> Path:
 
 @contextmanager
 def resumable_path(final: Path) -> Iterator[Path]:
-    """Lend the `part_path` of `final`, which becomes `final` when the block ends well.
+    """Lend the `part_path` of `final`, which becomes `final` when the block ends well; it may exist already.
 
-    When the block raises, Ctrl-C included, the file stays, to be continued by a later call. So it may exist already.
+    When the block raises, Ctrl-C included, the file stays, to be continued by a later call.
 
     Raises:
-        OutputError: the file cannot be written, or another process writes it. Every `OSError` of the block counts as one of
-            writing.
+        OutputError: as `atomic_path`; or another process writes the file.
     """
     part = part_path(final)
     with _becoming(final):
@@ -197,11 +187,7 @@ def _rename(temporary: Path, final: Path, *, flushed: bool = True) -> None:
 
 
 def require_space(final: Path, n_bytes: int) -> None:
-    """Refuse to begin a file that does not fit on its disk.
-
-    Raises:
-        OutputError: fewer than `n_bytes` are free.
-    """
+    """Raise an `OutputError` for a file of `n_bytes` that does not fit on its disk."""
     free = shutil.disk_usage(final.parent).free
     if n_bytes > free:
         raise OutputError(

@@ -22,11 +22,9 @@ class Progress(Protocol):
 
     def stage(self, title: str, total: int, unit: str) -> AbstractContextManager[Callable[[int], None]]:
         """Enter a stage of `total` units, such as "level 2: locate" of 81 exposures; call the value with units done."""
-        ...
 
     def note(self, message: str) -> None:
         """Show one line, such as the result of a level or a warning."""
-        ...
 
 
 class Quiet:
@@ -53,15 +51,12 @@ class Log(Protocol):
     @property
     def found(self) -> Sequence[Any]:
         """The results that were kept before; the first that is added is the next one."""
-        ...
 
     def add(self, result: Any) -> None:
         """Keep the next result."""
-        ...
 
     def finish(self) -> None:
         """Mark the step as finished: there are no more results."""
-        ...
 
 
 class Checkpoints(Protocol):
@@ -74,15 +69,12 @@ class Checkpoints(Protocol):
 
     def once(self, step: str, compute: Callable[[], ResultT], *given: Any) -> ResultT:
         """Return the result of a step: the one that was kept, or else the one that `compute` returns, which is kept."""
-        ...
 
     def log(self, step: str, *given: Any) -> Log:
         """Open the results of a step that has many of them."""
-        ...
 
     def within(self, *given: Any) -> Checkpoints:
         """Return checkpoints whose results depend on more."""
-        ...
 
 
 class NoLog:
@@ -118,20 +110,13 @@ class KeepNothing:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """How a computation runs; its result does not depend on it.
+    """How a computation runs; its result does not depend on it."""
 
-    Attributes:
-        threads: how many tasks are under way at once.
-        progress: receives stages and messages.
-        on_level: called with the `LevelResult` of each level of the loop when it is done.
-        checkpoints: keep what is found, for the case of an interruption.
-        executor: works on the tasks.
-    """
-
-    threads: int = 1
+    threads: int = 1  # how many tasks are under way at once
     progress: Progress = field(default_factory=Quiet)
+    # called with the `LevelResult` of each level of the loop when it is done
     on_level: Callable[[Any], object] = lambda _: None
-    checkpoints: Checkpoints = field(default_factory=KeepNothing)
+    checkpoints: Checkpoints = field(default_factory=KeepNothing)  # keep what is found, for the case of an interruption
     executor: Executor = field(default_factory=LocalExecutor)
 
     def in_order(self, work: Callable[[ItemT], ResultT], items: Iterable[ItemT]) -> Iterator[ResultT]:

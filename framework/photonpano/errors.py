@@ -52,29 +52,19 @@ class PluginError(PhotonpanoError):
     """A plugin is broken, missing a library, in conflict with another, or broke its contract."""
 
 
-_LONGEST = 200
-"""Characters of a path in a spec, or of an override, that a message shows."""
+_LONGEST = 200  # characters of a path in a spec, or of an override, that a message shows
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong with a spec.
+    """One thing that is wrong with a spec."""
 
-    Attributes:
-        where: path inside the spec, such as `locate.with.ratio`; empty for the file as a whole.
-        message: what was expected and what was given.
-        file: the spec file, None for a spec that was built in Python.
-        line: line in the file, from 1; None if unknown.
-        column: column in the line, from 1; None if unknown.
-        override: what has put the value there from outside of the file, such as `locate.with.ratio=0.7`.
-    """
-
-    where: str
-    message: str
-    file: Path | None = None
-    line: int | None = None
-    column: int | None = None
-    override: str | None = None
+    where: str  # path inside the spec, such as `locate.with.ratio`; empty for the file as a whole
+    message: str  # what was expected and what was given
+    file: Path | None = None  # the spec file, None for a spec that was built in Python
+    line: int | None = None  # line in the file, from 1; None if unknown
+    column: int | None = None  # column in the line, from 1; None if unknown
+    override: str | None = None  # what has put the value there from outside of the file, such as `locate.with.ratio=0.7`
 
     def __str__(self) -> str:
         position = [str(part) for part in (self.file, self.line, self.column) if part is not None]

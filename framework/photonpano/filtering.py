@@ -58,7 +58,7 @@ def exceeding_noise(steps: FloatArray, variances: FloatArray) -> Filtered:
     floor = np.tile(expected[:, None], windows.shape[1])
     floor[:, :slow_bins] += (slow_px * taper.sum()) ** 2
     excess = np.abs(windows) ** 2 / np.maximum(floor, 1e-30)
-    mean = _mean_of_neighbours(excess)
+    mean = sliding_window_view(np.pad(excess, 1, mode="edge"), (3, 3)).mean(axis=(2, 3))
     gain = np.where(mean > SIGNIFICANT, 1 - 1 / np.maximum(mean, 1), 0)
     restored = np.fft.irfft(windows * gain, size) * taper
     # Each frequency between the first and the last counts twice, for its negative.
@@ -71,8 +71,3 @@ def exceeding_noise(steps: FloatArray, variances: FloatArray) -> Filtered:
         spread[place] += let_through[window] * taper**2
     inner = slice(half, half + len(steps))
     return Filtered(signal[inner], np.sqrt(spread[inner]))
-
-
-def _mean_of_neighbours(image: FloatArray) -> FloatArray:
-    """Return the mean of 3 x 3 values; the border is repeated."""
-    return np.asarray(sliding_window_view(np.pad(image, 1, mode="edge"), (3, 3)).mean(axis=(2, 3)))

@@ -57,12 +57,7 @@ def remove_leftovers(directory: Path) -> None:
 
 
 def others_in(directory: Path, own: Iterable[str]) -> list[Path]:
-    """Return what lies in a folder beside some files.
-
-    Args:
-        directory: the folder.
-        own: the paths of the files in it. A folder that holds none of them is returned whole.
-    """
+    """Return what lies in a folder beside its own files, given as paths in it; a folder without any of these is one entry."""
     own = set(own)
     holders = {str(parent) for name in own for parent in PurePosixPath(name).parents}
     found, folders = [], [directory]
@@ -110,11 +105,7 @@ def replace_folder(staging: Path, directory: Path, replaced: Iterable[str]) -> N
 
 
 def finish_replacement(directory: Path) -> None:
-    """Put files in place that are complete, if there are any.
-
-    Raises:
-        OSError: a file cannot be renamed; the next call goes on.
-    """
+    """Put files in place that are complete, if there are any; after an `OSError`, the next call goes on."""
     pending = directory / PENDING
     if pending.is_symlink() or not pending.is_dir():
         return

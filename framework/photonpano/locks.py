@@ -31,11 +31,9 @@ class Holder(TypedDict):
 
 @contextmanager
 def locked(path: Path, what: str) -> Iterator[None]:
-    """Hold a lock during the block. The lock of a dead process is taken over.
+    """Hold the lock file of `what`, such as `the run folder runs/scan`, during the block, and remove it afterwards.
 
-    Args:
-        path: the lock file; it is made, and removed at the end of the block.
-        what: what is locked, for the message, such as `the run folder runs/scan`.
+    The lock of a dead process is taken over.
 
     Raises:
         OutputError: another process holds it.

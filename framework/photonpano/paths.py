@@ -93,11 +93,7 @@ def as_written(place: Location) -> str:
 
 
 def given_path(path: Path) -> Path:
-    """Return a path that a user has written, with its home folder filled in.
-
-    Raises:
-        ValueError: it begins with the home folder of nobody.
-    """
+    """Return a path that a user has written, with its home folder filled in; a `ValueError` if that is of nobody."""
     try:
         return path.expanduser()
     except RuntimeError as error:

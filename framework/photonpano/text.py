@@ -98,13 +98,10 @@ def span(start: int, stop: int) -> str:
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return the nearest of the known names, else all of them, to complete the message for an unknown name.
+    """Return `did you mean 'x'?` or `known: x, y and z`, to complete the message for an unknown name; empty if none is known.
 
     Case, and the choice between hyphen and underscore, do not count as differences. A name is near if one of its words is:
     `opencv-orb` to `orb`.
-
-    Returns:
-        `did you mean 'x'?` or `known: x, y and z`; empty if nothing is known.
     """
     by_shape = {_shape(each): each for each in sorted(known)}
     near = difflib.get_close_matches(_shape(name), by_shape, _MOST) or _with_word(_shape(name), by_shape)

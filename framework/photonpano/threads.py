@@ -40,15 +40,10 @@ def thread_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
 def in_order(
     work: Callable[[ItemT], ResultT], items: Iterable[ItemT], threads: int, pool: ThreadPoolExecutor | None = None
 ) -> Iterator[ResultT]:
-    """Yield the results of `work` in the order of the items.
+    """Yield the results of `work` in the order of the items; `threads` items are worked on ahead, in a pool.
 
-    Unlike `Executor.map`, it holds at most one result for each thread beside the one that it yields.
-
-    Args:
-        work: called with each item, in the pool.
-        items: drawn in the thread of the caller.
-        threads: how many items are worked on ahead.
-        pool: the threads; by default, a pool of its own.
+    Unlike `Executor.map`, it holds at most one result for each thread beside the one that it yields. Items are drawn in the
+    thread of the caller.
     """
     with nullcontext(pool) if pool else thread_pool(threads) as executor:
         submitted = (executor.submit(work, item) for item in items)

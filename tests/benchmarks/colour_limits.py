@@ -26,7 +26,7 @@ from colour import Camera, demosaicked
 
 from photonpano import FrameSpan, StreamInfo, open_source, parse_spec
 from photonpano.context import Context
-from photonpano.corrections.colours import with_colours
+from photonpano.corrections.colour_filter import with_colours
 from photonpano.evaluation import covered, image_score, true_panorama, white_flux
 from photonpano.geometry import Canvas, FrameTrajectory, canvas_of, inverse, normalised
 from photonpano.merging.colour import composed, filled, with_shared_detail

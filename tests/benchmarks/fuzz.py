@@ -37,7 +37,7 @@ MEMORY_BYTES = 8 * 1024**3
 LOOKED_AT = {"mask-png", "mat73", "ubicept", "tiff-folder", "tiff", "tiff-zlib", "avi", "mkv", "mp4"}
 """Kinds that a process of its own looks at first."""
 LOOKING = (
-    "photonpano.corrections.masks",
+    "photonpano.corrections.hot_pixels",
     *(f"photonpano_sensors.{module}" for module in ("mat_parts", "ubicept", "intensity.pictures", "intensity.video_index")),
 )
 """Modules that have it look."""

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from photonpano import LocationError, evaluate, parse_spec, run, simulate
-from photonpano.captures.repeats import timeline_of
+from photonpano.captures.obstacles import timeline_of
 from photonpano.context import Context
 from photonpano.corrections import divided_by
 from photonpano.evaluation.images import covered, image_score, true_panorama, white_flux

@@ -36,7 +36,7 @@ import photonpano.pipeline.run as run_module
 from photonpano import ExecutorContext, FrameSpan, Source, discover, parse_spec, run
 from photonpano.context import Quiet
 from photonpano.execution import CaptureElsewhere, LocalExecutor
-from photonpano.execution.packing import packed
+from photonpano.execution.remote import packed
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging import chunks_of
 from photonpano.pipeline.executors import as_read

@@ -1,7 +1,6 @@
 """One record of a capture as a run sees it: what its source gives, and what was found about it."""
 
-from photonpano.capture.capture import Capture, Colours
-from photonpano.capture.door import capture_of, in_light, part_of, seen_through
+from photonpano.capture.capture import Capture, Colours, capture_of, in_light, part_of, seen_through
 from photonpano.capture.pixels import MISSING, Gather, Index, LinearCorrection, numbered
 from photonpano.capture.plugin_source import PluginSource
 

@@ -10,32 +10,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture.pixels import Gather
+from photonpano.capture.plugin_source import PluginSource
+from photonpano.protocols import Closing
 from photonpano.values import BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, StreamInfo
 
 if TYPE_CHECKING:
     from photonpano.capture.plugin_source import PluginSource
     from photonpano.geometry import Camera
-    from photonpano.values import FloatArray, Response
+    from photonpano.protocols import Source
+    from photonpano.values import FloatArray, FrameSpan, Light, Response
 
 _PER_FRAME = ("homographies", "rotations", "camera_from_world", "light", "taken")  # arrays of a truth, one entry a frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Colours:
-    """The colours of a capture behind a filter array.
+    """The colours of a capture behind a filter array."""
 
-    Attributes:
-        parts: a capture for each of "red", "green", "blue" and, if there are pixels without filter, "clear", in this order:
-            the same frames, in which only the pixels behind filters of this colour are valid.
-        clear_mix: (3,) the flux of a clear pixel is the sum of these factors times the flux of red, green and blue ones.
-    """
-
+    # a capture for each of "red", "green", "blue" and, if there are pixels without filter, "clear", in this order: the same
+    # frames, in which only the pixels behind filters of this colour are valid
     parts: Mapping[str, Capture]
+    # (3,) the flux of a clear pixel is the sum of these factors times the flux of red, green and blue ones
     clear_mix: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Capture:
+class Capture(Closing):
     """A capture as components see it. It is a `photonpano.Source`; methods may be called from several threads at once.
 
     A correction, a light, a camera or a part makes another record, with `dataclasses.replace`. A capture in colour is grey by
@@ -50,8 +50,8 @@ class Capture:
         first: the frame of the source that is frame 0 here.
         gather: rearranges the pixels of frames; None for frames as they are read.
         steps: take everything but the flux out of sums of frames, one after the other.
-        weight: (H, W) float32, not negative: how many frames of an ordinary pixel a frame of each pixel is worth; None for 1.
-            Ordinary is the best pixel behind a filter, and a pixel of gain 1 of a sensor whose pixels differ in gain.
+        weight: (H, W) float32, not negative: statistical weight of a frame of each pixel; None for 1. That of the best pixel
+            behind a filter is 1, and that of a pixel of gain 1 of a sensor whose pixels differ in gain.
         light: the gain of each frame; None for steady light. Frames are weighted by it, and predicted flux is multiplied by it.
         camera: frames are warped through its lens, and homographies map ideal pixels; None if it is not known.
         colour: what the filters of a filter array show; None for a grey capture.
@@ -128,7 +128,7 @@ class Capture:
         return self.corrected(self.counts(span), len(span))
 
     def weights(self) -> FluxImage:
-        """Return how many frames of an ordinary pixel a frame of each pixel is worth: (H, W) float32."""
+        """Return the statistical weight of a frame of each pixel: (H, W) float32, 1 for an ordinary pixel."""
         return np.ones(self.info.frame_shape, np.float32) if self.weight is None else self.weight
 
     def colours(self) -> Mapping[str, Capture]:
@@ -166,12 +166,6 @@ class Capture:
         """Close the source; it is not used afterwards."""
         self.source.close()
 
-    def __enter__(self) -> Capture:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     @property
     def _is_part(self) -> bool:
         return self.info.n_frames != self.source.info.n_frames
@@ -200,3 +194,51 @@ class Capture:
             "sharp_view": self.gather is None and self.colour is None and self.source.offers("sharp_view"),
         }
         return offered[member]
+
+
+def capture_of(source: Source, origin: str | None = None) -> Capture:
+    """Return the capture that a source gives; a capture as it is.
+
+    Args:
+        source: the source, with any of the optional methods.
+        origin: who provides it, such as "source 'packed-npy' of photonpano 0.1.0": properties and arrays are checked, and
+            errors name the plugin, whoever reads. None for a source that is neither checked nor named.
+
+    Raises:
+        PluginError: a property of the source is not what it should be.
+    """
+    return source if isinstance(source, Capture) else _capture_of(PluginSource(source, origin))
+
+
+def in_light(source: Source, light: Light) -> Capture:
+    """Return a capture with the gain of each of its frames. Counts stay as they are; what sums them divides by the gains."""
+    return replace(capture_of(source), light=light)
+
+
+def seen_through(source: Source, camera: Camera) -> Capture:
+    """Return a capture with its camera. Counts stay as they are; what warps frames uses the lens."""
+    return replace(capture_of(source), camera=camera)
+
+
+def part_of(source: Source, span: FrameSpan) -> Capture:
+    """Return the frames of a span as a capture of its own, whose first frame has the index 0."""
+    whole = capture_of(source)
+    light = None if whole.light is None else whole.light.part(span)
+    return replace(whole, info=replace(whole.info, n_frames=len(span)), first=whole.first + span.start, light=light)
+
+
+def _capture_of(source: PluginSource) -> Capture:
+    colour = None
+    if source.offers("colours"):
+        parts = {name: _capture_of(each) for name, each in source.colours().items()}
+        colour = Colours(parts, source.clear_mix())
+    return Capture(
+        source,
+        source.info,
+        source.valid,
+        steps=(source.corrected,) if source.offers("corrected") else (),
+        weight=source.weights() if source.offers("weights") else None,
+        light=source.light if source.offers("light") else None,
+        camera=source.camera if source.offers("camera") else None,
+        colour=colour,
+    )

@@ -43,17 +43,12 @@ class Gather:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearCorrection:
-    """Corrects sums of frames, `slope * counts + n * offset` for n frames, and fills pixels from their neighbours.
+    """Corrects sums of frames, `slope * counts + n * offset` for n frames, and fills pixels from their neighbours."""
 
-    Attributes:
-        slope: (H, W) float32.
-        offset: (H, W) float32, added for each frame.
-        filling: (P,) numbers of the pixels that are replaced, (P, N) those of the neighbours of each, and (P, N) float32, the
-            weights of these, which sum to 1; None if no pixel is replaced.
-    """
-
-    slope: FluxImage
-    offset: FluxImage
+    slope: FluxImage  # (H, W) float32
+    offset: FluxImage  # (H, W) float32, added for each frame
+    # (P,) numbers of the pixels that are replaced, (P, N) those of the neighbours of each, and (P, N) float32, the weights of
+    # these, which sum to 1; None if no pixel is replaced
     filling: tuple[Index, Index, FluxImage] | None = None
 
     def __call__(self, counts: Counts | FluxImage, n_frames: int) -> FluxImage:

@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from itertools import count
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.contracts.attribution import attributing
-from photonpano.contracts.rules import BrokenContract, shown
+from photonpano.contracts.rules import BrokenContract, attributing
+from photonpano.contracts.sources import IMAGE, INFO, RANGE, READ, RESPONSE, TRUTH, VALID, Asked
 from photonpano.errors import PluginError
 from photonpano.protocols import (
     ColouredSource,
@@ -26,7 +26,7 @@ from photonpano.protocols import (
     Source,
     WeightedSource,
 )
-from photonpano.values import Bayer, BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Light, Response, StreamInfo
+from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Light, Response, StreamInfo
 
 if TYPE_CHECKING:
     from photonpano.geometry import Camera
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _ALWAYS, _EVERY = 16, 32  # values are checked in the first 16 reads, then in every 32nd: all would double reading time
-_FLUX = np.array([[0.0, 0.01, 0.3], [0.3, 0.01, np.nan]], np.float32)  # with which a response is tried
 _OPTIONAL: dict[str, Any] = {
     "packed": PackedSource,
     "corrected": LinearlyCorrectedSource,
@@ -74,9 +73,9 @@ class PluginSource:
         with self._attributing("opening"):
             self._offered = [name for name, protocol in _OPTIONAL.items() if isinstance(source, protocol)]
             checked = origin is not None
-            self.info: StreamInfo = _checked_info(source.info) if checked else source.info
-            self.valid: BoolArray = _checked_mask(source.valid, self.info.frame_shape) if checked else source.valid
-            self.response: Response = _checked_response(source.response) if checked else source.response
+            self.info: StreamInfo = INFO.require(source.info) if checked else source.info
+            self.valid: BoolArray = VALID.require(source.valid, self.info.frame_shape) if checked else source.valid
+            self.response: Response = RESPONSE.require(source.response) if checked else source.response
 
     def __reduce__(self) -> Any:
         """Travel as what was given; the source of a colour as a colour of the capture, which is opened in each process."""
@@ -108,7 +107,7 @@ class PluginSource:
             return self._image("corrected", self.given.corrected(counts, n_frames), counts.shape)
 
     def weights(self) -> FluxImage:
-        """Return what a frame of each pixel is worth: see `photonpano.WeightedSource`."""
+        """Return the statistical weight of a frame of each pixel: see `photonpano.WeightedSource`."""
         with self._attributing("weights()"):
             return self._image("weights", self.given.weights(), self.info.frame_shape)
 
@@ -146,11 +145,7 @@ class PluginSource:
     def truth(self) -> Mapping[str, NDArray[np.generic]]:
         """Return the ground truth: see `photonpano.KnowsTruth`."""
         with self._attributing("truth()"):
-            found: Any = self.given.truth()
-            if not isinstance(found, Mapping):
-                raise BrokenContract(f"truth() returns a mapping of arrays by name, got {shown(found)}")
-            truth: Mapping[str, NDArray[np.generic]] = found
-            return truth
+            return TRUTH.require(self.given.truth())
 
     def sharp_view(self, frame: int) -> FluxImage:
         """Return the flux of a frame without noise: see `photonpano.KnowsSharpViews`."""
@@ -175,11 +170,7 @@ class PluginSource:
 
     def _image(self, what: str, found: Any, shape: tuple[int, ...]) -> FluxImage:
         """Check an image of numbers; `what` is the name of the method that returned it."""
-        if self._origin is not None and not (
-            isinstance(found, np.ndarray) and found.dtype.kind == "f" and found.shape == shape
-        ):
-            raise BrokenContract(f"{what}() returns {shape} of float32, got {shown(found)}")
-        image: FluxImage = found
+        image: FluxImage = found if self._origin is None else IMAGE.require(found, Asked(what, shape))
         return image
 
     def _read(self, what: str, span: FrameSpan, shape: tuple[int, ...], highest: int) -> Any:
@@ -188,15 +179,11 @@ class PluginSource:
         if self._origin is None:
             return method(span)
         with self._attributing(str(span)):
-            found = method(span)
-            if np.shape(found) != shape:
-                raise BrokenContract(f"expected the shape {shape}, got {np.shape(found)}")
-            if not isinstance(found, np.ndarray) or found.dtype.kind not in "uib":
-                kind = f"an array of {found.dtype}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
-                raise BrokenContract(f"{what}() returns an array of whole numbers, got {kind}")
+            asked = Asked(what, shape, highest)
+            found = READ.require(method(span), asked)
             read = next(self._reads)
             if read < _ALWAYS or read % _EVERY == 0:
-                _require_range(what, found, highest)
+                RANGE.require(found, asked)
             if what not in self._own:
                 self._own.add(what)
                 self._require_kept(what, method, span, found)
@@ -217,55 +204,3 @@ class PluginSource:
 
 def _colour_of(capture: PluginSource, name: str) -> PluginSource:
     return capture.colours()[name]
-
-
-def _checked_info(info: Any) -> StreamInfo:
-    if not isinstance(info, StreamInfo):
-        raise BrokenContract(f"info is a StreamInfo, got {shown(info)}")
-    for name in ("n_frames", "height", "width", "bit_depth"):
-        size = getattr(info, name)
-        if not isinstance(size, int | np.integer) or size < 1:
-            raise BrokenContract(f"info.{name} is a whole number of at least 1, got {size!r:.60}")
-    if info.kind not in ("binary", "intensity"):
-        raise BrokenContract(f"info.kind is binary or intensity, got {info.kind!r:.60}")
-    if info.bayer not in (None, *get_args(Bayer)):
-        raise BrokenContract(f"info.bayer is {', '.join(get_args(Bayer))} or None, got {info.bayer!r:.60}")
-    rate: Any = info.frame_rate_hz
-    if rate is not None and not (isinstance(rate, int | float | np.number) and 0 < rate < np.inf):
-        raise BrokenContract(f"info.frame_rate_hz is a finite number above 0, or None if it is not known; got {rate!r:.60}")
-    return info
-
-
-def _checked_mask(valid: Any, frame_shape: tuple[int, int]) -> BoolArray:
-    if not isinstance(valid, np.ndarray) or valid.dtype != np.bool_ or valid.shape != frame_shape:
-        raise BrokenContract(f"valid is {frame_shape} of bool, got {shown(valid)}")
-    mask: BoolArray = valid
-    return mask
-
-
-def _checked_response(response: Any) -> Response:
-    """Try a response with a few values, NaN among them."""
-    with np.errstate(all="ignore"):
-        counts = response.mean_count(_FLUX)
-        tried = {
-            "mean_count": counts,
-            "flux": response.flux(counts, 10_000.0),
-            "stabilised": response.stabilised(_FLUX, np.full(_FLUX.shape, 100, np.float32)),
-        }
-    for name, found in tried.items():
-        if not isinstance(found, np.ndarray) or found.dtype.kind != "f" or found.shape != _FLUX.shape:
-            raise BrokenContract(f"response.{name}() of {_FLUX.shape} returns {_FLUX.shape} of float32, got {shown(found)}")
-        if (np.isnan(found) != np.isnan(_FLUX)).any():
-            raise BrokenContract(f"response.{name}() keeps NaN, and gives no other; {_FLUX.tolist()} became {found.tolist()}")
-    if not np.allclose(tried["flux"], _FLUX, rtol=0.1, atol=0.01, equal_nan=True):
-        raise BrokenContract(f"response.flux() inverts response.mean_count(); {_FLUX.tolist()} became {tried['flux'].tolist()}")
-    response.stabilised_std(100.0)
-    checked: Response = response
-    return checked
-
-
-def _require_range(what: str, found: NDArray[Any], highest: int) -> None:
-    lowest = int(found.min()) if found.dtype.kind == "i" else 0
-    if lowest < 0 or found.max() > highest:
-        worst = lowest if lowest < 0 else int(found.max())
-        raise BrokenContract(f"{what}() returns numbers from 0 to {highest} for these frames, got {worst}")

@@ -23,7 +23,7 @@ _PLACES, _FRAMES = 16, 4  # 4 frames at each of 16 places are hashed: at the mos
 
 
 class FileRecord(TypedDict):
-    """A file that the source or a correction reads, or a folder of them.
+    """A file, or a folder of files, that the source or a correction reads.
 
     `bytes` is the size of all its files, `modified` the latest of their times, ISO 8601 in UTC; None where there is none.
     `etag` is the mark that a server gives the content of a URL; None for other files.
@@ -48,12 +48,7 @@ class CaptureRecord(TypedDict):
 
 
 def fingerprint(plan: Plan, source: Source) -> CaptureRecord:
-    """Return the fingerprint of the capture of a plan.
-
-    Args:
-        plan: names the files.
-        source: the open capture, from `open_source`.
-    """
+    """Return the fingerprint of the open capture of a plan, which names its files."""
     suffixes = tuple(plan.source.contribution.suffixes)  # type: ignore[attr-defined]  # those of a source
     return {
         "files": [_remote(path) if isinstance(path, Url) else _file(path, suffixes) for path in _locations(plan)],

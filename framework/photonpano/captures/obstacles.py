@@ -1,22 +1,25 @@
-"""Find what makes a capture hard to locate: pixels in a wrong order, parts that stand still, a scene that repeats."""
+"""Find what makes a capture hard to locate: another order of pixels, repeated frames, parts that stand still, repetitions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from photonpano.capture import capture_of
-from photonpano.errors import LocationError
+from photonpano.capture import Capture, capture_of
+from photonpano.context import Context
+from photonpano.errors import InputError, LocationError
 from photonpano.locating.phase import correlation_peaks
 from photonpano.merging.accumulate import weights_of
+from photonpano.motion.timeline import Timeline
 from photonpano.protocols import Source
 from photonpano.reading import other_order, sampled_spans
-from photonpano.values import Decision, FrameSpan
+from photonpano.values import BoolArray, Decision, FrameSpan, true_spans
 
 _PLACES, _FRAMES = 5, 256  # spans all over the capture, and most frames of each
 _ALIKE = 0.7  # an image repeats if another shift fits at least this well, as a share of the best one
@@ -27,6 +30,11 @@ _MOST_PEAKS = 200  # most peaks that are compared
 _REACH = 1 / 3  # largest shift that is looked at, as a share of the frame
 _FILTER_BLUR_PX = 1.0  # standard deviation of the Gaussian that blurs a colour filter array
 _STANDING = 0.3  # share of the frame from which what stands still is named
+_BLOCK_FRAMES = 256  # frames that are compared at a time
+_ROW_STRIDE = 16  # frames are compared on every 16th row first
+# Frames that are repeated differ from the frame before by this many newly lit pixels, and as many that went dark: dark frames
+# are alike by chance, and so are saturated ones.
+_FEWEST_NEW = 20
 
 
 def order_warning(source: Source) -> str | None:
@@ -46,11 +54,7 @@ def order_warning(source: Source) -> str | None:
 
 @contextmanager
 def naming_obstacles(source: Source, decisions: Sequence[Decision]) -> Iterator[None]:
-    """Add the obstacles of a capture to the error of a block that could not locate its exposures.
-
-    Raises:
-        LocationError: with the sentences of `obstacles` at its end.
-    """
+    """Append the sentences of `obstacles` to the `LocationError` of a block."""
     try:
         yield
     except LocationError as error:
@@ -60,12 +64,7 @@ def naming_obstacles(source: Source, decisions: Sequence[Decision]) -> Iterator[
 
 
 def obstacles(source: Source, decisions: Sequence[Decision]) -> list[str]:
-    """Return sentences about what makes a capture hard to locate; empty if nothing is found.
-
-    Args:
-        source: the capture.
-        decisions: what was chosen from the capture; of them, the share of the frame that stands still is used.
-    """
+    """Return sentences about what makes a capture hard to locate; `decisions` hold the share of the frame that stands still."""
     return [*_standing(decisions), *_repeating(source)]
 
 
@@ -109,13 +108,9 @@ def _sum(source: Source, span: FrameSpan) -> NDArray[Any]:
 
 
 def repetition_px(first: NDArray[Any], second: NDArray[Any]) -> float | None:
-    """Return the distance after which an image repeats; None if it does not.
+    """Return the distance after which an image repeats, from two sums of frames (H, W); None if it does not.
 
-    Two sums of frames are compared, so that photon noise, which they do not share, plays no part.
-
-    Args:
-        first: (H, W) sum of frames.
-        second: (H, W) sum of the frames that follow.
+    Photon noise plays no part, since the two sums do not share it.
     """
     height, width = first.shape
     padded = 2 * height, 2 * width
@@ -134,3 +129,39 @@ def repetition_px(first: NDArray[Any], second: NDArray[Any]) -> float | None:
     along = ndimage.map_coordinates(surface, np.moveaxis(between, -1, 0)[::-1], order=1, mode="grid-wrap")
     apart = np.hypot(*(shifts[1:] - shifts[0]).T)[along.min(axis=0, initial=np.inf) < _DIP * surface.max()]
     return float(apart.min()) if apart.size else None
+
+
+def timeline_of(source: Source, context: Context) -> Timeline:
+    """Return the timeline of a capture, in which repeated frames take no time; raise an `InputError` if all are copies.
+
+    Only packed frames are compared: others would have to be read twice.
+    """
+    capture, n_frames = capture_of(source), source.info.n_frames
+    if not capture.is_packed:
+        return Timeline.regular(n_frames)
+    spans = [FrameSpan(max(0, span.start - 1), span.stop) for span in source.info.span.blocks(_BLOCK_FRAMES)]
+    same = np.zeros(n_frames, dtype=bool)
+    for span, found in zip(spans, context.in_order(partial(_same_as_before, capture), spans), strict=True):
+        same[span.start + 1 : span.stop] = found
+    if n_frames > 1 and same[1:].all():
+        raise InputError(f"all {n_frames} frames are copies of the first one; check that the camera went on recording")
+    for run in true_spans(same):
+        original = run.start - 1
+        if original and not _differ(*capture.packed(FrameSpan(original - 1, original + 1))):
+            same[run.start : run.stop] = False
+    return Timeline.with_repeats(same)
+
+
+def _same_as_before(capture: Capture, span: FrameSpan) -> BoolArray:
+    """Return whether each frame of a span but the first equals the one before it."""
+    packed = capture.packed(span)
+    some = packed[:, ::_ROW_STRIDE]
+    same = (some[1:] == some[:-1]).all(axis=(1, 2))
+    for index in np.flatnonzero(same):
+        same[index] = np.array_equal(packed[index], packed[index + 1])
+    return np.asarray(same)
+
+
+def _differ(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> bool:
+    """Return whether photons make two packed frames differ, so that others that are equal are copies."""
+    return all(int(np.unpackbits(new).sum()) >= _FEWEST_NEW for new in (first & ~second, second & ~first))

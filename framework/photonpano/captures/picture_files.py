@@ -24,11 +24,7 @@ _WEBP_QUALITY, _CRF = 90, "18"  # quality of lossy compression, whose errors are
 
 
 def require_writable(path: Path, n_pictures: int) -> None:
-    """Refuse a name that `write_pictures` cannot write, before the pictures are made.
-
-    Raises:
-        OutputError: no format has this suffix, the format holds fewer pictures, or its library is not installed.
-    """
+    """Raise an `OutputError` if `write_pictures` cannot write a name: its suffix, too many pictures, or a missing library."""
     if path.suffix not in ("", ".mp4", *_ANIMATED):
         raise OutputError(
             f"cannot write {path}: pictures go to a folder, as PNGs, or to a file that ends in .mp4, .webp or .gif"
@@ -44,13 +40,10 @@ def require_writable(path: Path, n_pictures: int) -> None:
 
 
 def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str], fps: float) -> None:
-    """Write pictures of one size.
+    """Write pictures of one size, (H, W) or (H, W, 3) with red first; uint8, or uint16 into a folder.
 
-    Args:
-        path: a new or empty folder for PNGs; a file that ends in .mp4, .webp or .gif for a film.
-        pictures: (H, W) uint8 each, or (H, W, 3), red first; uint16 for a folder only.
-        names: of the PNGs, without suffix, as many as there are pictures.
-        fps: pictures per second of a film; a GIF counts in 1/100 s.
+    The path is a new or empty folder for PNGs, or a film that ends in .mp4, .webp or .gif. `names` are those of the PNGs,
+    without suffix, as many as there are pictures; a GIF counts the time of a picture in 1/100 s.
 
     Raises:
         OutputError: see `require_writable`; or the files cannot be written. Nothing is left then.

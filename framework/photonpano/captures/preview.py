@@ -25,17 +25,11 @@ _FONT, _FONT_SCALE, _LINE_PX, _MARGIN_PX = cv2.FONT_HERSHEY_PLAIN, 0.8, 14, 3
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """The rendering style of pictures.
+    """The rendering style of pictures."""
 
-    Attributes:
-        white_flux: the flux that is white, the same in all pictures.
-        srgb: whether levels follow the sRGB curve; otherwise they are proportional to the flux.
-        label: whether frames and time are written below each picture.
-    """
-
-    white_flux: float
-    srgb: bool = True
-    label: bool = True
+    white_flux: float  # the flux that is white, the same in all pictures
+    srgb: bool = True  # whether levels follow the sRGB curve; otherwise they are proportional to the flux
+    label: bool = True  # whether frames and time are written below each picture
 
 
 def preview_spans(info: StreamInfo, group_size: int, step: int) -> list[FrameSpan]:
@@ -66,10 +60,7 @@ def pictures(source: Source, spans: Sequence[FrameSpan], style: Style, threads: 
 
 
 def still_exposure(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the flux of the sum of some frames, without any motion: (H, W), or (H, W, 3) behind a filter array.
-
-    Pixels that are masked are NaN.
-    """
+    """Return the flux of the sum of some frames, without motion: (H, W), or (H, W, 3) in colour; NaN where masked."""
     still = Chunk(span, np.eye(3))
 
     def merged(each: Source) -> Panorama:
@@ -92,11 +83,7 @@ def _label(span: FrameSpan, info: StreamInfo) -> NDArray[np.uint8]:
 
 
 def require_sharp_views(source: Source) -> Capture:
-    """Return a capture that knows what its frames show without noise.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Return a capture that knows its frames without noise, or raise an `InputError`."""
     capture = capture_of(source)
     if capture.has_sharp_views:
         return capture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,8 +34,7 @@ _TOLERANCE_PX = 1.5
 _CHECKED_PLACES, _CHECKED_FRAMES = 16, 16
 
 
-@dataclass(frozen=True, slots=True)
-class _Speed:
+class _Speed(NamedTuple):
     """The speed at one place, in px per frame, and the length of the spans that it was measured with, in frames."""
 
     px: float
@@ -43,15 +42,11 @@ class _Speed:
 
 
 def summarise(source: Source, threads: int = 1) -> CaptureSummary:
-    """Measure flux and speed at 12 places of a capture.
+    """Measure flux and speed at 12 places of a capture, whatever the number of threads.
 
     At each place the frames of three consecutive spans are summed, and phase correlation gives the shifts between the three
     sums. The spans are lengthened until the shifts agree and are large enough to be exact: short spans are too noisy in the
     dark, and long spans blur a fast motion.
-
-    Args:
-        source: the capture.
-        threads: how many places are measured at once; the result does not depend on it.
     """
     n_frames = source.info.n_frames
     lengths = [length for length in _SPANS if SHORTEST[source.info.kind] <= length <= n_frames // _SPANS_IN_CAPTURE]
@@ -92,11 +87,8 @@ def _majority_shift(images: Sequence[FluxImage], noise: float) -> FloatArray | N
     """Return the shift from each of three images to the next that most of the image follows; None if the shifts do not agree.
 
     An object with strong contrast has the highest peak of the correlation even if it is small. So where a part of the image
-    does not follow the shift, that part is correlated by itself, and the larger part decides.
-
-    Args:
-        images: on the scale on which noise is uniform.
-        noise: variance of the difference of two of them.
+    does not follow the shift, that part is correlated by itself, and the larger part decides. `images` have uniform noise,
+    `noise` is the variance of the difference of two of them.
     """
     shift = _common_shift(images)
     if shift is None:
@@ -111,12 +103,7 @@ def _majority_shift(images: Sequence[FluxImage], noise: float) -> FloatArray | N
 
 
 def _common_shift(images: Sequence[FluxImage], weight: FluxImage | None = None) -> FloatArray | None:
-    """Return the shift (x, y) from each of three images to the next, in their pixels; None if the shifts do not agree.
-
-    Args:
-        images: (h, w) each.
-        weight: (h, w) of their pixels, 1 by default.
-    """
+    """Return the shift (x, y) from each of three images to the next, in their pixels; None if the shifts do not agree."""
     if not all(np.ptp(image) for image in images):
         return None
     spectra = spectra_of(images, weight)
@@ -135,11 +122,7 @@ def _mean_flux(source: Source, means: Sequence[FluxImage], n_frames: int) -> flo
 
 
 def require_photons(source: Source) -> None:
-    """Sum 256 frames all over the capture, and refuse a capture that is all dark or all lit.
-
-    Raises:
-        InputError: no pixel, or every pixel, is lit in all of them; of grey levels, all are black, or saturated.
-    """
+    """Raise an `InputError` if 256 frames all over the capture are all dark, or all lit or saturated."""
     valid, spans = source.valid, source.info.spread(_CHECKED_PLACES, _CHECKED_FRAMES)
     n_frames = sum(map(len, spans))
     mean_count = sum(source.counts(span)[valid] for span in spans) / np.float32(n_frames)

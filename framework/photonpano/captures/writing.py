@@ -36,22 +36,10 @@ def write_folder(
     progress: Callable[[int], object] | None = None,
     threads: int = 2,
 ) -> tuple[Path, ...]:
-    """Write a binary source as a folder, whole or not at all, in constant memory; its truth as `write_packed` does.
-
-    Args:
-        source: the capture.
-        path: the folder, which must not be there.
-        write: writes the frames into an empty folder: the `write` of a source, with its last argument.
-        progress: called with the number of frames written since the last call.
-        threads: how many threads read the source.
-
-    Returns:
-        The folder, and the file of the truth if there is one.
+    """Write a binary source as a folder by `write`, whole or not at all, in constant memory; otherwise as `write_packed`.
 
     Raises:
-        InputError: as `write_packed`.
         OutputError: there is something under that name, or the folder cannot be written, or does not fit on the disk.
-        PluginError: as `write_packed`.
     """
     _require_bits(source, path)
     packed, truth = PackedFrames(source), _truth_of(source)
@@ -99,16 +87,11 @@ def write_packed(
 ) -> tuple[Path, ...]:
     """Write a binary source as uint8 (frames, height, ceil(width / 8)), packed along the width, in constant memory.
 
-    Args:
-        source: the capture; if its truth is known, it is written beside it, see `truth_path`. Packed frames are never unpacked.
-        path: the .npy file.
-        progress: called with the number of frames written since the last call.
-        threads: how many threads read the source.
-        resumed: makes the file resumable: after an interruption it stays as `part_path(path)`, and the next call compares its
-            frames with the source and continues it. Then this is called with the number of frames that it holds.
+    Packed frames are never unpacked. The truth of the source, if it is known, is written beside it, see `truth_path`; all
+    paths are returned, the capture first. `progress` is called with numbers of frames, and `threads` threads read the source.
 
-    Returns:
-        The files written, the capture first.
+    With `resumed`, an interrupted file stays as `part_path(path)`, and the next call compares its frames with the source and
+    continues it; then `resumed` is called with the number of frames that it holds.
 
     Raises:
         InputError: the source is not binary, or corrects its sums, which bits cannot hold.
@@ -119,48 +102,31 @@ def write_packed(
     _require_bits(source, path)
     if path.suffix != ".npy":
         raise OutputError(f"cannot write {path}: a packed capture is a .npy file; name it {path.name}.npy")
-    truth = _truth_of(source)
-    truth_bytes = sum(array.nbytes for array in truth.values())
-    with (atomic_path if resumed is None else resumable_path)(path) as temporary:
-        _write_capture(source, path, temporary, truth_bytes, progress, threads, resumed)
-        return (path, *_write_truth(path, truth))
-
-
-def _write_capture(
-    source: Source,
-    final: Path,
-    temporary: Path,
-    truth_bytes: int,
-    progress: Callable[[int], object] | None,
-    threads: int,
-    resumed: Callable[[int], object] | None,
-) -> None:
-    packed = PackedFrames(source)
-    there = temporary.stat().st_size
-    require_space(final, packed.n_bytes + truth_bytes - there)
-    with temporary.open("r+b") as file:
+    packed, truth = PackedFrames(source), _truth_of(source)
+    with (atomic_path if resumed is None else resumable_path)(path) as temporary, temporary.open("r+b") as file:
+        there = temporary.stat().st_size
+        require_space(path, packed.n_bytes + sum(array.nbytes for array in truth.values()) - there)
         done = packed.found_in(file, threads)
         if done is None:
             raise OutputError(
-                f"cannot write {final}: {temporary} is there, and holds something else than the first frames of this capture; "
+                f"cannot write {path}: {temporary} is there, and holds something else than the first frames of this capture; "
                 "remove it, or choose another name"
             )
-        if done and resumed is not None:
-            resumed(done)
-        if done and progress is not None:
-            progress(done)
-        if not done:
+        if done:
+            for notify in (resumed, progress):
+                if notify is not None:
+                    notify(done)
+        else:
             file.seek(0)
             file.write(packed.header)
         file.seek(packed.position(done))
         file.truncate()
-        for frames in in_order(packed.of, packed.blocks(done), threads):
+        for frames in _counted(in_order(packed.of, packed.blocks(done), threads), progress):
             file.write(frames.data)
-            if progress is not None:
-                progress(len(frames))
         # A full disk must be noticed before the truth gets its final name.
         file.flush()
         os.fsync(file.fileno())
+        return (path, *_write_truth(path, truth))
 
 
 class PackedFrames:
@@ -192,11 +158,7 @@ class PackedFrames:
             yield FrameSpan(start, min(start + step, last))
 
     def of(self, span: FrameSpan) -> NDArray[np.uint8]:
-        """Return the frames of a span: (n, H, ceil(W / 8)) uint8, contiguous.
-
-        Raises:
-            PluginError: the source returns an array of another shape or type.
-        """
+        """Return the frames of a span, (n, H, ceil(W / 8)) uint8, contiguous; a `PluginError` if the source returns others."""
         packed = self._capture.packed(span)
         expected = (len(span), *self._frame)
         if packed.shape != expected or packed.dtype != np.uint8:
@@ -209,7 +171,7 @@ class PackedFrames:
     def found_in(self, file: BinaryIO, threads: int) -> int | None:
         """Return how many frames of this source a file begins with; None if it is another file.
 
-        Every frame is compared. The first of them that differs ends what is found: it was damaged, or half written.
+        Every frame is compared. The first that differs, damaged or half written, ends what is found.
         """
         file.seek(0)
         start = file.read(len(self.header))

@@ -10,7 +10,7 @@ from photonpano.contracts.rules import is_real
 from photonpano.geometry import corners, jacobian
 from photonpano.values import FloatArray, Located
 
-UNDETERMINED = 10.0  # a pair whose corners have an expected error of this many sides of a frame ties nothing
+UNDETERMINED = 10.0  # expected corner error of a pair, in sides of a frame, from which on it constrains nothing
 _SAFE = 0.01  # margin of the bound on errors that the smallest pivot gives
 _SMALLEST = 1e-100  # floor on eigenvalues
 _ASYMMETRY = 1e-3  # largest relative asymmetry that counts as rounding
@@ -31,14 +31,9 @@ def is_inverse_covariance(matrix: object) -> bool:
 
 
 def why_undetermined(motion: Located, frame_shape: tuple[int, int]) -> str | None:
-    """Return why the images of a pair do not determine its motion, as those of stripes that move along themselves.
+    """Return why the images of a pair do not determine its motion, in px of a frame; None if they do.
 
-    Args:
-        motion: in px of a frame.
-        frame_shape: (height, width) of a frame.
-
-    Returns:
-        A clause if the expected error of a corner exceeds `UNDETERMINED` times the longer side of a frame.
+    The expected error of a corner exceeds `UNDETERMINED` times the longer side, as of stripes that move along themselves.
     """
     worst_px, limit_px = motion.residual_px or 0.0, UNDETERMINED * max(frame_shape)
     if motion.information is not None:

@@ -9,12 +9,14 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from photonpano.contracts.information import is_inverse_covariance
 from photonpano.contracts.rules import (
     STRICT_IMAGES,
     Contract,
     Rule,
+    attributing,
     has_h33_of_1,
     images,
     instance,
@@ -23,7 +25,7 @@ from photonpano.contracts.rules import (
     shown,
     text,
 )
-from photonpano.geometry import apply, corner_displacements, corners
+from photonpano.geometry import corner_displacements, corners, transform_points
 from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray, Group, Homography, Located, NotLocated, Response, VirtualExposure
 
@@ -80,29 +82,18 @@ GROUPS: Contract[tuple[Group, ...]] = Contract(
 
 
 def require_groups(found: Iterable[Any], n_frames: int) -> tuple[Group, ...]:
-    """Return the groups that a resampler returned for a capture, if they keep the contract.
-
-    Raises:
-        BrokenContract: there is none, or they are not in order, or lie outside the capture.
-    """
+    """Return the groups that a resampler returned for a capture, or raise `BrokenContract`."""
     return GROUPS.require(tuple(islice(found, 2 * n_frames)), n_frames)  # a generator may have no end
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What a merger was asked for.
-
-    Attributes:
-        group: the group.
-        scale: pixels of the exposure per pixel of a frame.
-        frame_shape: (height, width) of a frame.
-        response: that of the source; None where it is not compared.
-    """
+    """What a merger was asked for."""
 
     group: Group
-    scale: float
-    frame_shape: tuple[int, int]
-    response: Response | None = None
+    scale: float  # pixels of the exposure per pixel of a frame
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    response: Response | None = None  # that of the source; None where it is not compared
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -211,11 +202,7 @@ def contract_for(found: object) -> Contract[Any]:
 
 
 def require_valid(found: object) -> Located | NotLocated:
-    """Return what a locator returned for a pair, if it keeps the contract.
-
-    Raises:
-        BrokenContract: it is neither `Located` with finite numbers nor `NotLocated`.
-    """
+    """Return what a locator returned for a pair, or raise `BrokenContract`."""
     motion: Located | NotLocated = contract_for(found).require(found)
     return motion
 
@@ -232,34 +219,16 @@ _MOVING: Contract[float] = Contract(
 
 
 def require_no_standstill(motion: Located, expected: Homography | None, frame_shape: tuple[int, int]) -> None:
-    """Refuse the identity, or nearly the identity, as the motion of a pair if the motion known so far is far from it.
-
-    Args:
-        motion: what a locator returned, in any unit: the identity is the same in all.
-        expected: (3, 3) the motion known so far, in px of a frame; None at the first level.
-        frame_shape: (height, width) of a frame.
-
-    Raises:
-        BrokenContract: the locator returned the identity instead of a failure.
-    """
+    """Raise `BrokenContract` for nearly the identity if the motion known so far, in px of a frame, is far from it."""
     if expected is not None and np.abs(motion.homography - np.eye(3)).max() <= STILL_PX:
         _MOVING.require(float(corner_displacements(expected, np.eye(3), frame_shape).mean()), frame_shape)
 
 
 def why_still(homographies: Sequence[Homography], frame_shape: tuple[int, int], seen_px: Callable[[], float]) -> str | None:
-    """Return why the located pairs of a level cannot all stand still: the locator does not report its failures.
+    """Return why the located pairs of a level cannot all stand still, as a clause; None if they may.
 
     Because of photon noise, a camera that stands still gives nearly the identity, and never exactly. Nearly the identity is
-    refused if short spans of frames show that the image moves.
-
-    Args:
-        homographies: of the pairs that were located.
-        frame_shape: (height, width) of a frame.
-        seen_px: returns by how much the image moves between two exposures, as short spans of frames show it; called only if
-            every pair is nearly the identity.
-
-    Returns:
-        A clause; None if they may be right.
+    refused if `seen_px`, which is called only then, returns that short spans of frames show a motion between exposures.
     """
     if not homographies:
         return None
@@ -304,22 +273,33 @@ HOMOGRAPHIES: Contract[FloatArray] = Contract(
 )
 
 
+class AttributedTrajectory:
+    """A trajectory fitted at a level, whose errors name its interpolator, and whose homographies are checked."""
+
+    def __init__(self, trajectory: Trajectory, origin: str, level: int) -> None:
+        self._trajectory = trajectory
+        self._origin = origin
+        self._level = level
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the homographies of N instants, (N, 3, 3), or raise a `PluginError`."""
+        frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
+        with attributing(self._origin, f"level {self._level}"):
+            found = HOMOGRAPHIES.require(np.asarray(self._trajectory.at(frame_indices)), frames)
+            return np.asarray(found, dtype=np.float64)
+
+
 @dataclass(frozen=True, slots=True)
 class KnotErrors:
     """How far a trajectory lies from the knots that it was fitted to, at the corners of a frame.
 
     A trajectory that smooths misses its knots by a few of their expected errors, and outliers may lie further away: so these
     are medians, which may be as large as the larger of `KNOT_STDS` expected errors and `KNOT_PX`.
-
-    Attributes:
-        missed_px: distance from the knots.
-        strayed_px: half-way between two knots, distance from the mean of both, beyond the distance between them.
-        std_px: expected error of the knots; NaN where it is not known.
     """
 
-    missed_px: float
-    strayed_px: float
-    std_px: float
+    missed_px: float  # distance from the knots
+    strayed_px: float  # half-way between two knots, distance from the mean of both, beyond the distance between them
+    std_px: float  # expected error of the knots; NaN where it is not known
 
     @property
     def allowed_px(self) -> float:
@@ -347,16 +327,11 @@ def knot_errors(
 ) -> KnotErrors:
     """Compare a trajectory with the knots that it was fitted to: `KNOTS.require` refuses one that has nothing to do with them.
 
-    Args:
-        trajectory: what an interpolator fitted.
-        instants: (N,) of the knots.
-        homographies: (N, 3, 3) of the knots.
-        std_px: (N,) expected error of the knots; NaN where it is not known.
-        frame_shape: (height, width) of a frame.
+    The knots are (N, 3, 3) at (N,) instants, with (N,) expected errors, NaN where these are not known.
     """
     points = corners(frame_shape)
-    knots, between = apply(homographies, points), (instants[1:] + instants[:-1]) / 2
-    fitted = apply(trajectory.at(np.concatenate([instants, between])), points)
+    knots, between = transform_points(homographies, points), (instants[1:] + instants[:-1]) / 2
+    fitted = transform_points(trajectory.at(np.concatenate([instants, between])), points)
     strayed_px = _distance_px(fitted[len(instants) :], (knots[1:] + knots[:-1]) / 2) - _distance_px(knots[1:], knots[:-1])
     missed_px = float(np.median(_distance_px(fitted[: len(instants)], knots)))
     return KnotErrors(missed_px, float(np.median(strayed_px)) if len(between) else 0.0, float(np.median(std_px)))

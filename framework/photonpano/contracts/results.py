@@ -96,11 +96,7 @@ PANORAMA: Contract[Panorama] = Contract(
 
 
 def require_panorama(found: object, canvas: Canvas) -> Panorama:
-    """Return what a renderer returned for a canvas, in float32, if it keeps the contract.
-
-    Raises:
-        BrokenContract: it is no panorama on this canvas, or flux is not finite exactly where the weight is positive.
-    """
+    """Return what a renderer returned for a canvas, in float32, or raise `BrokenContract`."""
     panorama = PANORAMA.require(found, canvas)
     flux, weight = (np.ascontiguousarray(image, np.float32) for image in (panorama.flux, panorama.weight))
     return Panorama(flux, weight, canvas.transform)
@@ -139,8 +135,8 @@ def _no_flags(found: PoseEstimate, stream: StreamInfo) -> object:
 
 def _not_rigid(found: PoseEstimate, _: StreamInfo) -> object:
     located = np.asarray(found.located)
-    bent = np.flatnonzero(located)[~_are_rigid(found.camera_from_world[located])]
-    return bent.size and (bent[0],)
+    wrong = np.flatnonzero(located)[~_are_rigid(found.camera_from_world[located])]
+    return wrong.size and (wrong[0],)
 
 
 def _std(name: str) -> tuple[Rule, Rule]:
@@ -186,10 +182,7 @@ def _no_indices(view: PosedView, count: int) -> tuple[object, ...]:
 
 
 def _of_views(sentence: str, check: Callable[[PosedView, int], object]) -> Rule:
-    """Require something of every view, whose span comes first in the sentence.
-
-    `check` takes a view and the number of points of the scene, and returns what else comes in the sentence if it is wrong.
-    """
+    """Require something of every view, whose span comes first in the sentence; `check` takes the number of points as well."""
 
     def wrong(found: PoseEstimate, _: StreamInfo) -> object:
         for view in found.views:

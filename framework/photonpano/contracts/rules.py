@@ -1,11 +1,15 @@
-"""State what a component may return as a table of rules, and check values against it."""
+"""State what a component may return as a table of rules, check values against it, and name the component that broke one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
+
+from photonpano.errors import PhotonpanoError, PluginError, described
+from photonpano.interrupts import is_interrupt
 
 T = TypeVar("T")
 # What is required, as a sentence for users, and a check of a value against facts, such as the number of frames of the capture.
@@ -17,12 +21,32 @@ class BrokenContract(Exception):  # noqa: N818 - it is not raised to callers
     """What a component returned although its protocol does not allow it, as a clause; raised inside `attributing`."""
 
 
-class Contract(Generic[T]):
-    """The rules for what one kind of component returns.
+@contextmanager
+def attributing(origin: str, where: str) -> Iterator[None]:
+    """Raise a `PluginError` that names a component for errors of the block.
+
+    Errors that are written for users, and interrupts, pass unchanged.
 
     Args:
-        rules: what a run refuses; each may rely on those before it.
-        strict: what only the conformance kit refuses, while a run converts it or can do without.
+        origin: who provides the component, such as "merger 'photon-mle' of photonpano 0.1.0".
+        where: what it works on, such as "level 2" or "frames 0 to 15".
+    """
+    try:
+        yield
+    except PhotonpanoError:
+        raise
+    except BrokenContract as error:
+        raise PluginError(f"{origin} broke its contract at {where}: {error}") from None
+    except BaseException as error:  # a plugin that calls sys.exit() must not end the program in silence
+        if is_interrupt(error):
+            raise
+        raise PluginError(f"{origin} failed at {where}: {described(error)}") from error
+
+
+class Contract(Generic[T]):
+    """The rules for what one kind of component returns: `rules` for runs, each of which may rely on those before it.
+
+    `strict` are those of the conformance kit alone: a run converts such a value, or can do without it.
     """
 
     def __init__(self, rules: Sequence[Rule], strict: Sequence[Rule] = ()) -> None:
@@ -30,11 +54,7 @@ class Contract(Generic[T]):
         self.strict = tuple(strict)
 
     def require(self, found: Any, facts: Any = None) -> T:
-        """Return a value that keeps the rules of a run.
-
-        Raises:
-            BrokenContract: it does not; the message is that of the first rule that it breaks.
-        """
+        """Return a value that keeps the rules of a run, or raise `BrokenContract` with the sentence of the first broken one."""
         for sentence, check in self.rules:
             if wrong := check(found, facts):
                 raise BrokenContract(_filled(sentence, wrong))

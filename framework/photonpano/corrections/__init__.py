@@ -3,7 +3,7 @@
 from photonpano.corrections.applying import corrected_source
 from photonpano.corrections.colour_filter import ColourFilter
 from photonpano.corrections.dark import DarkCounts, DarkFrames, measure_dark, read_dark, write_dark
-from photonpano.corrections.flat_field import FlatField, Vignette, divided_by, read_vignette, write_vignette
+from photonpano.corrections.flat_field import FlatField, Vignette, divided_by, estimate_vignette, read_vignette, write_vignette
 from photonpano.corrections.geometry import (
     TURNS,
     ColourSwissSpad2,
@@ -13,11 +13,9 @@ from photonpano.corrections.geometry import (
     MissingRow,
     SwapColumns,
 )
-from photonpano.corrections.hot_pixels import HotPixels, hot_in_the_dark
-from photonpano.corrections.masks import Mask
+from photonpano.corrections.hot_pixels import HotPixels, Mask, hot_in_the_dark
 from photonpano.corrections.pixels import Correction
 from photonpano.corrections.still_pixels import StillPixels, without_still_pixels
-from photonpano.corrections.vignette import estimate_vignette
 
 _ALL: tuple[type[Correction], ...] = (
     *(ColourSwissSpad2, GreySwissSpad2Half, GreySwissSpad2Full),
@@ -30,11 +28,9 @@ CORRECTIONS = {correction.name: correction for correction in _ALL}  # all correc
 __all__ = [
     "CORRECTIONS",
     "Correction",
-    "DarkCounts",
     "DarkFrames",
     "FlatField",
     "HotPixels",
-    "StillPixels",
     "Vignette",
     "corrected_source",
     "divided_by",

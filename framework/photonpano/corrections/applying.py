@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from photonpano.capture import MISSING, Capture, Gather, Index, LinearCorrection, capture_of, numbered
-from photonpano.corrections.colour_filter import ColourFilter
-from photonpano.corrections.colours import with_colours
+from photonpano.corrections.colour_filter import ColourFilter, with_colours
 from photonpano.corrections.pixels import Correction, Decide, Pixels
 from photonpano.errors import InputError
 from photonpano.protocols import Source
@@ -25,7 +24,7 @@ def corrected_source(
     blame: Callable[[int, str], Exception] | None = None,
     look: bool = True,
 ) -> Capture:
-    """Return a capture with corrections. Frames and counts stay whole numbers, as they were recorded.
+    """Return a capture with corrections, in order. Frames and counts stay whole numbers, as they were recorded.
 
     Args:
         source: the capture as it is read; closing the corrected one closes it.

@@ -29,15 +29,10 @@ _AT_ONCE = 1024  # frames summed between two reports of progress
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DarkFrames:
-    """Dark counts of each pixel, from frames taken with the lens covered.
+    """Dark counts of each pixel, from frames taken with the lens covered."""
 
-    Attributes:
-        rates: (H, W) float32, dark counts per frame: photons of binary frames, grey values of others.
-        n_frames: frames that they were measured in; None if unknown.
-    """
-
-    rates: FluxImage
-    n_frames: int | None
+    rates: FluxImage  # (H, W) float32, dark counts per frame: photons of binary frames, grey values of others
+    n_frames: int | None  # frames that they were measured in; None if unknown
 
 
 class DarkCounts(Correction):
@@ -75,14 +70,10 @@ class DarkCounts(Correction):
 
 
 def measure_dark(source: Source, advance: Callable[[int], object] | None = None) -> DarkFrames:
-    """Measure the dark counts of a capture that was recorded with the lens covered.
+    """Measure the dark counts of a capture that was recorded with the lens covered; `advance` is given numbers of frames read.
 
     The rate of a binary pixel is `-ln(1 - k / n)` for k counts in n frames, as its flux is. The rate of other pixels is the
     mean of their grey values.
-
-    Args:
-        source: the capture.
-        advance: called with the number of frames read since the last call.
     """
     info, spans = source.info, list(source.info.span.blocks(_AT_ONCE))
     counts = np.zeros(info.frame_shape, np.uint64)
@@ -100,11 +91,7 @@ def write_dark(path: Path, dark: DarkFrames) -> None:
 
 
 def read_dark(path: Path) -> DarkFrames:
-    """Read dark counts: an .npz archive that `write_dark` wrote, or a .npy file of rates.
-
-    Raises:
-        InputError: the file is missing, holds something else, or rates that are negative or not finite.
-    """
+    """Read dark counts: an .npz archive of `write_dark`, or a .npy file of rates. An `InputError` tells what is wrong."""
     arrays = read_arrays(path, "a file of dark counts", ("rates", "n_frames"))
     rates, n_frames = arrays.get("rates", arrays.get("")), arrays.get("n_frames")
     if rates is None:

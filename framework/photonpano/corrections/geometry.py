@@ -25,7 +25,7 @@ class Rearrangement(Correction):
 
     @abstractmethod
     def moved(self, pixels: Index) -> Index:
-        """Move the numbers of pixels, (H, W): -1 stands for a pixel that the sensor does not have.
+        """Move the numbers of pixels, (H, W): -1 stands for a pixel that the sensor lacks.
 
         Raises:
             InputError: the frame is too small.
@@ -103,42 +103,32 @@ class MissingRow(Rearrangement):
 
 
 class Turn(Rearrangement):
-    """Rotates or mirrors the frame.
+    """Rotates or mirrors the frame."""
 
-    Attributes:
-        turn: the numpy function that does it.
-    """
-
-    turn: ClassVar[Callable[[Index], Index]]
+    turn: ClassVar[Callable[[Index], Index]]  # the numpy function that does it
 
     def moved(self, pixels: Index) -> Index:
         """See `Rearrangement`."""
         return type(self).turn(pixels)
 
 
-def _turns() -> tuple[type[Turn], ...]:
-    table: tuple[tuple[str, Callable[[Index], Index], str], ...] = (
-        ("rot90", partial(np.rot90, k=-1), "Turns the frame by 90 degrees clockwise."),
-        ("rot180", partial(np.rot90, k=2), "Turns the frame upside down, by 180 degrees."),
-        ("rot270", partial(np.rot90, k=1), "Turns the frame by 270 degrees clockwise, which is 90 degrees counter-clockwise."),
-        ("flip-ud", np.flipud, "Mirrors the frame top to bottom."),
-        ("flip-lr", np.fliplr, "Mirrors the frame left to right."),
-    )
-    return tuple(type(name, (Turn,), {"name": name, "turn": staticmethod(turn), "__doc__": doc}) for name, turn, doc in table)
-
-
-TURNS = _turns()  # A class for each way to turn a frame
+_TURNS: tuple[tuple[str, Callable[[Index], Index], str], ...] = (
+    ("rot90", partial(np.rot90, k=-1), "Turns the frame by 90 degrees clockwise."),
+    ("rot180", partial(np.rot90, k=2), "Turns the frame upside down, by 180 degrees."),
+    ("rot270", partial(np.rot90, k=1), "Turns the frame by 270 degrees clockwise, which is 90 degrees counter-clockwise."),
+    ("flip-ud", np.flipud, "Mirrors the frame top to bottom."),
+    ("flip-lr", np.fliplr, "Mirrors the frame left to right."),
+)
+# A class for each way to turn a frame.
+TURNS: tuple[type[Turn], ...] = tuple(
+    type(name, (Turn,), {"name": name, "turn": staticmethod(turn), "__doc__": doc}) for name, turn, doc in _TURNS
+)
 
 
 class Preset(Rearrangement):
-    """Other corrections, one after the other, that a known sensor needs.
+    """Other corrections, one after the other, that a known sensor needs."""
 
-    Attributes:
-        shape: (height, width) of the frames that it is made for.
-        steps: the corrections.
-    """
-
-    shape: ClassVar[tuple[int, int]]
+    shape: ClassVar[tuple[int, int]]  # (height, width) of the frames that it is made for
     steps: ClassVar[tuple[Rearrangement, ...]]
 
     def moved(self, pixels: Index) -> Index:

@@ -1,4 +1,4 @@
-"""Find hot and dead pixels, in dark frames or in the capture itself, and mask them."""
+"""Mask bad pixels: those that a file marks, and hot and dead ones, found in dark frames or in the capture itself."""
 
 from __future__ import annotations
 
@@ -11,9 +11,13 @@ from pydantic import Field
 from photonpano.contributions import SpecPath
 from photonpano.corrections.dark import DARK_FILE, read_dark
 from photonpano.corrections.pixels import Correction
+from photonpano.errors import InputError
+from photonpano.reading import look_first, read_array, read_picture
 from photonpano.robust import robust_std
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from photonpano.capture import Capture
@@ -68,16 +72,10 @@ class HotPixels(Correction):
 
 
 def hot_in_the_dark(dark: DarkFrames, threshold: float, valid: BoolArray) -> tuple[BoolArray, float]:
-    """Return the pixels that have far more dark counts than most.
+    """Return the pixels (H, W) that have far more dark counts than most, and the rate above which pixels are hot.
 
-    Args:
-        dark: the dark counts.
-        threshold: standard deviations above the median from which a pixel is hot. The standard deviation comes from the median
-            absolute deviation, and is at least that of photon noise.
-        valid: (H, W) the pixels that count for the median.
-
-    Returns:
-        (H, W) mask of hot pixels, and the rate above which pixels are hot.
+    The limit lies `threshold` standard deviations above the median of the `valid` pixels. The standard deviation comes from the
+    median absolute deviation, and is at least that of photon noise.
     """
     rates = dark.rates[valid]
     if not rates.size:
@@ -105,15 +103,9 @@ def _standing_out(pixels: Pixels, capture: Capture, threshold: float) -> tuple[B
 
 
 def outliers(image: FluxImage, noise_std: float, threshold: float) -> BoolArray:
-    """Return the pixels that are brighter or darker than their neighbours.
+    """Return the pixels that are brighter or darker than their neighbours: (H, W) bool, False at unknown pixels, which are NaN.
 
-    Args:
-        image: (H, W), on the scale on which photon noise is uniform; NaN at pixels that must not be used.
-        noise_std: standard deviation of photon noise.
-        threshold: smallest deviation, in robust standard deviations of the other pixels.
-
-    Returns:
-        (H, W) bool, False at unknown pixels.
+    Photon noise is uniform in the image, of the standard deviation `noise_std`; the threshold is in robust standard deviations.
     """
     around = sorted_neighbours(image, reach_of(image))
     differences = np.abs(image - brightest(around, 0.5))
@@ -145,12 +137,7 @@ def sorted_neighbours(image: FluxImage, reach: int = _REACH) -> FluxImage:
 
 
 def brightest(around: FluxImage, share: float) -> FluxImage:
-    """Return, for each pixel, the value that the brightest share of its neighbours reach; NaN where fewer than 6 are known.
-
-    Args:
-        around: (H, W, N), from `sorted_neighbours`.
-        share: fraction of the neighbours.
-    """
+    """Return the value that the brightest share of the neighbours (H, W, N) of each pixel reach; NaN with fewer than 6."""
     known = _n_known(around)
     return _picked(around, known, known - np.floor(known * share))
 
@@ -170,3 +157,40 @@ def _picked(around: FluxImage, known: NDArray[np.intp], place: NDArray[Any]) -> 
     place = np.clip(place, 0, around.shape[-1] - 1).astype(np.intp)
     found = np.take_along_axis(around, place, axis=-1)
     return np.where(known >= _MIN_KNOWN, found, np.float32(np.nan))[..., 0]
+
+
+class Mask(Correction):
+    """Masks the pixels that a file marks as bad; the motion fills them."""
+
+    name: ClassVar[str] = "mask"
+    file: SpecPath = Field(
+        description="a bool .npy file, true for bad pixels, or a .png picture in which bad pixels are not black; of "
+        "the size of the frames at this place of the list"
+    )
+
+    def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
+        """Mask the bad pixels; see `Correction`."""
+        del capture, decide
+        bad = _read_mask(self.file)
+        pixels.require(bad.shape, self.file)
+        return pixels.without(bad)
+
+
+def _read_mask(path: Path) -> BoolArray:
+    expected = "a mask of bad pixels"
+    if path.suffix.lower() == ".png":
+        return _read_picture(path, f"is not {expected}: it is no picture that can be read")
+    mask = read_array(path, expected)
+    if mask.dtype != np.bool_:
+        raise InputError(
+            f"{path} holds {mask.dtype} values; a mask is a .npy file of bool, true for pixels that must not be used"
+        )
+    return mask
+
+
+def _read_picture(path: Path, otherwise: str) -> BoolArray:
+    """Return which pixels of a picture of 8 or 16 bits are not black: (H, W)."""
+    import cv2
+
+    look_first(path, "cv2:imread")
+    return np.asarray(read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH).any(axis=-1))

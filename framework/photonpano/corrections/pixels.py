@@ -20,20 +20,13 @@ Decide: TypeAlias = Callable[[str, float, str], None]  # records a decision: wha
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pixels:
-    """The pixels of a frame after some corrections; every array is (H, W).
+    """The pixels of a frame after some corrections; every array is (H, W)."""
 
-    Attributes:
-        index: intp, the number of each pixel in the frame as it is read, counted along its rows; -1 where there is none.
-        valid: False for pixels that must not be used.
-        interpolated: True for pixels that are replaced by their neighbours.
-        dark_rates: float32, dark counts per frame to subtract: photons of binary frames, grey values of others.
-        colour: int8, the place in `COLOURS` of the colour that each pixel sees; -1 where all pixels are treated alike.
-    """
-
-    index: Index
-    valid: BoolArray
-    interpolated: BoolArray
-    dark_rates: FluxImage
+    index: Index  # intp, the number of each pixel in the frame as it is read, counted along its rows; -1 where there is none
+    valid: BoolArray  # False for pixels that must not be used
+    interpolated: BoolArray  # True for pixels that are replaced by their neighbours
+    dark_rates: FluxImage  # float32, dark counts per frame to subtract: photons of binary frames, grey values of others
+    # int8, the place in `COLOURS` of the colour that each pixel sees; -1 where all pixels are treated alike
     colour: NDArray[np.int8]
 
     @classmethod
@@ -68,11 +61,7 @@ class Pixels:
         return replace(self, valid=self.valid & ~bad)
 
     def require(self, shape: tuple[int, ...], what: object) -> None:
-        """Refuse a file whose size differs from that of frames after the corrections so far.
-
-        Raises:
-            InputError: the sizes differ.
-        """
+        """Raise an `InputError` for a file whose size differs from that of frames after the corrections so far."""
         if shape != self.shape:
             given = "x".join(map(str, shape)) + " px" if len(shape) == 2 and all(shape) else f"the shape {shape}"
             here = "x".join(map(str, self.shape))
@@ -80,13 +69,9 @@ class Pixels:
 
 
 class Correction(Config, ABC):
-    """One correction of a list: its settings, and what it does.
+    """One correction of a list: its settings, and what it does."""
 
-    Attributes:
-        name: its name in specs.
-    """
-
-    name: ClassVar[str]
+    name: ClassVar[str]  # its name in specs
 
     @property
     def changes_sums(self) -> bool:
@@ -97,11 +82,8 @@ class Correction(Config, ABC):
     def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
         """Apply the correction to the pixels that the corrections before it have left.
 
-        Args:
-            pixels: the pixels so far.
-            capture: as it is read.
-            decide: records what was chosen because of the capture or a file. None means that no frame may be read yet: the
-                correction leaves out what depends on frames.
+        `capture` is as it is read. `decide` records what was chosen because of the capture or a file; with None, no frame may
+        be read yet, and the correction leaves out what depends on frames.
 
         Raises:
             InputError: the correction does not suit the pixels, or a file holds something else.

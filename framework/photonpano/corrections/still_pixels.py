@@ -78,40 +78,31 @@ def without_still_pixels(source: Source, look: bool = True) -> Capture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Still:
-    """What stands still in the frame.
+    """What stands still in the frame."""
 
-    Attributes:
-        mask: (H, W) bool, the pixels to mask.
-        share: share of the frame that stands still, of the parts that show motion or rest; 0 if no part does.
-        why: a clause on the masked pixels.
-    """
-
-    mask: BoolArray
-    share: float
-    why: str
+    mask: BoolArray  # (H, W) bool, the pixels to mask
+    share: float  # share of the frame that stands still, of the parts that show motion or rest; 0 if no part does
+    why: str  # a clause on the masked pixels
 
 
 def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike: Sequence[BoolArray] | None = None) -> Still:
-    """Find what stands still while the rest of the frame moves.
+    """Find what stands still while the rest of the frame moves, from (M, H, W) sums of binary frames at M times of a capture.
 
     A pixel that sees one thing all the time varies by photon noise only; a pixel that the scene moves past varies by its
     contrast. To stand still, a part must have structure in all directions, which a motion would have turned into variation: a
     part that moves by s px (root mean square) over a mean squared gradient g varies by about g s^2. Single pixels stand if they
     differ from their neighbours all the time.
 
-    Args:
-        sums: (M, H, W) uint8, sums of binary frames at M times of the capture.
-        n_frames: frames of a sum.
-        usable: (H, W) bool, pixels to look at.
-        alike: (H, W) bool each, pixels that may be compared with each other, such as those of one colour; by default all. The
-            parts are those that most of the pixels show.
+    Pixels of each mask in `alike` may be compared with each other, such as those of one colour; by default all. The parts are
+    those that most of the pixels show.
     """
     colours = [usable & part for part in alike] if alike else [usable]
     single = np.logical_or.reduce([_single_pixels(sums, n_frames, part) for part in colours])
-    parts = _Parts.of(sums, n_frames, max(colours, key=np.count_nonzero) & ~single)
-    standing = _continued(parts.standing, ~parts.moving)
-    share = _share(standing, parts.moving & ~standing)
-    if parts.moving.mean() < _LEAST_MOVING:
+    moving, stood = _parts(sums, n_frames, max(colours, key=np.count_nonzero) & ~single)
+    standing = _continued(stood, ~moving)
+    n_standing, n_moving = int(standing.sum()), int((moving & ~standing).sum())
+    share = n_standing / max(n_standing + n_moving, 1)
+    if moving.mean() < _LEAST_MOVING:
         return Still(np.zeros_like(usable), share, "are masked: nothing in the frame moves")
     if share > _HALF:
         why = f"are masked: {share:.0%} of the frame stands still, so that it is open which part is the scene"
@@ -127,11 +118,12 @@ def _single_pixels(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) ->
     n_spans, total = len(sums), len(sums) * n_frames
     counts = sums.sum(axis=0, dtype=np.float32)
     stabilised = np.arcsin(np.sqrt((counts + 0.375) / np.float32(total + 0.75)))
-    found = outliers(_where(usable, stabilised), 0.5 / np.sqrt(total), _THRESHOLD)
+    nothing = np.float32(np.nan)
+    found = outliers(np.where(usable, stabilised, nothing), 0.5 / np.sqrt(total), _THRESHOLD)
     mean = counts / np.float32(total)
     noise = _photon_noise(mean, n_frames, total)
     variance = sum((each / np.float32(n_frames) - mean) ** 2 for each in sums) / np.float32(n_spans - 1)
-    difference, more = (_beyond_neighbours(_where(usable, image)) for image in (mean, variance - noise))
+    difference, more = (_beyond_neighbours(np.where(usable, image, nothing)) for image in (mean, variance - noise))
     chance = _SURE * np.sqrt(2 / (n_spans - 1)) * noise
     return np.asarray(found & (more < chance + _STEADY * difference**2) & ~_has_halo(np.nan_to_num(difference)))
 
@@ -150,38 +142,29 @@ def _has_halo(difference: FluxImage) -> BoolArray:
     return np.asarray(third > _HALO * np.abs(difference))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Parts:
-    """Where the frame moves, and where it stands: (H, W) bool each; both are False where nothing shows it."""
+def _parts(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Return where the frame moves, and where it stands, (H, W) each; both are False where nothing shows it.
 
-    moving: BoolArray
-    standing: BoolArray
+    Variation over time is compared with structure, averaged over squares.
+    """
+    kernel = _kernel()
+    independent = _SIDE_PX**2 * _energy(kernel)
+    mean, noise, variance = _variation(sums, n_frames, usable)
+    chance = np.sqrt(2 / (len(sums) - 1) / independent) * _root_mean_square(noise)
+    slope_noise = noise / len(sums) * float(np.sum(np.convolve(kernel, [0.5, 0, -0.5]) ** 2) / np.sum(kernel**2))
+    structure = _weakest_structure(mean, slope_noise)
 
-    @classmethod
-    def of(cls, sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> _Parts:
-        """Compare variation over time with structure, averaged over squares."""
-        kernel = _kernel()
-        independent = _SIDE_PX**2 * _energy(kernel)
-        mean, noise, variance = _variation(sums, n_frames, usable)
-        chance = np.sqrt(2 / (len(sums) - 1) / independent) * _root_mean_square(noise)
-        slope_noise = noise / len(sums) * float(np.sum(np.convolve(kernel, [0.5, 0, -0.5]) ** 2) / np.sum(kernel**2))
-        structure = _weakest_structure(mean, slope_noise)
-
-        moving = (variance > _SURE * chance) & (variance > structure)
-        some_move = moving.mean() >= _LEAST_MOVING
-        typical = float(np.median(variance[moving])) if some_move else 0.0
-        noticed = _SURE * np.sqrt(2 / independent) * _root_mean_square(slope_noise)
-        stood = (structure > np.maximum(noticed, _FAINT * typical)) & (variance < _STOOD_PX**2 * structure + _SURE * chance)
-        certain = variance + 2 * chance < np.minimum(_MOVED_PX**2 * structure, _CALM * typical if some_move else np.inf)
-        return cls(moving, _large(stood & certain))
+    moving = (variance > _SURE * chance) & (variance > structure)
+    some_move = moving.mean() >= _LEAST_MOVING
+    typical = float(np.median(variance[moving])) if some_move else 0.0
+    noticed = _SURE * np.sqrt(2 / independent) * _root_mean_square(slope_noise)
+    stood = (structure > np.maximum(noticed, _FAINT * typical)) & (variance < _STOOD_PX**2 * structure + _SURE * chance)
+    certain = variance + 2 * chance < np.minimum(_MOVED_PX**2 * structure, _CALM * typical if some_move else np.inf)
+    return moving, _large(stood & certain)
 
 
 def _variation(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> tuple[FluxImage, FluxImage, FluxImage]:
-    """Blur the sums against photon noise; return their mean, their noise, and their variance over time without that noise.
-
-    Returns:
-        Mean of the blurred sums per frame, and variance of the photon noise of one of them; variance, averaged over squares.
-    """
+    """Return mean and photon noise of the blurred sums per frame, and their variance over time without noise, over squares."""
     n_spans, total, known = len(sums), len(sums) * n_frames, usable.astype(np.float32)
     near = np.maximum(_blurred(known), np.float32(1e-3)) * n_frames
 
@@ -240,15 +223,6 @@ def _widened(standing: BoolArray) -> BoolArray:
 
     side = 2 * (_SIDE_PX // 2 + 2) + 1
     return np.asarray(cv2.dilate(standing.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
-
-
-def _where(usable: BoolArray, image: FluxImage) -> FluxImage:
-    return np.where(usable, image, np.float32(np.nan))
-
-
-def _share(standing: BoolArray, moving: BoolArray) -> float:
-    n_standing, n_moving = int(standing.sum()), int(moving.sum())
-    return n_standing / max(n_standing + n_moving, 1)
 
 
 def _kernel() -> NDArray[np.float64]:

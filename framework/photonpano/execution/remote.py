@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -9,29 +11,64 @@ from operator import itemgetter
 from threading import Event
 from typing import Any, Protocol, TypeVar, cast
 
-from photonpano.execution.packing import packed, unpacked
+from photonpano.errors import PluginError
 from photonpano.interrupts import interrupted
 
+_CAPTURE = "capture"
 _POLL_S = 0.2  # from one check for an interrupt to the next, in threads that wait
 # Items of a task. An exposure takes some ten milliseconds, and a task costs about one in the scheduler and in the client.
 _MOST_AT_ONCE = 8
 # Items are worked on at once where there are so many tasks for each one under way, so that no worker waits for the last.
 _TASKS_UNDER_WAY = 4
+
+
+def packed(value: object, capture: object) -> bytes:
+    """Pickle a value, in which the capture travels as a name; a `PluginError` says what cannot be pickled."""
+    buffer = io.BytesIO()
+    try:
+        _Packer(buffer, capture).dump(value)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise PluginError(
+            f"a component cannot be sent to other processes: {error}; run it in threads: leave out run.executor"
+        ) from error
+    return buffer.getvalue()
+
+
+def unpacked(data: bytes, capture: object) -> Any:
+    """Return a value from what `packed` returned; `capture` takes the place of the capture."""
+    return _Unpacker(io.BytesIO(data), capture).load()
+
+
+class _Packer(pickle.Pickler):
+    def __init__(self, buffer: io.BytesIO, capture: object) -> None:
+        super().__init__(buffer, protocol=pickle.HIGHEST_PROTOCOL)
+        self._capture = capture
+
+    def persistent_id(self, obj: object) -> str | None:
+        return _CAPTURE if obj is self._capture else None
+
+
+class _Unpacker(pickle.Unpickler):
+    def __init__(self, buffer: io.BytesIO, capture: object) -> None:
+        super().__init__(buffer)
+        self._capture = capture
+
+    def persistent_load(self, pid: object) -> object:
+        if pid != _CAPTURE:
+            raise pickle.UnpicklingError(f"unknown object {pid!r}")
+        return self._capture
+
+
 ValueT = TypeVar("ValueT")
 ResultT = TypeVar("ResultT")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaptureElsewhere:
-    """What stands for a capture in tasks.
+    """What stands for a capture in tasks."""
 
-    Attributes:
-        source: the capture in this process.
-        opener: opens it in another one; can be pickled, and tells by `==` whether it is the same capture.
-    """
-
-    source: object
-    opener: Callable[[], object]
+    source: object  # the capture in this process
+    opener: Callable[[], object]  # opens it in another one; can be pickled, and tells by `==` whether it is the same capture
 
 
 class Pending(Protocol):
@@ -43,7 +80,6 @@ class Pending(Protocol):
         Raises:
             Exception: what the task raised.
         """
-        ...
 
 
 class Workers(Protocol):
@@ -56,20 +92,16 @@ class Workers(Protocol):
             function: of a module that workers can import.
             given: its arguments; a `Pending` is replaced by its result, which travels from worker to worker alone.
         """
-        ...
 
     @property
     def under_way(self) -> int:
         """How many tasks are worth having under way at once: more than there are workers, so that none waits for the next."""
-        ...
 
     def when_done(self, pending: Pending, call: Callable[[], object]) -> None:
         """Have a function called, in any thread, once a task has ended in whatever way."""
-        ...
 
     def close(self) -> None:
         """Cancel what is under way, and end the processes that were started."""
-        ...
 
 
 class Remote:
@@ -177,12 +209,7 @@ def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
 
 
 def _work(of_two: Sequence[bool], *given: Any) -> Any:
-    """Work on a task, in the process of a worker.
-
-    Args:
-        of_two: which of the things that are given are results of two values, the first of which is meant.
-        given: the function, and its arguments.
-    """
+    """Work on a task, a function and its arguments, in a worker; `of_two` marks results of two values, whose first is meant."""
     meant = (each[0] if first else each for first, each in zip(of_two, given, strict=True))
     work, *values = (each.value() if isinstance(each, _Sent) else each for each in meant)
     return work(*values)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from photonpano.geometry.homographies import corners, from_parameters, normalised, transform_points
-from photonpano.geometry.rotations import nearest_rotations
-from photonpano.geometry.steps import unit_coordinates
+from photonpano.geometry.camera import nearest_rotations
+from photonpano.geometry.homographies import corners, from_parameters, normalised, transform_points, unit_coordinates
 from photonpano.values import FloatArray, Homography
 
 # Evenly spaced frames to which the alignment is fitted. They are plenty: a homography has eight parameters, and each frame
@@ -42,6 +41,7 @@ def align_planes(
     Raises:
         ValueError: the trajectories are empty, or differ in length.
     """
+    import cv2
     from scipy.optimize import least_squares
 
     if len(estimated) != len(true) or not len(true):
@@ -49,54 +49,27 @@ def align_planes(
             f"only trajectories of the same length can be aligned, got {len(estimated)} and {len(true)} homographies"
         )
     chosen = np.unique(np.linspace(0, len(true) - 1, FIT_FRAMES).round().astype(int))
-    frame = corners(frame_shape)
-    from_points, to_points = transform_points(estimated[chosen], frame), transform_points(true[chosen], frame)
-    to_frame = np.linalg.inv(true[chosen])
-    if start is None:
-        condition, target_condition = _conditioning(from_points), _conditioning(to_points)
-        linear = _direct_linear(transform_points(condition, from_points), transform_points(target_condition, to_points))
-        left = np.linalg.inv(target_condition) @ linear
-    else:
-        condition = unit_coordinates(frame_shape)
-        left = start @ np.linalg.inv(condition)
+    frame, condition = corners(frame_shape), unit_coordinates(frame_shape)
+    to_plane, to_frame = estimated[chosen], np.linalg.inv(true[chosen])
+    first = start
+    if first is None:
+        ends = (transform_points(each, frame).reshape(-1, 2) for each in (to_plane, true[chosen]))
+        first = np.asarray(cv2.findHomography(*ends)[0], np.float64)  # the direct linear transform (Hartley 1997)
+    left = first @ np.linalg.inv(condition)
 
     def plane(p: FloatArray) -> Homography:
-        # Steps from the linear solution, in conditioned coordinates in which all eight parameters have the same scale.
+        # Steps from the start, in coordinates in which all eight parameters have about the same scale.
         return left @ from_parameters(p) @ condition
 
     def residuals(p: FloatArray) -> FloatArray:
-        if start is None:
-            residual = transform_points(to_frame @ plane(p), from_points) - frame
-        else:  # points of the plane may lie behind the camera, or at infinity
-            residual = transform_points(to_frame @ plane(p) @ estimated[chosen], frame) - frame
+        # Points of the plane may lie behind the camera, or at infinity.
+        residual = transform_points(to_frame @ plane(p) @ to_plane, frame) - frame
         return np.nan_to_num(residual, nan=_FAR_PX, posinf=_FAR_PX, neginf=-_FAR_PX).ravel()
 
-    fit = least_squares(residuals, np.zeros(8), method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    fit = least_squares(residuals, np.zeros(8), method="lm", x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
     return normalised(plane(fit.x)) if start is None else plane(fit.x)
 
 
 def align_rotations(estimated: FloatArray, true: FloatArray) -> FloatArray:
     """Return the rotation G that brings G estimated_t nearest to true_t: (3, 3), for (T, 3, 3) rotations (Kabsch 1976)."""
     return nearest_rotations((true @ np.swapaxes(estimated, -1, -2)).mean(axis=0))
-
-
-def _conditioning(points: FloatArray) -> Homography:
-    """Return the similarity that moves points to the origin and scales them to a mean distance of sqrt(2) (Hartley 1997)."""
-    flat = points.reshape(-1, 2)
-    centre = flat.mean(axis=0)
-    scale = np.sqrt(2) / np.linalg.norm(flat - centre, axis=1).mean()
-    return np.array([[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1]])
-
-
-def _direct_linear(source: FloatArray, target: FloatArray) -> Homography:
-    """Return the homography of the direct linear transform: the right singular vector of `target x (H source) = 0`."""
-    x, y = source.reshape(-1, 2).T
-    u, v = target.reshape(-1, 2).T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    equations = [
-        np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1),
-        np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1),
-        np.zeros((1, 9)),  # a single frame gives eight equations: padded to nine
-    ]
-    solution: FloatArray = np.linalg.svd(np.concatenate(equations), full_matrices=False)[2][-1].reshape(3, 3)
-    return solution

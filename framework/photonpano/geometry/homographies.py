@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from photonpano.values import FloatArray, Homography
 
 BLOCK_FRAMES = 8192  # what is computed of all frames of a capture is computed for this many at a time, which bounds the memory
+_PARAMETERS = ((0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1))  # row and column of p1..p8
 
 
 def normalised(matrices: ArrayLike) -> Homography:
@@ -179,4 +180,59 @@ def from_parameters(p: ArrayLike) -> Homography:
     return h
 
 
-_PARAMETERS = ((0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1))  # row and column of p1..p8
+@cache
+def unit_coordinates(shape: tuple[int, int]) -> Homography:
+    """Return the map from pixels of a (height, width) image to coordinates with -1 and 1 at the ends of its longer side."""
+    height, width = shape
+    half = max(height, width) / 2
+    unit = np.array([[1 / half, 0, (1 - width) / (2 * half)], [0, 1 / half, (1 - height) / (2 * half)], [0, 0, 1]])
+    unit.flags.writeable = False
+    return unit
+
+
+@cache
+def generators(shape: tuple[int, int]) -> FloatArray:
+    """Return the derivatives of a homography of pixels by p1..p8 of `unit_coordinates`, at the identity: (8, 3, 3).
+
+    To first order, a change by p in unit coordinates is the homography I + p1 G1 + ... + p8 G8 of pixels.
+    """
+    unit = unit_coordinates(shape)
+    changes = np.asarray(np.linalg.inv(unit) @ (from_parameters(np.eye(8)) - np.eye(3)) @ unit)
+    changes.flags.writeable = False
+    return changes
+
+
+def slopes(mapped: FloatArray, changes: FloatArray) -> FloatArray:
+    """Return the derivatives of mapped points by eight parameters: (..., 2 N, 8), x and y of a point in adjacent rows.
+
+    Args:
+        mapped: (..., 3, N) points in homogeneous coordinates.
+        changes: (..., 8, 3, N) their derivatives with respect to eight parameters.
+    """
+    depth = mapped[..., None, 2:, :]
+    points = mapped[..., None, :2, :] / depth
+    d = (changes[..., :2, :] - points * changes[..., 2:, :]) / depth
+    return np.asarray(np.moveaxis(d, -3, -1).swapaxes(-3, -2).reshape(*d.shape[:-3], -1, d.shape[-3]))
+
+
+class FrameTrajectory:
+    """A trajectory given at every frame: linear between frames, constant beyond the first and last.
+
+    Args:
+        homographies: (T, 3, 3) float64, frame pixels to reference pixels, h33 = 1.
+    """
+
+    def __init__(self, homographies: FloatArray) -> None:
+        self._homographies = np.asarray(homographies, dtype=np.float64)
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the homographies of N instants, in frames: (N, 3, 3)."""
+        instants = np.asarray(frame_indices, dtype=np.float64)
+        found, last = np.empty((len(instants), 3, 3)), len(self._homographies) - 1
+        for start in range(0, len(instants), BLOCK_FRAMES):
+            block = np.clip(instants[start : start + BLOCK_FRAMES], 0, last)
+            before = np.floor(block).astype(int)
+            share = (block - before)[:, None, None]
+            after = np.minimum(before + 1, last)
+            found[start : start + len(block)] = (1 - share) * self._homographies[before] + share * self._homographies[after]
+        return found

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.geometry.camera import Camera
-from photonpano.geometry.canvas import Canvas
+from photonpano.geometry.camera import Camera, nearest_rotations
+from photonpano.geometry.canvas import PROJECTIONS, Canvas
 from photonpano.geometry.homographies import translation
-from photonpano.geometry.projections import PROJECTIONS
-from photonpano.geometry.rotations import nearest_rotations
 from photonpano.values import FloatArray
 
 _SIDE_POINTS = 16  # points of an outline along each side of a frame

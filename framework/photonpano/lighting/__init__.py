@@ -1,13 +1,19 @@
 """Light that changes: measured from what a capture shows along its motion, and attached to its source."""
 
 from photonpano.capture import in_light
-from photonpano.lighting.files import LIGHT_FILE, in_light_of, write_light
-from photonpano.lighting.finding import LIGHT_DECISION, corrected_light, decision_of, find_light, measure_light
+from photonpano.lighting.finding import (
+    LIGHT_DECISION,
+    corrected_light,
+    decision_of,
+    find_light,
+    in_light_of,
+    measure_light,
+    write_light,
+)
 from photonpano.lighting.flat_field import PixelGain, measure_pixel_gain
 
 __all__ = [
     "LIGHT_DECISION",
-    "LIGHT_FILE",
     "PixelGain",
     "corrected_light",
     "decision_of",

@@ -10,7 +10,7 @@ from scipy import sparse
 
 from photonpano.context import Context
 from photonpano.errors import InputError
-from photonpano.geometry import apply, inverse
+from photonpano.geometry import inverse, transform_points
 from photonpano.lighting.finding import speed_px
 from photonpano.lighting.gains import SMOOTHING, STRUCTURE, SeenCells, seen_cells
 from photonpano.protocols import Source, Trajectory
@@ -32,32 +32,22 @@ _NARROWEST = 1e-3  # least standard deviation of the prior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelGain:
-    """The relative gain of the pixels of a sensor.
+    """The relative gain of the pixels of a sensor."""
 
-    Attributes:
-        gain: (H, W) float32, 1 on average over the valid pixels.
-        std: (H, W) float32, its standard deviation, relative to the gain. It contains what the motion leaves open: of a picture
-            that turns, how the gain changes with the distance from the centre of the turn.
-        spans: the frames that it was measured from.
-    """
-
-    gain: FluxImage
+    gain: FluxImage  # (H, W) float32, 1 on average over the valid pixels
+    # (H, W) float32, its standard deviation, relative to the gain. It contains what the motion leaves open: of a picture that
+    # turns, how the gain changes with the distance from the centre of the turn.
     std: FluxImage
-    spans: tuple[FrameSpan, ...]
+    spans: tuple[FrameSpan, ...]  # the frames that it was measured from
 
 
 def measure_pixel_gain(source: Source, trajectory: Trajectory, context: Context) -> PixelGain:
-    """Compare what different pixels saw of the same places.
+    """Compare what different pixels saw of the same places, along a motion known to a few pixels.
 
     A square c of the scene sends `exposure exp(s_c + l_t + sum_k a_k b_k(x))` photons in the span t, in which it lies at the
     pixel x of the sensor. The knots a_k of the logarithm of the gain are found by iterated least squares, together with the
     light l_t; the brightness s_c is eliminated. Their prior is a Gaussian whose spread is that of the knots themselves, so that
     what the motion leaves open stays flat, as does the field of a sensor whose pixels are alike.
-
-    Args:
-        source: the capture.
-        trajectory: its motion, known to a few pixels.
-        context: threads.
 
     Raises:
         InputError: the motion cannot tell the gain from the scene, or the camera turns too far for a plane.
@@ -73,8 +63,7 @@ def measure_pixel_gain(source: Source, trajectory: Trajectory, context: Context)
         )
     knots = _Knots.of(shape)
     places = _on_sensor(seen, inverse(trajectory.at(seen.instants)), seen.to_cells)
-    found = _solved(seen, knots.basis(places), knots.correlation())
-    log_gain, variance = knots.image(found.mean, found.covariance, source.valid)
+    log_gain, variance = knots.image(*_solved(seen, knots.basis(places), knots.correlation()), source.valid)
     gain = np.exp(log_gain)
     gain /= gain[source.valid].mean()
     return PixelGain(gain.astype(np.float32), np.sqrt(variance).astype(np.float32), seen.spans)
@@ -85,24 +74,19 @@ def _on_sensor(seen: SeenCells, to_frames: FloatArray, to_cells: Homography) -> 
     rows, columns = np.divmod(seen.cells, seen.shape[1])
     places = np.empty((len(seen.cells), 2))
     cells: FloatArray = np.stack([columns, rows], axis=-1).astype(float)
-    middles = apply(inverse(to_cells), cells)
+    middles = transform_points(inverse(to_cells), cells)
     for time, homography in enumerate(to_frames):
         of_time = seen.times == time
-        places[of_time] = apply(homography, middles[of_time])
+        places[of_time] = transform_points(homography, middles[of_time])
     return places
 
 
 @dataclass(frozen=True, slots=True)
 class _Knots:
-    """A grid of knots from corner to corner of the frame.
+    """A grid of knots from corner to corner of the frame."""
 
-    Attributes:
-        frame_shape: (height, width).
-        shape: (rows, columns).
-    """
-
-    frame_shape: tuple[int, int]
-    shape: tuple[int, int]
+    frame_shape: tuple[int, int]  # (height, width)
+    shape: tuple[int, int]  # (rows, columns)
 
     @classmethod
     def of(cls, frame_shape: tuple[int, int]) -> _Knots:
@@ -140,20 +124,8 @@ class _Knots:
         return np.stack([row @ mean for row in rows]), np.maximum(np.stack(variance), 0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
-    """The knots: (K,), and their covariance."""
-
-    mean: FloatArray
-    covariance: FloatArray
-
-
-def _solved(seen: SeenCells, basis: Any, correlation: FloatArray) -> _Solved:
-    """Solve for the knots.
-
-    Raises:
-        InputError: they stay unknown.
-    """
+def _solved(seen: SeenCells, basis: Any, correlation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Solve for the mean (K,) and covariance (K, K) of the knots, or raise an `InputError` if they stay unknown."""
     n_times, n_knots = len(seen.spans), basis.shape[1]
     root = np.linalg.cholesky(correlation)
     every, ones = np.arange(len(seen.cells)), np.ones(len(seen.cells))
@@ -196,15 +168,11 @@ def _solved(seen: SeenCells, basis: Any, correlation: FloatArray) -> _Solved:
         # Smoothed squares share photons: their residuals are small, and correlated.
         noise = max(float(np.sqrt(np.mean(left**2))) * SMOOTHING, 1e-9)
     _require_known(information, correlation)
-    return _Solved(mean, covariance)
+    return mean, covariance
 
 
 def _require_known(information: FloatArray, correlation: FloatArray) -> None:
-    """Refuse a gain that stays unknown.
-
-    Raises:
-        InputError: photons and motion do not determine enough of its variance.
-    """
+    """Raise an `InputError` if photons and motion do not determine enough of the variance of the gain."""
     seen = np.diag(information) > 0
     left = np.linalg.inv(information + np.linalg.inv(correlation * _WIDEST**2))
     # The mean of the gain is that of the scene.

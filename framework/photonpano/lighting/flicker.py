@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from photonpano.lighting.gains import STRUCTURE, Gains, SeenCells
+from photonpano.lighting.gains import STRUCTURE, Gains, SeenCells, equations_of_groups
 from photonpano.values import FloatArray, FluxImage
 
 _PERIODS = 2.5  # periods for which a place must be in view
@@ -25,19 +25,12 @@ _MOST = 1.5  # largest amplitude, relative to the mean light of a place
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalFlicker:
-    """The flicker of each square of the scene: `1 + cosine cos(2 pi f t) + sine sin(2 pi f t)` of its mean light.
+    """The flicker of each square of the scene: `1 + cosine cos(2 pi f t) + sine sin(2 pi f t)` of its mean light."""
 
-    Attributes:
-        frequency: f, in cycles per frame.
-        cosine: (h, w) float32.
-        sine: (h, w) float32.
-        slow: (S,) gain of the spans, over which it does not flicker.
-    """
-
-    frequency: float
-    cosine: FluxImage
-    sine: FluxImage
-    slow: FloatArray
+    frequency: float  # f, in cycles per frame
+    cosine: FluxImage  # (h, w) float32
+    sine: FluxImage  # (h, w) float32
+    slow: FloatArray  # (S,) gain of the spans, over which it does not flicker
 
 
 def local_frequency(gains: Gains) -> float:
@@ -113,12 +106,7 @@ def _is_local(gains: Gains, frequency: float) -> bool:
 
 
 def measure_local_flicker(gains: Gains, frequency: float) -> LocalFlicker:
-    """Fit the amplitude and the phase of each square of the scene.
-
-    Args:
-        gains: of spans much shorter than a period.
-        frequency: in cycles per frame.
-    """
+    """Fit the amplitude and the phase of each square of the scene at a frequency; spans must be much shorter than a period."""
     seen = gains.seen
     lengths = np.array([len(span) for span in seen.spans], float)
     phase = 2 * np.pi * frequency * seen.instants
@@ -156,12 +144,7 @@ def _fitted(seen: SeenCells, waves: FloatArray, slow: FloatArray) -> FloatArray:
     exposure = seen.exposure * slow[seen.times]
     weight = 1 / (flux[seen.cells] / exposure + (STRUCTURE * flux[seen.cells]) ** 2)
     columns = waves[:, seen.times]
-    normal = np.zeros((seen.n_cells, 3, 3))
-    right = np.zeros((seen.n_cells, 3))
-    for i in range(3):
-        right[:, i] = np.bincount(seen.cells, weight * columns[i] * seen.photons / exposure, seen.n_cells)
-        for j in range(3):
-            normal[:, i, j] = np.bincount(seen.cells, weight * columns[i] * columns[j], seen.n_cells)
+    normal, right = equations_of_groups(seen.cells, seen.n_cells, columns, weight, seen.photons / exposure)
     normal[:, 0, 0] += 1e-12
     for i in (1, 2):
         normal[:, i, i] += 1 / (_SPREAD * flux) ** 2

@@ -42,24 +42,15 @@ _WIDEST = np.pi / 2  # widest field of view, in radians, of which squares lie on
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenCells:
-    """Photons of squares of the scene in spans of frames: N observations of C squares in S spans.
-
-    Attributes:
-        spans: the spans.
-        cells: (N,) index of the square, below `n_cells`.
-        times: (N,) index of the span.
-        photons: (N,) photons, those that a saturated pixel missed included.
-        exposure: (N,) pixels times frames.
-        shape: (h, w) rows and columns of squares, C in all.
-        to_cells: (3, 3), pixels of the reference plane to squares: integers are their middles. None if they lie on a sphere.
-    """
+    """Photons of squares of the scene in spans of frames: N observations of C squares in S spans."""
 
     spans: tuple[FrameSpan, ...]
-    cells: NDArray[np.intp]
-    times: NDArray[np.intp]
-    photons: FloatArray
-    exposure: FloatArray
-    shape: tuple[int, int]
+    cells: NDArray[np.intp]  # (N,) index of the square, below `n_cells`
+    times: NDArray[np.intp]  # (N,) index of the span
+    photons: FloatArray  # (N,) photons, those that a saturated pixel missed included
+    exposure: FloatArray  # (N,) pixels times frames
+    shape: tuple[int, int]  # (h, w) rows and columns of squares, C in all
+    # (3, 3), pixels of the reference plane to squares: integers are their middles. None if they lie on a sphere.
     to_cells: Homography | None
 
     @property
@@ -75,23 +66,14 @@ class SeenCells:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gains:
-    """The light of spans of frames, up to a common factor.
-
-    Attributes:
-        seen: the observations.
-        logarithm: (S,) of the gain, 0 on average.
-        std: (S,) its standard deviation.
-        brightness: (C,) logarithm of the flux of each square in light of gain 1; NaN for squares that were not seen.
-        change: root mean square of the change of the light between spans that see the same places, noise subtracted.
-        shifted: (N,) logarithm of what errors of the motion change in each observation.
-    """
+    """The light of spans of frames, up to a common factor."""
 
     seen: SeenCells
-    logarithm: FloatArray
-    std: FloatArray
-    brightness: FloatArray
-    change: float
-    shifted: FloatArray
+    logarithm: FloatArray  # (S,) of the gain, 0 on average
+    std: FloatArray  # (S,) its standard deviation
+    brightness: FloatArray  # (C,) logarithm of the flux of each square in light of gain 1; NaN for squares that were not seen
+    change: float  # root mean square of the change of the light between spans that see the same places, noise subtracted
+    shifted: FloatArray  # (N,) logarithm of what errors of the motion change in each observation
 
     @property
     def gain(self) -> FloatArray:
@@ -101,13 +83,9 @@ class Gains:
 
 
 def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan], context: Context) -> SeenCells:
-    """Sum the photons of squares of the scene in spans of frames, along a motion.
+    """Sum the photons of squares of the scene in spans of frames, along a motion known to a few pixels.
 
-    Args:
-        source: the capture.
-        trajectory: its motion, known to a few pixels.
-        spans: so short that the image hardly moves in them; those that a plane can hardly show are left out.
-        context: threads.
+    The image must hardly move in a span; spans that a plane can hardly show are left out.
     """
     shape = source.info.frame_shape
     motions = trajectory.at([span.centre for span in spans])
@@ -139,18 +117,13 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
 
 
 def _least_weight(source: Source, side: int) -> float:
-    """Return what the faintest square of the sensor is worth: masked pixels, and those of faint colours, cover less everywhere.
-
-    Args:
-        source: the capture.
-        side: of a square, px.
-    """
+    """Return the least weight of a square of `side` px: masked pixels, and those of faint colours, weigh less."""
     weights = weights_of(source)
     if weights is None:
         return 1.0
-    worth, valid = (cv2.blur(each, (side, side)) for each in (weights, source.valid.astype(np.float32)))
+    weight, valid = (cv2.blur(each, (side, side)) for each in (weights, source.valid.astype(np.float32)))
     inside = valid >= min(0.5, float(valid.max()))
-    return float((worth[inside] / valid[inside]).min() * source.valid.mean())
+    return float((weight[inside] / valid[inside]).min() * source.valid.mean())
 
 
 def _seen(
@@ -158,12 +131,8 @@ def _seen(
 ) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
     """Return the squares that a span sees, the photons in them, and their exposures in frames and pixels.
 
-    Args:
-        source: the capture.
-        canvas: two pixels are the side of a square.
-        half: pixels of a frame in a pixel of the canvas.
-        covered: least share of the frames in which a square is seen.
-        place: the span, and where its frames lie.
+    A square has the side of two pixels of the canvas, each of which has the side of `half` pixels of a frame; it is seen in
+    the share `covered` of the frames at least. `place` is the span, and where its frames lie.
     """
     span, homography = place
     summed = accumulate(source, [Chunk(span, homography)], canvas, canvas.shape)
@@ -198,7 +167,8 @@ def solve_gains(seen: SeenCells) -> Gains:
     the motion between these steps.
     """
     n_times = len(seen.spans)
-    brightness, light = _first_guess(seen)
+    photons, exposure = (np.bincount(seen.cells, each, seen.n_cells) for each in (seen.photons, seen.exposure))
+    brightness, light = np.log((photons + 0.5) / np.maximum(exposure, 1)), np.zeros(n_times)
     shifted = np.zeros(len(seen.photons))
     robust = np.ones(len(seen.photons))
     for _ in range(_ROUNDS):
@@ -238,30 +208,24 @@ def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: 
     image = np.where(unseen, np.nan, brightness).reshape(seen.shape)
     gradient = np.stack([np.nan_to_num(each).ravel() for each in np.gradient(image)])[:, seen.cells]
     columns = np.concatenate([gradient, np.ones((1, len(left)))])
-    normal = np.empty((len(seen.spans), 3, 3))
-    right = np.empty((len(seen.spans), 3))
-    for i in range(3):
-        right[:, i] = np.bincount(seen.times, weight * columns[i] * left, len(seen.spans))
-        for j in range(3):
-            normal[:, i, j] = np.bincount(seen.times, weight * columns[i] * columns[j], len(seen.spans))
+    normal, right = equations_of_groups(seen.times, len(seen.spans), columns, weight, left)
     shift = np.linalg.solve(normal + np.eye(3), right[..., None])[:, :2, 0]
     return np.asarray((shift[seen.times].T * gradient).sum(axis=0))
 
 
-def _first_guess(seen: SeenCells) -> tuple[FloatArray, FloatArray]:
-    """Return the brightness of each square in steady light, and no change of the light."""
-    photons = np.bincount(seen.cells, seen.photons, seen.n_cells)
-    exposure = np.bincount(seen.cells, seen.exposure, seen.n_cells)
-    flux = (photons + 0.5) / np.maximum(exposure, 1)
-    return np.log(flux), np.zeros(len(seen.spans))
+def equations_of_groups(
+    groups: NDArray[np.intp], number: int, columns: FloatArray, weight: FloatArray, target: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the least-squares equations of each group of observations, for K columns (K, N): (G, K, K) and (G, K)."""
+    normal = np.array([[np.bincount(groups, weight * one * other, number) for other in columns] for one in columns])
+    right = np.array([np.bincount(groups, weight * one * target, number) for one in columns])
+    return np.moveaxis(normal, -1, 0), right.T
 
 
 def _step(seen: SeenCells, weight: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Solve `step = s_c + l_t` for both.
+    """Solve `step = s_c + l_t` for changes of the light (S,) and of the squares (C,).
 
-    Returns:
-        Changes of the light, (S,), and of the squares, (C,); the covariance of the light, (S, S); and how much two spans saw of
-        the same squares, (S, S), in weights.
+    Also return the covariance of the light, (S, S), and how much two spans saw of the same squares, (S, S), in weights.
     """
     n_times = len(seen.spans)
     matrix = np.zeros((seen.n_cells, n_times))

@@ -15,9 +15,6 @@ from .configs import KeypointConfig as KeypointConfig
 from .configs import MatchingConfig as MatchingConfig
 from .configs import PointLimits as PointLimits
 from .configs import PyramidConfig as PyramidConfig
-from .fitting import MIN_NOISE_PX as MIN_NOISE_PX
-from .fitting import Fit as Fit
-from .fitting import fit_homography as fit_homography
 from .following import Follows as Follows
 from .following import follows as follows
 from .images import motion_from_images as motion_from_images
@@ -28,8 +25,11 @@ from .phase import shift_between as shift_between
 from .phase import shift_by_phase as shift_by_phase
 from .phase import shift_of_spectra as shift_of_spectra
 from .point_locator import PointLocator as PointLocator
+from .points import MIN_NOISE_PX as MIN_NOISE_PX
+from .points import Fit as Fit
 from .points import Matches as Matches
 from .points import consensus_of as consensus_of
+from .points import fit_homography as fit_homography
 from .points import motion_from_points as motion_from_points
 from .points import too_few_matches as too_few_matches
 from .turns import TurnInformation as TurnInformation

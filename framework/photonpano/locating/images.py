@@ -148,11 +148,7 @@ def _common_curvature(
 
 
 def _conversions(homography: Homography, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Return the Jacobians of small steps in unit coordinates of the moving image.
-
-    Returns:
-        (8, 8) derivatives of the mapped corners with respect to a step, and (8, 8) those of a step with respect to p1..p8.
-    """
+    """Return the derivatives (8, 8) of mapped corners by a small step in unit coordinates, and of a step by p1..p8."""
     rows = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
     to_corners = slopes(homography @ rows, homography @ generators(shape) @ rows)
     return to_corners, np.asarray(np.linalg.solve(to_corners, jacobian(homography, corners(shape)).reshape(8, 8)))

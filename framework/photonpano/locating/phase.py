@@ -35,16 +35,11 @@ def shift_between(moving: View, fixed: View, peak_px: float = 1.5) -> FloatArray
 def shift_by_phase(
     moving: NDArray[np.float32], fixed: NDArray[np.float32], peak_px: float, gaussian_peak: bool = True
 ) -> FloatArray | None:
-    """Return the shift (x, y) in px between two windowed images of mean 0; None without texture.
+    """Return the shift (x, y) in px between two windowed images of mean 0, (H, W) and 0 at the borders; None without texture.
 
     The inverse transform of the normalised cross-power spectrum peaks at the shift. All frequencies have the same weight in it,
-    also those that hold only noise; so it is blurred, which makes the peak a Gaussian.
-
-    Args:
-        moving: (H, W) image, 0 at the borders.
-        fixed: (H, W) the other image.
-        peak_px: standard deviation of the peak, in px.
-        gaussian_peak: whether the peak is located by a Gaussian through three values, and not by a parabola.
+    also those that hold only noise; so it is blurred, which makes the peak a Gaussian of the standard deviation `peak_px`. It
+    is located by a Gaussian through three values, or by a parabola.
     """
     return shift_of_spectra(fft.rfft2(moving), fft.rfft2(fixed), moving.shape, peak_px, gaussian_peak)
 
@@ -56,15 +51,7 @@ def shift_of_spectra(
     peak_px: float,
     gaussian_peak: bool = True,
 ) -> FloatArray | None:
-    """Return the shift (x, y) in px between two images from their spectra: see `shift_by_phase`.
-
-    Args:
-        moving: (H, W // 2 + 1) spectrum of the image.
-        fixed: (H, W // 2 + 1) of the other one.
-        shape: (height, width) of the images.
-        peak_px: standard deviation of the peak, in px.
-        gaussian_peak: whether the peak is located by a Gaussian through three values, and not by a parabola.
-    """
+    """Return the shift (x, y) in px between two images (H, W) from their spectra, (H, W // 2 + 1): see `shift_by_phase`."""
     surface = correlation_surface(fixed * moving.conj(), shape, peak_px)
     if surface is None:
         return None

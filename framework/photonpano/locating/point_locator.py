@@ -46,7 +46,10 @@ class PointLocator(ABC):
             frame uncertain, or when no camera moves like that.
         """
         motion = self._homography(moving, fixed, initial)
-        if self._camera_matrix is None or (isinstance(motion, Located) and _agreeing(motion) >= _DETERMINED):
+        if self._camera_matrix is None:
+            return motion
+        # The number that agreed at first: near their final motion some matches are chance.
+        if isinstance(motion, Located) and motion.evidence.get("agreeing", motion.evidence["inliers"]) >= _DETERMINED:
             return motion
         matches = self._matches(moving, fixed, initial)
         evidence = {name: number for name, number in motion.evidence.items() if name.startswith("keypoints")}
@@ -62,8 +65,3 @@ class PointLocator(ABC):
     @abstractmethod
     def _matches(self, moving: Any, fixed: Any, initial: Homography | None) -> Iterator[Matches]:
         """Yield the matches near the positions that `initial` predicts if there is one, then those in the whole image."""
-
-
-def _agreeing(motion: Located) -> float:
-    """Return the number of matches that agreed at first: near their final motion some matches are chance."""
-    return motion.evidence.get("agreeing", motion.evidence["inliers"])

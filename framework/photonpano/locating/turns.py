@@ -14,16 +14,12 @@ _UNKNOWN = 1.0
 
 
 class TurnInformation(NamedTuple):
-    """Information of a pair of exposures on the rotation between them.
+    """Information of a pair of exposures on the rotation between them."""
 
-    Attributes:
-        information: (8, 8) inverse covariance of p1..p8 of the homography. Only a turn is known: what else could have happened
-            to the image is uncertain by a whole image.
-        std_px: expected error of a corner if the camera has only turned.
-    """
-
+    # (8, 8) inverse covariance of p1..p8 of the homography. Only a turn is known: what else could have happened to the image is
+    # uncertain by a whole image.
     information: FloatArray
-    std_px: float
+    std_px: float  # expected error of a corner if the camera has only turned
 
 
 def turn_slopes(homography: Homography, camera_matrix: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ from photonpano.merging.accumulate import PhotonSum, accumulate, divided
 from photonpano.merging.binning import binned_mean, binning_of
 from photonpano.merging.chunks import Chunk, CountsCache, chunks_of, clipped
 from photonpano.merging.light import LightTerms, LitFrames, gain_image
-from photonpano.merging.merge_renderer import MergeRenderer
+from photonpano.merging.panorama import MergeRenderer
 
 __all__ = [
     "Chunk",

@@ -16,7 +16,7 @@ from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range,
 from photonpano.protocols import Source, Trajectory
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Response
 
-_INSTANTS = 64  # largest number of instants at which the corrections of the sensor are laid on the canvas
+_INSTANTS = 64  # largest number of instants at which the corrections of the sensor are warped onto the canvas
 _LARGEST_PX = 1024  # longer side of the maps of corrections on a canvas; those of a larger canvas are coarser than its pixels
 _BLOCK = 2**18  # values of a tile that are looked at at once
 _EVEN = 1e-4  # corrections that differ by less than this are one number
@@ -28,31 +28,17 @@ class CanvasNoise:
     """Noise model of a canvas: all that its noise depends on beside flux and weight.
 
     A correction multiplies the counts of a pixel by `slope` and adds `offset` for each frame: see `flux_std`.
-
-    Attributes:
-        response: the response of the camera.
-        slope: one number, or a map of the canvas, coarser by `reduction`: (h, w), or (h, w, 3) in colour.
-        offset: as `slope`.
-        reduction: pixels of the canvas per pixel of the maps, along each side.
-        averaging: how far interpolation lowers the noise; None without motion.
     """
 
     response: Response
-    slope: Factor = 1.0
-    offset: Factor = 0.0
-    reduction: float = 1.0
-    averaging: Averaging | None = None
+    slope: Factor = 1.0  # one number, or a map of the canvas, coarser by `reduction`: (h, w), or (h, w, 3) in colour
+    offset: Factor = 0.0  # as `slope`
+    reduction: float = 1.0  # pixels of the canvas per pixel of the maps, along each side
+    averaging: Averaging | None = None  # how far interpolation lowers the noise; None without motion
 
     @classmethod
     def of(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
-        """Lay the noise of a source on a canvas, as it is on average over the frames that see each place.
-
-        Args:
-            source: the capture.
-            trajectory: frame pixels to reference pixels.
-            span: the frames that are rendered.
-            canvas: the pixel grid.
-        """
+        """Average the noise model of a capture over the frames of a span that see each place of a canvas."""
         capture = capture_of(source)
         averaging = Averaging.of(trajectory, span, capture.info.frame_shape, canvas, capture.camera)
         if capture.colour is None:
@@ -63,40 +49,33 @@ class CanvasNoise:
         return cls(capture.response, slope, offset, max(each.reduction for each in colours), averaging)
 
     @classmethod
-    def _corrected(cls, source: Capture, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
-        """Lay the corrections of a source on a canvas."""
-        if not source.corrects_sums:
-            return cls(source.response)
-        none = np.zeros(source.info.frame_shape, np.uint32)
-        offset = np.asarray(source.corrected(none, 1), np.float32)
-        slope = np.asarray(source.corrected(none + 1, 1) - offset, np.float32)
-        valid = source.valid
-        if source.weight is not None:
+    def _corrected(cls, capture: Capture, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
+        """Average the corrections of a capture over the frames that see each place of a canvas."""
+        if not capture.corrects_sums:
+            return cls(capture.response)
+        none = np.zeros(capture.info.frame_shape, np.uint32)
+        offset = np.asarray(capture.corrected(none, 1), np.float32)
+        slope = np.asarray(capture.corrected(none + 1, 1) - offset, np.float32)
+        valid = capture.valid
+        if capture.weight is not None:
             # A count of weight w adds w to the weight and w^2 times its variance: in frames of weight 1, w times its variance.
-            slope, offset = slope * source.weight, offset * source.weight
+            slope, offset = slope * capture.weight, offset * capture.weight
         means = float(slope[valid].mean()), float(offset[valid].mean())
         if max(np.ptp(slope[valid]), np.ptp(offset[valid])) < _EVEN:
-            return cls(source.response, *means)
+            return cls(capture.response, *means)
         reduction = max(1.0, max(canvas.shape) / _LARGEST_PX)
         height, width = (int(np.ceil(side / reduction)) for side in canvas.shape)
         instants = np.unique(np.linspace(span.start, span.stop - 1, min(len(span), _INSTANTS)).round())
         coarse = replace(canvas, height=height, width=width, transform=rescaling(1 / reduction) @ canvas.transform)
-        sums, share = laid(coarse, source.camera, trajectory.at(instants), (slope, offset), valid)
+        sums, share = laid(coarse, capture.camera, trajectory.at(instants), (slope, offset), valid)
         on_slope, on_offset = (
             np.asarray(np.where(share > 0, total / np.maximum(share, np.float32(1e-6)), mean), np.float32)
             for total, mean in zip(sums, means, strict=True)
         )
-        return cls(source.response, on_slope, on_offset, reduction)
+        return cls(capture.response, on_slope, on_offset, reduction)
 
     def std(self, flux: FluxImage, weight: FluxImage, top: int = 0, left: int = 0) -> FluxImage:
-        """Return the standard deviation of the flux of a part of the canvas.
-
-        Args:
-            flux: (h, w) or (h, w, 3).
-            weight: the same shape.
-            top: first row of the part.
-            left: first column.
-        """
+        """Return the standard deviation of the flux, (h, w) or (h, w, 3), of a part of the canvas from `top`, `left` on."""
         slope, offset = (self._part(each, flux, top, left) for each in (self.slope, self.offset))
         std = flux_std(flux, weight, self.response, slope, offset)
         if self.averaging is None:
@@ -126,17 +105,10 @@ class CanvasNoise:
 def laid(
     canvas: Canvas, camera: Camera | None, homographies: FloatArray, images: Sequence[FluxImage], valid: BoolArray
 ) -> tuple[FluxImage, FluxImage]:
-    """Lay images that move with a camera on a canvas, and add them up.
+    """Warp images that move with a camera onto a canvas, and add them up: (K, H, W), and what is known, (H, W).
 
-    Args:
-        canvas: the grid.
-        camera: of the frames; None if it is not known.
-        homographies: (N, 3, 3), (ideal) pixels of the frame to pixels of the reference plane at N instants.
-        images: K images of a frame, (h, w) each.
-        valid: (h, w), True where they are known.
-
-    Returns:
-        The sums of the images, (K, H, W), and of what is known, (H, W).
+    `homographies` (N, 3, 3) map (ideal) pixels of the frame to pixels of the reference plane at N instants; the K images are
+    (h, w), known where `valid`.
     """
     sums, share = np.zeros((len(images), *canvas.shape), np.float32), np.zeros((1, *canvas.shape), np.float32)
     grid, once, never = Grid.zeros(canvas, 1)._replace(coverages=share), np.ones(1), np.zeros(1)
@@ -159,23 +131,14 @@ def _stacked(factors: list[Factor]) -> Factor:
 
 @dataclass(slots=True)
 class DynamicRange:
-    """The range of flux in a panorama, gathered tile by tile.
+    """The range of flux in a panorama, gathered tile by tile."""
 
-    Attributes:
-        noise: of its canvas.
-        low: the lowest flux that exceeds its standard deviation; infinite before there is one.
-        high: the highest.
-        n_saturated: number of values of pixels that were lit in every frame.
-        n_seen: number of values of pixels that were seen.
-        frames: frames that saw each value, added up.
-    """
-
-    noise: CanvasNoise
-    low: float = float("inf")
-    high: float = 0.0
-    n_saturated: int = 0
-    n_seen: int = 0
-    frames: float = 0.0
+    noise: CanvasNoise  # of its canvas
+    low: float = float("inf")  # the lowest flux that exceeds its standard deviation; infinite before there is one
+    high: float = 0.0  # the highest
+    n_saturated: int = 0  # number of values of pixels that were lit in every frame
+    n_seen: int = 0  # number of values of pixels that were seen
+    frames: float = 0.0  # frames that saw each value, added up
 
     def add(self, flux: FluxImage, weight: FluxImage, top: int, left: int) -> None:
         """Add a tile, row by row so that it takes little memory."""

@@ -36,19 +36,12 @@ _TURN = 360
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """How a panorama is projected.
+    """How a panorama is projected."""
 
-    Attributes:
-        projection: "planar", "cylindrical", "spherical", or "auto".
-        level: whether the horizon is level, or that of the reference frame.
-        camera: of the frames; None if it is not known.
-        turns: whether the camera only turns, so that a cylinder or a sphere can show what it sees.
-    """
-
-    projection: str = "auto"
-    level: bool = False
-    camera: Camera | None = None
-    turns: bool = False
+    projection: str = "auto"  # "planar", "cylindrical", "spherical", or "auto"
+    level: bool = False  # whether the horizon is level, or that of the reference frame
+    camera: Camera | None = None  # of the frames; None if it is not known
+    turns: bool = False  # whether the camera only turns, so that a cylinder or a sphere can show what it sees
 
 
 def plan_canvas(
@@ -63,16 +56,9 @@ def plan_canvas(
 ) -> Canvas:
     """Choose the canvas that holds every frame of a span, or a part of it, before anything of its size is allocated.
 
-    Args:
-        trajectory: the motion, frame pixels to reference pixels.
-        span: the frames to show.
-        frame_shape: (height, width) of a frame.
-        scale: pixels of the canvas per pixel of the reference frame.
-        memory: bytes that rendering may take.
-        bytes_per_pixel: bytes that rendering takes for a pixel of the canvas.
-        extent: the part, by default everything. A box is in pixels of the reference frame on a plane, and in degrees of a and
-            b otherwise.
-        view: how the panorama is projected; on a plane by default.
+    `scale` is pixels of the canvas per pixel of the reference frame, `memory` the bytes that rendering may take, of which a
+    pixel takes `bytes_per_pixel`. A box is in pixels of the reference frame on a plane, and in degrees of a and b otherwise;
+    without a view, the canvas is a plane.
 
     Raises:
         ExtentError: no frame shows the extent.
@@ -89,7 +75,7 @@ def plan_canvas(
         fitting = scale * np.sqrt(MAX_EXCESS / excess)
         raise CanvasTooLargeError(
             f"the panorama would have {canvas.width} x {canvas.height} pixels, {excess:.0f} times what fits into the "
-            f"{_gib(memory)} of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
+            f"{memory / 1024**3:.2g} GiB of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
             "More often means that the motion is wrong. Raise run.memory, "
             f"lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
             "or choose a render.reference nearer to the middle of the motion"
@@ -98,12 +84,7 @@ def plan_canvas(
 
 
 def box_of(extent: Extent, frame_shape: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return the box of a part of a planar panorama, in pixels of the reference frame.
-
-    Args:
-        extent: the part; not the whole panorama.
-        frame_shape: (height, width) of a frame.
-    """
+    """Return the box of a part of a planar panorama, not of the whole one, in pixels of the reference frame."""
     return (0, 0, *frame_shape[::-1]) if isinstance(extent, str) else extent
 
 
@@ -178,11 +159,7 @@ def _plane(
 
 
 def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Canvas:
-    """Return the canvas of a box in pixels of the reference frame.
-
-    Raises:
-        ExtentError: it lies outside the whole canvas.
-    """
+    """Return the canvas of a box in pixels of the reference frame; an `ExtentError` if it lies outside the whole canvas."""
     part = canvas_of_box(box, scale)
     ends = np.array([[0.0, 0.0], [whole.width - 1, whole.height - 1]])
     (left, top), (right, bottom) = np.rint(transform_points(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
@@ -196,11 +173,7 @@ def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Can
 
 
 def _part_around(whole: Canvas, covered: Covered, box: tuple[int, int, int, int]) -> Canvas:
-    """Return the part of a canvas of a cylinder or a sphere between a0, b0 and a1, b1 in degrees.
-
-    Raises:
-        ExtentError: it lies outside the whole canvas, or is more than the sphere.
-    """
+    """Return the part of a canvas of a cylinder or a sphere between a0, b0 and a1, b1 in degrees, or raise an `ExtentError`."""
     a0, b0, a1, b1 = box
     (first, last), (low, high) = np.degrees(covered.a), np.degrees(covered.b)
     if a1 - a0 > _TURN or b0 < -_TURN / 4 or b1 > _TURN / 4:
@@ -220,10 +193,6 @@ def _part_around(whole: Canvas, covered: Covered, box: tuple[int, int, int, int]
     (left, right), (top, bottom) = ((int(np.floor(start + 1e-6)), int(np.ceil(stop - 1e-6))) for start, stop in (across, down))
     origin = np.rint(whole.transform[:2, 2] + 0.5).astype(int)
     return whole.part(left + int(origin[0]), top + int(origin[1]), bottom - top, right - left)
-
-
-def _gib(size: float) -> str:
-    return f"{size / 1024**3:.2g} GiB"
 
 
 def _rounded_down(scale: float) -> float:

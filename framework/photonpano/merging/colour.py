@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture import capture_of
+from photonpano.photometry import frame_variance
 from photonpano.protocols import Source
 from photonpano.values import BoolArray, FloatArray, FluxImage, Panorama, Response
 
@@ -21,21 +22,12 @@ _LARGEST = 8  # neighbourhoods are doubled at most this many times
 _ROUNDS = 3  # times that the sum of the colours, and their ratios to it, follow from each other
 _RATIO_PX = 1.5  # standard deviation of the Gaussian over which the ratio of a colour to the sum of all is averaged
 _WINDOW_PX = 1.5  # standard deviation of the Gaussian over which the detail of a colour's own is measured
-_RELATIVE_STEP = 0.02  # relative step of numerical derivatives
-_MANY_FRAMES = 1e4
+_DARKEST = np.float32(1e-4)  # least flux of which the noise is taken
 _FEWEST_FRAMES = 1e-3
 
 
 def in_colours(source: Source, render: Callable[[Source], Panorama]) -> Panorama:
-    """Render a source; that of a filter array colour by colour.
-
-    Args:
-        source: the capture.
-        render: returns flux and weight of a source on a grid, (H, W) each.
-
-    Returns:
-        What `render` returns; of a capture in colour, flux and weight are (H, W, C), one image for each of its colours.
-    """
+    """Render a source, (H, W), by a function; that of a filter array colour by colour, (H, W, C)."""
     colours = capture_of(source).colours()
     if not colours:
         return render(source)
@@ -50,14 +42,12 @@ def channels_of(source: Source) -> int:
 
 
 def composed(panorama: Panorama, source: Source) -> Panorama:
-    """Return red, green and blue of what `in_colours` rendered; a grey panorama as it is.
+    """Return red, green and blue, (H, W, 3), of what `in_colours` rendered; a grey panorama as it is.
 
     Where a colour was hardly seen, or not at all, it follows from the others: see `filled`. Noise is lower by the detail that
-    the colours share: see `with_shared_detail`. Clear pixels count for all colours: see `with_clear`.
-
-    Returns:
-        Flux and weight are (H, W, 3) for a capture in colour. The weight is the number of frames that saw the place in this
-        colour; it is 0 where the flux was filled. Flux is NaN in all colours where none was seen.
+    the colours share: see `with_shared_detail`. Clear pixels count for all colours: see `with_clear`. The weight is the number
+    of frames that saw the place in this colour; it is 0 where the flux was filled. Flux is NaN in all colours where none was
+    seen.
     """
     capture = capture_of(source)
     if capture.colour is None:
@@ -73,20 +63,13 @@ def composed(panorama: Panorama, source: Source) -> Panorama:
 
 
 def filled(flux: FluxImage, weight: FluxImage) -> FluxImage:
-    """Fill the places that a colour was hardly seen at, from its neighbourhood and from what the other colours show there.
+    """Fill the places that a colour of (H, W, C) was hardly seen at, from its neighbourhood and from the other colours there.
 
     The ratio of colours changes less from place to place than their sum does. The sum at a place is that of the flux expected
     of each colour, times the photons seen there over those expected; at first, the mean around the place is expected. Then the
     flux expected of a colour is the sum, times the ratio of the two where the colour was seen around the place. The
     neighbourhood is as small as it can be with all colours in it. What was seen is averaged with what is expected by the number
-    of frames, so that nothing jumps where the filling begins.
-
-    Args:
-        flux: (H, W, C), NaN where unknown.
-        weight: (H, W, C), in frames.
-
-    Returns:
-        (H, W, C), NaN where nothing was seen.
+    of frames, so that nothing jumps where the filling begins. Flux is NaN where nothing was seen.
     """
     due = _due(weight)
     thin: BoolArray = np.any(weight < due, axis=-1)
@@ -118,19 +101,10 @@ def with_clear(flux: FluxImage, weight: FluxImage, mix: FloatArray, response: Re
     """Correct red, green and blue by what clear pixels saw: the least-squares flux of all four.
 
     With photon noise of the variances v of the colours and u of the clear pixels, whose flux is `c = mix . f`, the flux becomes
-    `f + v mix (c - mix . f) / (u + mix . v mix)`.
-
-    Args:
-        flux: (H, W, 4), the last one clear; finite.
-        weight: (H, W, 4), in frames.
-        mix: (3,) factors of red, green and blue in clear pixels.
-        response: the camera's response, from which the noise follows.
-
-    Returns:
-        (H, W, 3).
+    `f + v mix (c - mix . f) / (u + mix . v mix)`: (H, W, 4), the last one clear, become (H, W, 3).
     """
     colours, clear = flux[..., : len(COLOURS)], flux[..., -1]
-    variance = noise_of_a_frame(flux, response) / np.maximum(weight, np.float32(1e-3))
+    variance = frame_variance(np.maximum(flux, _DARKEST), response) / np.maximum(weight, np.float32(1e-3))
     factors = mix.astype(np.float32)
     gain = variance[..., :-1] * factors
     difference = clear - colours @ factors
@@ -139,7 +113,7 @@ def with_clear(flux: FluxImage, weight: FluxImage, mix: FloatArray, response: Re
 
 
 def with_shared_detail(flux: FluxImage, weight: FluxImage, response: Response) -> FluxImage:
-    """Return the flux of each colour, with less noise where all colours have the same detail.
+    """Return the flux of each colour, (H, W, C), with less noise where all colours have the same detail.
 
     What is expected of a colour is the brightness of the place, from the photons of all colours, times the ratio of the colour
     to the brightness around the place. The flux differs from that by photon noise of the variance v, and by detail of the
@@ -148,14 +122,6 @@ def with_shared_detail(flux: FluxImage, weight: FluxImage, response: Response) -
         expected + e / (e + v) (flux - expected)                        (Wiener 1949)
 
     With many photons it is the flux itself.
-
-    Args:
-        flux: (H, W, C), finite.
-        weight: (H, W, C), in frames.
-        response: the camera's response, from which v follows.
-
-    Returns:
-        (H, W, C), not negative.
     """
     weight = np.maximum(weight, np.float32(_FEWEST_FRAMES))
     photons = flux * weight
@@ -164,21 +130,12 @@ def with_shared_detail(flux: FluxImage, weight: FluxImage, response: Response) -
     luminance = (brightness * mean.sum(axis=-1))[..., None]
     below = np.maximum(_blurred(weight * luminance, _RATIO_PX), np.float32(1e-9))
     expected = luminance * _blurred(photons, _RATIO_PX) / below
-    noise = noise_of_a_frame(np.asarray(expected, np.float32), response) / weight
+    noise = frame_variance(np.asarray(np.maximum(expected, _DARKEST), np.float32), response) / weight
     certain = 1 / np.maximum(noise, np.float32(1e-12))
     difference = flux - expected
     own = _blurred(difference**2 * certain - 1, _WINDOW_PX) / _blurred(certain, _WINDOW_PX)
     own = np.maximum(own, 0)
     return np.asarray(np.maximum(expected + own / np.maximum(own + noise, np.float32(1e-12)) * difference, 0), np.float32)
-
-
-def noise_of_a_frame(flux: FluxImage, response: Response) -> FluxImage:
-    """Return the variance of flux estimated from many frames, times their number, from the scale on which it is uniform."""
-    at = np.maximum(flux, np.float32(1e-4))
-    low, high = (np.asarray(at * factor, np.float32) for factor in (1 - _RELATIVE_STEP, 1 + _RELATIVE_STEP))
-    slope = np.asarray((response.stabilised(high, _MANY_FRAMES) - response.stabilised(low, _MANY_FRAMES)) / (high - low))
-    std = response.stabilised_std(_MANY_FRAMES) / np.maximum(slope, np.float32(1e-9))
-    return np.asarray(_MANY_FRAMES * std**2, np.float32)
 
 
 def _due(weight: FluxImage) -> FluxImage:
@@ -190,11 +147,7 @@ def _due(weight: FluxImage) -> FluxImage:
 def _around(above: FluxImage, below: FluxImage, weight: FluxImage, share: NDArray[np.float32]) -> FluxImage:
     """Return the ratio of two sums over the smallest neighbourhood of each place that has all colours: (H, W, C).
 
-    Args:
-        above: (H, W, C), what is summed above the line.
-        below: (H, W, C), what is summed below it.
-        weight: (H, W, C), in frames.
-        share: (C,) of the frames that saw each colour.
+    `weight` is in frames; `share` (C,) of all frames saw each colour.
     """
     height, width = weight.shape[:2]
     found, known = np.zeros_like(above), np.zeros((height, width), np.bool_)

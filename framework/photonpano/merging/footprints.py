@@ -37,21 +37,14 @@ NO_LENS = Lens(0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, np.inf)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint:
-    """Where a frame lies on a grid, and how it is remapped there.
+    """Where a frame lies on a grid, and how it is remapped there."""
 
-    Attributes:
-        shrink: squares of this many pixels a side are averaged before the warp.
-        to_image: (3, 3), rays of the grid to homogeneous ideal coordinates; on a plane, pixels of the grid.
-        rows: rows of the grid that the frame may touch; empty if it lies outside.
-        columns: columns that it may touch; two ranges where it crosses the seam of a full turn, none where it lies outside.
-        lens: from ideal coordinates to pixels of the averaged frame.
-    """
-
-    shrink: int
-    to_image: Homography
-    rows: range
+    shrink: int  # squares of this many pixels a side are averaged before the warp
+    to_image: Homography  # (3, 3), rays of the grid to homogeneous ideal coordinates; on a plane, pixels of the grid
+    rows: range  # rows of the grid that the frame may touch; empty if it lies outside
+    # columns that it may touch; two ranges where it crosses the seam of a full turn, none where it lies outside
     columns: tuple[range, ...]
-    lens: Lens = NO_LENS
+    lens: Lens = NO_LENS  # from ideal coordinates to pixels of the averaged frame
 
 
 def by_homographies(canvas: Canvas, camera: Camera | None, homographies: FloatArray, frame_shape: tuple[int, int]) -> bool:
@@ -68,14 +61,7 @@ def by_homographies(canvas: Canvas, camera: Camera | None, homographies: FloatAr
 def footprints_of(
     canvas: Canvas, camera: Camera | None, homographies: FloatArray, frame_shape: tuple[int, int]
 ) -> list[Footprint]:
-    """Return the footprint of each frame on a canvas.
-
-    Args:
-        canvas: the grid.
-        camera: of the frames; None if it is not known.
-        homographies: (N, 3, 3), (ideal) pixels of each frame to pixels of the reference plane.
-        frame_shape: (height, width) of a frame.
-    """
+    """Return the footprint of each frame on a canvas; (N, 3, 3) map (ideal) pixels to pixels of the reference plane."""
     if not by_homographies(canvas, camera, homographies, frame_shape):
         return _Remap(canvas, camera if camera is not None and camera.distorts else None, frame_shape).footprints(homographies)
     to_grid = canvas.transform @ homographies

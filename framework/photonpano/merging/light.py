@@ -50,10 +50,6 @@ class LitFrames:
         """Return the flux of each pixel that explains its counts: `counts = sum_c frames_c mean_count(gain_c flux)`.
 
         Frames of one gain, and linear responses, need one step. Saturated pixels get a flux that is finite, and too small.
-
-        Args:
-            counts: (H, W) summed counts.
-            response: the response of the camera.
         """
         frames = np.maximum(self.frames.sum(axis=0), np.float32(1))
         total = np.maximum(self.weight, np.float32(_SEEN))
@@ -118,13 +114,7 @@ class LightTerms:
         return np.asarray((of_class.astype(float) @ values.T).ravel())
 
     def lit_frames(self, coverages: FluxImage, light: Light, onto: Homography | Canvas) -> LitFrames:
-        """Return the frames and gains of each pixel.
-
-        Args:
-            coverages: (number, H, W).
-            light: of the capture.
-            onto: (3, 3), pixels of the reference plane to pixels of the grid; or a canvas of any projection.
-        """
+        """Return the frames and gains of each pixel, from (number, H, W) coverages of a canvas."""
         shape = coverages.shape[1:]
         by_class = coverages.reshape(len(self.present), -1, *shape)
         gains = by_class[:, 1].copy()
@@ -135,13 +125,7 @@ class LightTerms:
 
 
 def amplitudes(light: Light, to_plane: Homography, shape: tuple[int, int]) -> list[FluxImage]:
-    """Return the amplitudes of the lamps at the pixels of a grid: (H, W) for each of the maps.
-
-    Args:
-        light: of the capture.
-        to_plane: (3, 3), pixels of the grid to pixels of the reference plane.
-        shape: (H, W).
-    """
+    """Return the amplitudes of the lamps at the pixels of a grid, whose pixels `to_plane` maps: (H, W) for each of the maps."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = (shape[1], shape[0])
     return [

@@ -1,4 +1,4 @@
-"""Render the panorama: divide its canvas into tiles that fit into memory, render all located frames on each."""
+"""Render the panorama: divide its canvas into tiles that fit into memory, merge all located frames on each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,42 @@ from numpy.typing import NDArray
 from photonpano.context import Context
 from photonpano.errors import ExtentError
 from photonpano.geometry import Canvas, Extent, rescaling
+from photonpano.merging.accumulate import accumulate
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, View, plan_canvas
+from photonpano.merging.chunks import chunks_of
 from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
 from photonpano.merging.light import bytes_of_light
-from photonpano.merging.merge_renderer import MergeRenderer
-from photonpano.photometry import Tone, WhiteBalance, balanced, picture_of
+from photonpano.photometry import Tone, WhiteBalance, balanced, debiased, picture_of
 from photonpano.protocols import Renderer, Source, Trajectory
+from photonpano.threads import InOrder
 from photonpano.values import FluxImage, FrameSpan, Panorama
+
+if TYPE_CHECKING:
+    from photonpano.geometry import Canvas
+
+
+class MergeRenderer:
+    """Warps the photons of all frames to the canvas, and estimates the flux of each pixel once (paper, equation 3)."""
+
+    def __init__(self, in_order: InOrder) -> None:
+        """Take what works on several parts at once, such as that of a `StageContext`; the result does not depend on it."""
+        self._in_order = in_order
+
+    def render(
+        self,
+        source: Source,
+        trajectory: Trajectory,
+        span: FrameSpan,
+        canvas: Canvas,
+        tolerance_px: float,
+        advance: Callable[[int], None],
+    ) -> Panorama:
+        """Merge the frames of a span on a canvas: see `Renderer`."""
+        chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
+        photons = accumulate(source, chunks, canvas, canvas.shape, advance, self._in_order)
+        flux, weight = photons.estimate(source.response)
+        return Panorama(debiased(flux, weight, source.response), weight, canvas.transform)
 
 
 class RenderOptions(Protocol):
@@ -30,60 +58,46 @@ class RenderOptions(Protocol):
     @property
     def scale(self) -> float:
         """Pixels of the panorama per pixel of the reference frame."""
-        ...
 
     @property
     def tolerance_px(self) -> float:
         """Motion within which frames are summed before they are warped, in px of a frame."""
-        ...
 
     @property
     def white_quantile(self) -> float:
         """Quantile of the flux that is white in the picture."""
-        ...
 
     @property
     def white_balance(self) -> WhiteBalance:
         """What makes grey things grey in a picture in colour."""
-        ...
 
     @property
     def extent(self) -> Extent:
         """What the canvas holds."""
-        ...
 
     @property
     def tone(self) -> Tone:
         """How flux becomes the picture."""
-        ...
 
     @property
     def exposure_stops(self) -> float:
         """How much brighter the picture is, in powers of two."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tile:
-    """A part of a canvas.
+    """A part of a canvas."""
 
-    Attributes:
-        left: first column, on the canvas.
-        top: first row, on the canvas.
-        canvas: pixel grid of the tile.
-    """
-
-    left: int
-    top: int
-    canvas: Canvas
+    left: int  # first column, on the canvas
+    top: int  # first row, on the canvas
+    canvas: Canvas  # pixel grid of the tile
 
 
 def tiles_of(canvas: Canvas, memory: int, bytes_per_pixel: int = BYTES_PER_PIXEL) -> tuple[tuple[Tile, ...], int]:
     """Divide the longer side of a canvas into tiles that are rendered one by one within the memory.
 
-    Returns:
-        The tiles, one if the whole canvas fits; and the factor by which a `Thumbnail` that fits beside a tile is smaller than
-        the canvas. Tiles begin at multiples of that factor.
+    Also return the factor by which a `Thumbnail` that fits beside a tile is smaller than the canvas. Tiles begin at multiples
+    of that factor; it is 1 if the whole canvas fits.
     """
     fits = memory // bytes_per_pixel
     n_pixels = canvas.height * canvas.width
@@ -110,19 +124,10 @@ def render(
     context: Context,
     renderer: Renderer | None = None,
 ) -> Panorama:
-    """Render the frames of a span on a canvas that is not divided.
+    """Render the frames of a span on a canvas that is not divided; by default, all frames are merged.
 
     Flux and weight of a capture in colour are (H, W, C), an image for each of its colours; `composed` makes red, green and blue
     of them.
-
-    Args:
-        source: the capture.
-        trajectory: frame pixels to reference pixels.
-        span: the frames to render.
-        canvas: the pixel grid.
-        tolerance_px: motion within which frames are summed before they are warped, in px of a frame.
-        context: threads and progress.
-        renderer: by default, it merges all frames.
     """
     renderer = renderer or MergeRenderer(context.in_order)
     (panorama,) = render_tiles(renderer, source, trajectory, span, [Tile(0, 0, canvas)], tolerance_px, context)
@@ -153,12 +158,7 @@ def render_tiles(
 
 
 class Thumbnail:
-    """A panorama downscaled by a whole factor, put together tile by tile.
-
-    Args:
-        canvas: the canvas that the tiles are parts of.
-        reduction: squares of this many pixels a side are averaged; tiles begin at multiples of it. 1 keeps the only tile.
-    """
+    """A panorama downscaled by a whole factor, put together tile by tile; with a factor of 1, it is the only tile."""
 
     def __init__(self, canvas: Canvas, reduction: int) -> None:
         self._reduction = reduction
@@ -202,29 +202,17 @@ def _averaged(image: NDArray[np.generic], step: int) -> FluxImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedPanorama:
-    """A panorama whose tiles have been written.
+    """A panorama whose tiles have been written."""
 
-    Attributes:
-        canvas: pixel grid of the whole panorama.
-        thumbnail: flux and weight, averaged down by `reduction`.
-        reduction: side of the squares of pixels that are averaged; 1 if the panorama fits into memory.
-        picture: (H, W) or (H, W, 3) uint8, red first, the thumbnail in sRGB.
-        white_flux: flux that is white in the picture, photons per pixel per frame.
-        coverage_share: share of the pixels that were seen.
-        seconds: time of rendering and writing.
-        noise: what the noise depends on, beside flux and weight; None if it was not asked for.
-        dynamic_range: the range of flux; None if it was not asked for.
-    """
-
-    canvas: Canvas
-    thumbnail: Panorama
-    reduction: int
-    picture: NDArray[np.uint8]
-    white_flux: float
-    coverage_share: float
-    seconds: float
-    noise: CanvasNoise | None = None
-    dynamic_range: DynamicRange | None = None
+    canvas: Canvas  # pixel grid of the whole panorama
+    thumbnail: Panorama  # flux and weight, averaged down by `reduction`
+    reduction: int  # side of the squares of pixels that are averaged; 1 if the panorama fits into memory
+    picture: NDArray[np.uint8]  # (H, W) or (H, W, 3) uint8, red first, the thumbnail in sRGB
+    white_flux: float  # flux that is white in the picture, photons per pixel per frame
+    coverage_share: float  # share of the pixels that were seen
+    seconds: float  # time of rendering and writing
+    noise: CanvasNoise | None = None  # what the noise depends on, beside flux and weight; None if it was not asked for
+    dynamic_range: DynamicRange | None = None  # the range of flux; None if it was not asked for
 
 
 def render_panorama(
@@ -240,26 +228,15 @@ def render_panorama(
     view: View | None = None,
     ready: tuple[Canvas, Panorama] | None = None,
 ) -> RenderedPanorama:
-    """Render the frames of a span, in tiles if the panorama exceeds the memory.
+    """Render the frames of a span, in tiles if the panorama exceeds the memory, in bytes.
 
-    Args:
-        renderer: renders each tile.
-        source: the capture.
-        trajectory: the motion, frame pixels to reference pixels.
-        span: the frames to render.
-        options: scale, extent, tolerance, and how the picture is made.
-        memory: bytes that rendering may take.
-        write_tile: called with each tile, its flux and weight, and the whole canvas.
-        context: threads and progress.
-        bytes_per_pixel: bytes that the renderer takes for a pixel of the canvas, in one colour.
-        view: how the panorama is projected; on a plane by default.
-        ready: what `render` would render of the same frames along the same motion, and its canvas; used if it is the same.
+    `write_tile` is called with each tile, its flux and weight, and the whole canvas. `bytes_per_pixel` is what the renderer
+    takes in one colour. What is `ready` was rendered of the same frames along the same motion, on its canvas; it is used if
+    that is the same.
 
     Raises:
         ExtentError: no frame shows the extent.
-        CanvasTooLargeError: the panorama has more than `MAX_EXCESS` times the pixels that fit into memory.
-        LocationError: frames reach the horizon of the reference plane.
-        ProjectionError: the motion does not suit the projection.
+        CanvasTooLargeError, LocationError, ProjectionError: see `plan_canvas`.
     """
     start = time.perf_counter()
     bytes_per_pixel = (bytes_per_pixel + bytes_of_light(source)) * channels_of(source)

@@ -35,36 +35,25 @@ StateT = TypeVar("StateT")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """How well a graph determines its unknowns.
+    """How well a graph determines its unknowns."""
 
-    Attributes:
-        information: (N, k, k) inverse covariances of the motion of each node while the others are held: of p1..p8 of its
-            homography, or of a rotation vector in its own frame. NaN for a single node.
-        std_px: (N,) expected error of the corners of each node, after the best alignment of the planes.
-        std_camera: (5,) expected errors of the camera that all nodes share: of its focal length in px, and of k1, k2, p1 and
-            p2. They are 0 for what is given; () without a camera.
-    """
-
+    # (N, k, k) inverse covariances of the motion of each node while the others are held: of p1..p8 of its homography, or of a
+    # rotation vector in its own frame. NaN for a single node.
     information: FloatArray
-    std_px: FloatArray
+    std_px: FloatArray  # (N,) expected error of the corners of each node, after the best alignment of the planes
+    # (5,) expected errors of the camera that all nodes share: of its focal length in px, and of k1, k2, p1 and p2. They are 0
+    # for what is given; () without a camera.
     std_camera: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """A connected graph whose nodes are to be found.
+    """A connected graph whose nodes are to be found."""
 
-    Attributes:
-        pairs: (E, 2) the moving and the fixed node of each edge.
-        anchor: the node that does not change.
-        motions: the motions of the edges, with their information.
-        frame_shape: (height, width) of a frame.
-    """
-
-    pairs: NDArray[np.integer]
-    anchor: int
-    motions: Sequence[Located]
-    frame_shape: tuple[int, int]
+    pairs: NDArray[np.integer]  # (E, 2) the moving and the fixed node of each edge
+    anchor: int  # the node that does not change
+    motions: Sequence[Located]  # the motions of the edges, with their information
+    frame_shape: tuple[int, int]  # (height, width) of a frame
 
     @property
     def observed(self) -> FloatArray:
@@ -140,12 +129,7 @@ class Adjustment(ABC, Generic[StateT]):
         return np.linalg.solve(homographies[self._fixed], homographies[self._moving])
 
     def minimise(self, state: StateT, kept: BoolArray) -> tuple[StateT, FloatArray]:
-        """Return the state of least cost, and the norm of the whitened residual of each edge, (E,).
-
-        Args:
-            state: where to start.
-            kept: (E,) False for outliers.
-        """
+        """Return the state of least cost, and the norm of the whitened residual of each edge, (E,); outliers are not `kept`."""
         # Equal weights at first: the start fits half of the edges exactly, so that robust weights would reject the others.
         weights = kept.astype(np.float64)
         for _ in range(MAX_ITERATIONS):
@@ -293,15 +277,10 @@ class Adjustment(ABC, Generic[StateT]):
 
 
 def _solved(normal: sparse.csr_array, right: FloatArray, draws: bool = False) -> FloatArray:
-    """Solve a positive semidefinite system; the symmetric ordering keeps the factors of a graph with loop closures sparse.
+    """Solve a positive semidefinite system (N, N) for (N,) or (N, S) right sides; the ordering keeps the factors sparse.
 
-    Unknowns that nothing determines stay where they are: a singular system is damped.
-
-    Args:
-        normal: (N, N).
-        right: (N,) or (N, S).
-        draws: whether the right sides are drawn with `normal` as their covariance; unknowns that nothing determines then get
-            draws as wide as the damping.
+    Unknowns that nothing determines stay where they are: a singular system is damped. If the right sides are `draws` with
+    `normal` as their covariance, such unknowns get draws as wide as the damping.
     """
     with suppress(RuntimeError), np.errstate(all="ignore"):
         solution = _factorised(normal).solve(right)
@@ -335,12 +314,7 @@ def _roots(information: FloatArray) -> FloatArray:
 
 
 def _whitening(motions: Sequence[Located], rows: FloatArray) -> FloatArray:
-    """Return the maps from residuals at the corners, in px, to residuals of unit variance: (E, 8, 8).
-
-    Args:
-        motions: of the edges.
-        rows: (3, 4) the corners in homogeneous coordinates.
-    """
+    """Return the maps from residuals at the corners, (3, 4) in homogeneous px, to residuals of unit variance: (E, 8, 8)."""
     whitening = np.array([np.eye(8) / max(motion.residual_px or 1.0, 1e-3) for motion in motions])
     informed = [index for index, motion in enumerate(motions) if motion.information is not None]
     if informed:

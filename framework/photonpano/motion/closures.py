@@ -35,12 +35,6 @@ def closure_candidates(
 
     An exposure is paired with the best view of each earlier visit: a prominent maximum of the overlap, as a function of time.
     Exposures that are denser than their length are thinned out.
-
-    Args:
-        groups: the groups of the level, in order of their instants.
-        solution: the homographies of the exposures.
-        frame_shape: (height, width) of a frame.
-        graph: the least overlap, as a share of the field of view, and the skips of the pairs that are registered anyway.
     """
     if graph.closure_overlap is None:
         return []
@@ -62,16 +56,10 @@ def closure_candidates(
 
 
 def exposure_similarity(moving: VirtualExposure, fixed: VirtualExposure, homography: FrameHomography) -> float:
-    """Return the similarity of two exposures under a motion: the correlation they would have without photon noise.
+    """Return the correlation of two exposures of one scale that they would have without photon noise, under a motion.
 
-    Args:
-        moving: one exposure.
-        fixed: another one, of the same scale.
-        homography: (3, 3), pixels of the moving exposure's frame to pixels of the fixed one's.
-
-    Returns:
-        1 for the same place, around 0 for different ones; 0 where the overlap is small, or the scene does not stand out from
-        the noise.
+    It is 1 for the same place and around 0 for different ones; 0 where the overlap is small, or the scene does not stand out
+    from the noise.
     """
     height, width = (side // _BLOCK for side in moving.flux.shape)
     if not height * width:

@@ -30,24 +30,16 @@ _START = "If the image turns or shifts at a constant velocity, write motion: {st
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """How much there is to see in an exposure.
+    """Contrast of an exposure."""
 
-    Attributes:
-        signal_to_noise: standard deviation of the scene over that of a pixel's noise, see `photonpano.photometry`.
-        blank: why nothing can be seen in it; None if something can.
-    """
-
-    signal_to_noise: float
-    blank: str | None = None
+    signal_to_noise: float  # standard deviation of the scene over that of a pixel's noise, see `photonpano.photometry`
+    blank: str | None = None  # why nothing can be seen in it; None if something can
 
 
 class UntiedError(LocationError):
     """Too many exposures of a level are not tied to the others.
 
     Attributes:
-        level: from 1.
-        groups: the groups of the level.
-        edges: the pairs that were tried.
         parts: (N,) number of the connected component of each exposure, 0 for the largest.
         merged: returns an exposure by its number; None where they cannot be merged again.
     """
@@ -66,7 +58,7 @@ class UntiedError(LocationError):
 
 
 def contrast_of(exposure: VirtualExposure) -> Contrast:
-    """Measure how much there is to see in an exposure."""
+    """Measure the contrast of an exposure."""
     longest = exposure.weight.max()
     if longest == 0:
         return Contrast(0.0, "no pixel was seen")
@@ -91,23 +83,11 @@ def require_tied(
     merged: Callable[[int], VirtualExposure] | None = None,
     started: bool = True,
 ) -> None:
-    """Refuse a level where too many exposures are not tied to the others.
+    """Raise an `UntiedError` for a level where too many exposures are not tied to the others.
 
     Up to two exposures in a row may be lost, since the motion is interpolated across them. A longer run is an error, unless
-    `disconnected` is "largest". Fewer than two located exposures are always an error.
-
-    Args:
-        level: from 1.
-        groups: the groups of the level.
-        edges: the pairs that were tried.
-        parts: (N,) number of the connected component of each exposure, 0 for the largest.
-        contrasts: how much there is to see in each exposure.
-        disconnected: the option of the spec.
-        merged: returns an exposure by its number, for whoever looks at those that are lost.
-        started: whether a motion was known before the level.
-
-    Raises:
-        UntiedError: names the frames that are lost, those that are tied together, and why pairs failed.
+    `disconnected` is "largest". Fewer than two located exposures are always an error. `parts` (N,) numbers the connected
+    component of each exposure, 0 for the largest; `merged` returns an exposure to whoever looks at those that are lost.
     """
     tied = parts == 0
     if len(groups) == 1:
@@ -140,14 +120,7 @@ def require_tied(
 
 @contextmanager
 def solving(level: int) -> Iterator[None]:
-    """Solve the motion graph in the block; what cannot be computed there is an error of the pairs.
-
-    Args:
-        level: from 1.
-
-    Raises:
-        LocationError: a homography cannot be inverted, or is not finite.
-    """
+    """Raise a `LocationError` if the motion graph cannot be solved in the block: homographies are singular, or not finite."""
     try:
         yield
     except (np.linalg.LinAlgError, ValueError, RuntimeError) as error:
@@ -160,18 +133,7 @@ def solving(level: int) -> Iterator[None]:
 def require_in_front(
     level: int, groups: Sequence[Group], solution: GraphSolution, frame_shape: tuple[int, int], cause: BaseException
 ) -> None:
-    """Refuse a level where exposures reach the horizon of the plane that they are located in.
-
-    Args:
-        level: from 1.
-        groups: the groups of the level.
-        solution: the homography of each exposure.
-        frame_shape: (height, width) of a frame.
-        cause: what went wrong because of it.
-
-    Raises:
-        LocationError: names the frames.
-    """
+    """Raise a `LocationError` from its cause if exposures reach the horizon of the plane that they are located in."""
     points = corners(frame_shape)
     with np.errstate(all="ignore"):
         depths = solution.homographies[:, 2:, :2] @ points.T + solution.homographies[:, 2:, 2:]

@@ -13,8 +13,7 @@ from photonpano.contracts.loop import require_no_standstill, require_valid
 from photonpano.geometry import why_implausible
 from photonpano.motion.closures import exposure_similarity
 from photonpano.motion.diagnosis import Contrast, contrast_of
-from photonpano.motion.level import FrameHomography, NamedLocator
-from photonpano.motion.merge import VirtualExposures
+from photonpano.motion.level import FrameHomography, NamedLocator, VirtualExposures
 from photonpano.motion.pairs import shared_share
 from photonpano.motion.tracking import Place, StartingMotion, Track
 from photonpano.protocols import KeepsHypotheses
@@ -29,19 +28,13 @@ MAX_HYPOTHESES = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Described:
-    """An exposure as it stays in the process that has merged it.
+    """An exposure as it stays in the process that has merged it."""
 
-    Attributes:
-        contrast: of its image.
-        exposure: the exposure itself, for loop closures.
-        features: what locators made of it so far, by their numbers; none of a blank exposure.
-        guard: held while a locator describes it, so that each does so once.
-    """
-
-    contrast: Contrast
-    exposure: VirtualExposure | None = None
+    contrast: Contrast  # of its image
+    exposure: VirtualExposure | None = None  # the exposure itself, for loop closures
+    # what locators made of it so far, by their numbers; none of a blank exposure
     features: dict[int, Any] = field(default_factory=dict)
-    guard: Guard = field(default_factory=Guard)
+    guard: Guard = field(default_factory=Guard)  # held while a locator describes it, so that each does so once
 
 
 # Exposures by their numbers.
@@ -50,50 +43,32 @@ Descriptions: TypeAlias = Mapping[int, Described]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Two exposures to register.
+    """Two exposures to register."""
 
-    Attributes:
-        moving: number of the later exposure.
-        fixed: number of the earlier one.
-        expected: the motion known so far, if any.
-        guessed: whether that is a guess of the first level, from which only locators that keep hypotheses start.
-        closure: whether it is a candidate for a loop closure. The motion known so far may have drifted between its exposures,
-            and does not predict whether the camera is back where it was.
-    """
-
-    moving: int
-    fixed: int
-    expected: FrameHomography | None
-    guessed: bool = False
+    moving: int  # number of the later exposure
+    fixed: int  # number of the earlier one
+    expected: FrameHomography | None  # the motion known so far, if any
+    guessed: bool = False  # whether that is a guess of the first level, from which only locators that keep hypotheses start
+    # whether it is a candidate for a loop closure. The motion known so far may have drifted between its exposures, and does not
+    # predict whether the camera is back where it was.
     closure: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """What a task returns beside its result.
+    """What a task returns beside its result."""
 
-    Attributes:
-        seconds: in each stage.
-        decisions: of components, where it was worked on in another process.
-    """
-
-    seconds: dict[str, float]
-    decisions: tuple[Decision, ...]
+    seconds: dict[str, float]  # in each stage
+    decisions: tuple[Decision, ...]  # of components, where it was worked on in another process
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """Exposures of the first level that were registered with earlier ones.
+    """Exposures of the first level that were registered with earlier ones."""
 
-    Attributes:
-        edges: of each exposure, by its number.
-        places: where each lies.
-        alternatives_px: see `Track`.
-    """
-
-    edges: dict[int, list[Edge]]
-    places: dict[int, Place]
-    alternatives_px: dict[tuple[int, int], float]
+    edges: dict[int, list[Edge]]  # of each exposure, by its number
+    places: dict[int, Place]  # where each lies
+    alternatives_px: dict[tuple[int, int], float]  # see `Track`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,24 +79,15 @@ class ExposureTasks:
 
     Convention:
         All homographies are in pixels of frames; only a locator sees pixels of exposures.
-
-    Attributes:
-        exposures: of the level.
-        independent: the share of the photons of a typical group that no earlier group contains.
     """
 
-    exposures: VirtualExposures
-    independent: float
+    exposures: VirtualExposures  # of the level
+    independent: float  # the share of the photons of a typical group that no earlier group contains
 
     def describe(self, indices: Sequence[int], keep: bool) -> tuple[dict[int, Described], tuple[list[Contrast], Notes]]:
         """Merge exposures, and have the first locator describe them; a blank exposure is not described.
 
-        Args:
-            indices: the numbers of the exposures.
-            keep: whether the exposures themselves are kept.
-
-        Returns:
-            What stays in this process, by exposure; and the contrast of each.
+        Return what stays in this process, by exposure, with the exposures themselves if they are to `keep`; and the contrasts.
         """
         clock, described = Stopwatch(1), dict[int, Described]()
         for index in indices:
@@ -145,13 +111,9 @@ class ExposureTasks:
         places: Mapping[int, Place],
         *described: Descriptions,
     ) -> tuple[Tracked, Notes]:
-        """Register exposures of the first level, in order: first with the nearest partner, whose motion predicts the others.
+        """Register exposures of the first level with earlier ones, in order; the motion to the nearest predicts the others.
 
-        Args:
-            start: see `Track`.
-            partners: the exposures, each with earlier ones.
-            places: of partners that are not among the exposures, and of exposures that were placed before.
-            described: all of them.
+        `places` are those of partners that are not among the exposures, and of exposures that were placed before.
         """
         clock, known = Stopwatch(1), _joined(described)
         track = Track(start, self.exposures.groups, self.exposures.frame_shape, places)

@@ -11,9 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from photonpano.geometry import inverse, nearest_rotations, normalised, scaled_ahead
+from photonpano.geometry import (
+    from_parameters,
+    generators,
+    inverse,
+    nearest_rotations,
+    normalised,
+    parameters,
+    scaled_ahead,
+    unit_coordinates,
+)
 from photonpano.motion.adjustment import Adjustment, Assessment, Problem
-from photonpano.motion.homography_graph import HomographyAdjustment
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
@@ -30,17 +38,14 @@ class GraphOptions(Protocol):
     @property
     def skips(self) -> tuple[float, ...]:
         """Each exposure is registered with those at these distances before and after it, in group lengths."""
-        ...
 
     @property
     def closure_overlap(self) -> float | None:
         """Least overlap of a loop closure, as a share of the field of view; None registers no loop closures."""
-        ...
 
     @property
     def disconnected(self) -> Literal["error", "largest"]:
         """Whether a graph that falls apart is an error, or its largest part is used."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,39 +55,28 @@ class GraphSolution:
     Convention:
         Homographies map pixels of a node's frame to pixels of the anchor's frame; the anchor's is the identity. Those of a
         rotating camera have determinant 1, all others h33 = 1.
-
-    Attributes:
-        homographies: (N, 3, 3), NaN for nodes that are not tied to the anchor.
-        located: (N,) True for nodes that are tied to the anchor.
-        outliers: positions, in the list that was solved, of edges that were dropped because they contradict the others.
-        residual_px: root mean square residual of the other edges at the corners, 0 for a tree.
-        assess: returns how well the L located nodes are determined. It takes about as long as to solve the graph.
-        rotations: of the L located nodes, and their camera; None for homographies.
-        compare: returns how well a rotating camera explains the edges; None where one of the two models is not fitted.
-            For rotations it takes about as long as to solve the graph.
     """
 
-    homographies: FloatArray
-    located: BoolArray
+    homographies: FloatArray  # (N, 3, 3), NaN for nodes that are not tied to the anchor
+    located: BoolArray  # (N,) True for nodes that are tied to the anchor
+    # positions, in the list that was solved, of edges that were dropped because they contradict the others
     outliers: tuple[int, ...]
-    residual_px: float
+    residual_px: float  # root mean square residual of the other edges at the corners, 0 for a tree
+    # returns how well the L located nodes are determined. It takes about as long as to solve the graph.
     assess: Callable[[], Assessment]
-    rotations: Rotations | None = None
+    rotations: Rotations | None = None  # of the L located nodes, and their camera; None for homographies
+    # returns how well a rotating camera explains the edges; None where one of the two models is not fitted. For rotations it
+    # takes about as long as to solve the graph.
     compare: Callable[[], Evidence | None] = lambda: None
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """How well a rotating camera explains the pairs, compared with any homographies.
+    """How well a rotating camera explains the pairs, compared with any homographies."""
 
-    Attributes:
-        rotation: mean square of the whitened residuals of rotations, 1 where they are photon noise.
-        homography: that of homographies.
-        gain: by how much each additional unknown of the homographies lowers the sum of the squares, in units of `homography`.
-    """
-
-    rotation: float
-    homography: float
+    rotation: float  # mean square of the whitened residuals of rotations, 1 where they are photon noise
+    homography: float  # that of homographies
+    # by how much each additional unknown of the homographies lowers the sum of the squares, in units of `homography`
     gain: float
 
     @classmethod
@@ -115,19 +109,11 @@ def solve(
     start: FloatArray | None = None,
     model: MotionModel = HOMOGRAPHIES,
 ) -> GraphSolution:
-    """Solve the graph: find the motions with the least residuals of all located edges.
+    """Solve the graph: find the motions with the least residuals of all located edges; that of the anchor is the identity.
 
     Robust least squares on the corners that each edge maps, weighted by the edge's information where it has one; Gauss-Newton
-    with Cauchy weights, from a tree of edges between near exposures unless a start is given. Outliers are dropped, unless the
-    graph would fall apart, and it is solved again.
-
-    Args:
-        n_nodes: number of exposures.
-        edges: pairs of exposures; those that are not located are skipped.
-        anchor: the node whose homography is the identity.
-        frame_shape: (height, width) of a frame.
-        start: (N, 3, 3) homographies to any plane, such as those of a solution without some of the edges.
-        model: what the motion of a node may be.
+    with Cauchy weights, from a tree of edges between near exposures unless a start is given: (N, 3, 3) homographies to any
+    plane. Outliers are dropped, unless the graph would fall apart, and it is solved again.
     """
     tied = _Tied.of(n_nodes, edges, anchor, frame_shape)
     if not len(tied.motions):
@@ -154,42 +140,25 @@ def _compared(tied: _Tied, start: FloatArray | None, rotating: _Fit) -> tuple[_F
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """A solution of the graph.
-
-    Attributes:
-        adjustment: the problem.
-        state: of least cost.
-        norms: (E,) of the whitened residuals.
-        kept: (E,) False for outliers.
-    """
+    """A solution of the graph."""
 
     adjustment: Adjustment[Any]
-    state: Any
-    norms: FloatArray
-    kept: BoolArray
+    state: Any  # of least cost
+    norms: FloatArray  # (E,) of the whitened residuals
+    kept: BoolArray  # (E,) False for outliers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Tied:
-    """The part of a graph that is tied to its anchor.
+    """The part of a graph that is tied to its anchor."""
 
-    Attributes:
-        located: (N,) which nodes.
-        order: these nodes, the anchor first, each after its parent.
-        parents: (N,) of the nodes: a tree of short edges.
-        positions: (E,) of the located edges between them, in the list that is solved.
-        pairs: (E, 2) their nodes.
-        motions: their motions.
-        frame_shape: (height, width) of a frame.
-    """
-
-    located: BoolArray
-    order: NDArray[np.integer]
-    parents: NDArray[np.integer]
-    positions: NDArray[np.integer]
-    pairs: NDArray[np.integer]
-    motions: Sequence[Located]
-    frame_shape: tuple[int, int]
+    located: BoolArray  # (N,) which nodes
+    order: NDArray[np.integer]  # these nodes, the anchor first, each after its parent
+    parents: NDArray[np.integer]  # (N,) of the nodes: a tree of short edges
+    positions: NDArray[np.integer]  # (E,) of the located edges between them, in the list that is solved
+    pairs: NDArray[np.integer]  # (E, 2) their nodes
+    motions: Sequence[Located]  # their motions
+    frame_shape: tuple[int, int]  # (height, width) of a frame
 
     @classmethod
     def of(cls, n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> _Tied:
@@ -307,3 +276,40 @@ def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:
     """Return the (moving, fixed) of the located edges: (E, 2)."""
     located = [(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)]
     return np.array(located, dtype=int).reshape(-1, 2)
+
+
+class HomographyAdjustment(Adjustment[FloatArray]):
+    """The least-squares problem of a graph whose nodes have any homographies; its state is these, (N, 3, 3) with h33 = 1.
+
+    The unknowns of a node are p1..p8 of a small homography of its own frame, in coordinates of about unit size.
+    """
+
+    _n_node = 8
+
+    def homographies(self, state: FloatArray) -> FloatArray:
+        """Return the state."""
+        return state
+
+    def changed(self, state: FloatArray, nodes: FloatArray, shared: FloatArray) -> FloatArray:
+        """Return the homographies after a step; nothing is shared."""
+        del shared
+        unit = unit_coordinates(self._frame_shape)
+        return normalised(state @ (np.linalg.inv(unit) @ from_parameters(nodes) @ unit))
+
+    def anchored(self, state: FloatArray) -> FloatArray:
+        """Return the homographies, of which the anchor's is the identity."""
+        state[self._anchor] = np.eye(3)
+        return state
+
+    def generators(self, state: FloatArray) -> FloatArray:
+        """Return those of p1..p8 in unit coordinates: (8, 3, 3)."""
+        del state
+        return generators(self._frame_shape)
+
+    def information(self, state: FloatArray, blocks: FloatArray) -> FloatArray:
+        """Convert (N, 8, 8) information on changes of nodes to that on p1..p8 of their homographies."""
+        changed = state[:, None] @ generators(self._frame_shape)
+        slopes = changed - state[:, None] * changed[..., 2:, 2:]
+        to_parameters = parameters(np.eye(3) + slopes).transpose(0, 2, 1)
+        to_change = np.linalg.inv(to_parameters)
+        return np.asarray(to_change.transpose(0, 2, 1) @ blocks @ to_change)

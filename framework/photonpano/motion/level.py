@@ -1,18 +1,21 @@
-"""The components of one level of the loop, and the scale of its exposures."""
+"""The components of one level of the loop, the scale of its exposures, and the merge step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any, NewType
 
 import numpy as np
 
-from photonpano.contracts.attribution import attributing
+from photonpano.contracts.loop import EXPOSURE, Asked
+from photonpano.contracts.rules import attributing
 from photonpano.geometry import Camera, rescaled
-from photonpano.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler
-from photonpano.values import Decision, DecisionValue, FloatArray, Located
+from photonpano.motion.timeline import Timeline
+from photonpano.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler, Source, Trajectory
+from photonpano.threads import Stopwatch
+from photonpano.values import Decision, DecisionValue, FloatArray, Group, Located, VirtualExposure
 
 # In pixels of frames, as in the motion graph and in trajectories.
 FrameHomography = NewType("FrameHomography", FloatArray)
@@ -31,11 +34,7 @@ class Recorder:
         self._decisions, self._waiting = decisions, list[Decision]()
 
     def __call__(self, what: str, value: DecisionValue, reason: str) -> None:
-        """Record a decision.
-
-        Raises:
-            TypeError: the value is no plain one.
-        """
+        """Record a decision; a `TypeError` if its value is no plain one."""
         if not isinstance(value, bool | int | float | str):
             raise TypeError(f"the value of a decision is a number, a text, true or false; {what} is a {type(value).__name__}")
         self.add(Decision(what, value, reason))
@@ -55,50 +54,34 @@ class Recorder:
 
 @dataclass(frozen=True, slots=True)
 class NamedLocator:
-    """A locator of a level.
+    """A locator of a level."""
 
-    Attributes:
-        name: as in the spec; the second of a level with the same name is numbered, such as "opencv-sift 2".
-        component: the locator.
-        origin: who provides it, such as "locator 'opencv-sift' of photonpano 0.1.0".
-    """
-
-    name: str
+    name: str  # as in the spec; the second of a level with the same name is numbered, such as "opencv-sift 2"
     component: Locator
-    origin: str
+    origin: str  # who provides it, such as "locator 'opencv-sift' of photonpano 0.1.0"
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """The components of one level, built.
+    """The components of one level, built."""
 
-    Attributes:
-        number: from 1.
-        scale: pixels of the level's exposures per pixel of a frame.
-        locators: at least one; a pair that one of them does not locate is passed to the next.
-        origins: who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0".
-        recorder: records what they decide.
-    """
-
-    number: int
-    scale: float
+    number: int  # from 1
+    scale: float  # pixels of the level's exposures per pixel of a frame
     resampler: Resampler
     merger: Merger
-    locators: tuple[NamedLocator, ...]
+    locators: tuple[NamedLocator, ...]  # at least one; a pair that one of them does not locate is passed to the next
     interpolator: Interpolator
+    # who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0"
     origins: Mapping[str, str]
-    recorder: Recorder = field(default_factory=Recorder)
+    recorder: Recorder = field(default_factory=Recorder)  # records what they decide
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave out what only the process of the loop needs: the resampler and the interpolator."""
-        return _for_tasks, (self.number, self.scale, self.merger, self.locators, self.origins, self.recorder)
+        components = None, self.merger, self.locators, None
+        return Level, (self.number, self.scale, *components, self.origins, self.recorder)
 
     def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:
-        """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator.
-
-        Raises:
-            PluginError: the component failed, or broke its contract.
-        """
+        """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator: `attributing`."""
         origin = self.origins[component] if isinstance(component, str) else component.origin
         return attributing(origin, f"level {self.number}")
 
@@ -130,13 +113,47 @@ class Level:
         return replace(motion, homography=homography, information=information, residual_px=residual_px)
 
 
-def _for_tasks(
-    number: int,
-    scale: float,
-    merger: Merger,
-    locators: tuple[NamedLocator, ...],
-    origins: Mapping[str, str],
-    recorder: Recorder,
-) -> Level:
-    nothing: Any = None
-    return Level(number, scale, nothing, merger, locators, nothing, origins, recorder)
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualExposures:
+    """The virtual exposures of a level, planned. May be used from several threads."""
+
+    level: Level
+    source: Source
+    groups: Sequence[Group]  # the frames of each exposure
+    previous: Trajectory | None  # the motion known so far; None at the first level
+    clock: Stopwatch  # adds up the time that merging takes
+    timeline: Timeline | None = None  # where the image jumps; None if it is not known to
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """Height and width of a frame."""
+        return self.source.info.frame_shape
+
+    def previous_homographies(self) -> FloatArray | None:
+        """Return the motion known so far at every frame of the capture: (T, 3, 3); None at the first level."""
+        return None if self.previous is None else self.previous.at(np.arange(self.source.info.n_frames))
+
+    def merged(self, index: int, clock: Stopwatch | None = None) -> VirtualExposure:
+        """Merge a group, given by its index, along the motion known so far; a second call merges it again.
+
+        `clock` adds up the time, by default that of the level.
+
+        Raises:
+            PluginError: the merger failed, or returned anything but an exposure of the group at the level's scale.
+        """
+        level = self.level
+        with (clock or self.clock)("merge"), level.attributing("merger"):
+            exposure = level.merger.merge(self.source, self.groups[index], self.previous, level.scale)
+            return EXPOSURE.require(exposure, Asked(self.groups[index], level.scale, self.frame_shape))
+
+
+def merge(
+    level: Level,
+    source: Source,
+    groups: Sequence[Group],
+    previous: Trajectory | None,
+    clock: Stopwatch,
+    timeline: Timeline | None = None,
+) -> VirtualExposures:
+    """Plan the virtual exposures of a level: its groups, merged along the motion known so far (paper, section 4, "Merge")."""
+    return VirtualExposures(level, source, groups, previous, clock, timeline)

@@ -15,8 +15,7 @@ from photonpano.geometry import corner_displacements, inverse
 from photonpano.motion.closures import closure_candidates
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.graph import Evidence, GraphOptions, GraphSolution, components, solve
-from photonpano.motion.level import Level
-from photonpano.motion.merge import VirtualExposures
+from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
@@ -32,32 +31,21 @@ _CONTRADICTION = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedLevel:
-    """The exposures of a level, located.
-
-    Attributes:
-        groups: the groups of the level.
-        edges: every pair that was tried, with its motion or the reason why there is none.
-        closures: the candidates for loop closures among them, which stand at the end.
-        solution: one homography for each exposure.
-        information: (N, 8, 8) inverse covariances of p1..p8 of each located exposure while the others are held, or (N, 3, 3)
-            of its rotation vector for a camera that only turns; None for a single exposure.
-        std_px: (N,) expected error of the corners of each located exposure; NaN for a single one.
-        frame_shape: (height, width) of a frame.
-        std_camera: (5,) expected errors of the camera, see `Assessment`.
-        evidence: how well a camera that only turns explains the pairs, compared with homographies; None where they are not.
-        ambiguity: pairs that fit the scene at more than one place; None where there are none.
-    """
+    """The exposures of a level, located."""
 
     groups: Sequence[Group]
-    edges: tuple[Edge, ...]
-    closures: tuple[Edge, ...]
-    solution: GraphSolution
+    edges: tuple[Edge, ...]  # every pair that was tried, with its motion or the reason why there is none
+    closures: tuple[Edge, ...]  # the candidates for loop closures among them, which stand at the end
+    solution: GraphSolution  # one homography for each exposure
+    # (N, 8, 8) inverse covariances of p1..p8 of each located exposure while the others are held, or (N, 3, 3) of its rotation
+    # vector for a camera that only turns; None for a single exposure
     information: FloatArray | None
-    std_px: FloatArray
-    frame_shape: tuple[int, int]
-    std_camera: FloatArray
+    std_px: FloatArray  # (N,) expected error of the corners of each located exposure; NaN for a single one
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    std_camera: FloatArray  # (5,) expected errors of the camera, see `Assessment`
+    # how well a camera that only turns explains the pairs, compared with homographies; None where they are not
     evidence: Evidence | None
-    ambiguity: Ambiguity | None = None
+    ambiguity: Ambiguity | None = None  # pairs that fit the scene at more than one place; None where there are none
 
     @property
     def instants(self) -> FloatArray:

@@ -8,13 +8,11 @@ from functools import partial
 
 from photonpano.capture import seen_through
 from photonpano.context import Context
-from photonpano.contracts.attribution import AttributedTrajectory
-from photonpano.contracts.loop import KNOTS, knot_errors, require_groups
+from photonpano.contracts.loop import KNOTS, AttributedTrajectory, knot_errors, require_groups
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
-from photonpano.motion.level import Level
+from photonpano.motion.level import Level, VirtualExposures, merge
 from photonpano.motion.locate import LocatedLevel, locate
-from photonpano.motion.merge import VirtualExposures, merge
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
 from photonpano.motion.timeline import Timeline
@@ -26,25 +24,15 @@ from photonpano.values import FloatArray, Group
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelResult:
-    """The motion after one level.
+    """The motion after one level."""
 
-    Attributes:
-        level: its components.
-        groups: the frames of each virtual exposure.
-        located: pairs of exposures, their motions, and the homography of each exposure.
-        trajectory: the motion of every frame; the reference frame's homography is the identity.
-        uncertainty: the expected error of the trajectory.
-        seconds: time spent in each stage.
-        exposures: its virtual exposures, which can be merged again.
-    """
-
-    level: Level
-    groups: tuple[Group, ...]
-    located: LocatedLevel
-    trajectory: Trajectory
-    uncertainty: Uncertainty
+    level: Level  # its components
+    groups: tuple[Group, ...]  # the frames of each virtual exposure
+    located: LocatedLevel  # pairs of exposures, their motions, and the homography of each exposure
+    trajectory: Trajectory  # the motion of every frame; the reference frame's homography is the identity
+    uncertainty: Uncertainty  # the expected error of the trajectory
     seconds: dict[str, float]
-    exposures: VirtualExposures
+    exposures: VirtualExposures  # its virtual exposures, which can be merged again
 
     @property
     def change_px(self) -> float | None:
@@ -70,20 +58,13 @@ def estimate_motion(
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level (paper, section 4).
 
-    `merge` only plans the virtual exposures of a level. `locate` merges each of them in its pool of threads, has it described,
-    and releases it; the description is kept until the last pair of the exposure is registered. Memory therefore does not grow
-    with the number of groups. An exposure that a fallback locator or a loop closure needs is merged again.
+    Virtual exposures are planned first. `locate` merges each of them in its pool of threads, has it described, and releases
+    it; the description is kept until the last pair of the exposure is registered. Memory therefore does not grow with the
+    number of groups. An exposure that a fallback locator or a loop closure needs is merged again.
 
-    Args:
-        source: the capture.
-        levels: the components of each level.
-        graph: which pairs are registered, and whether some exposures may remain disconnected.
-        reference: the frame whose homography is the identity.
-        context: threads, progress, and `on_level`, which is called with each result.
-        until_converged: stop as soon as a level changes the motion by no more than its expected error.
-        previous: the motion that is known so far; None at level 1.
-        timeline: repeated frames, and where the motion is cut; None for a capture without gaps.
-        model: what the motion of the camera may be.
+    The homography of the frame `reference` is the identity. With `until_converged`, the loop ends as soon as a level changes
+    the motion by no more than its expected error. `previous` is the motion known so far; without a timeline, no frame is
+    missing or repeated.
 
     Raises:
         LocationError: too few exposures could be located.
@@ -117,11 +98,7 @@ def through_lens(source: Source, model: MotionModel) -> Source:
 
 
 def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]:
-    """Choose the groups of a level (paper, section 4, "Re-sample").
-
-    Raises:
-        PluginError: the resampler failed, or its groups are not in order, or lie outside the capture.
-    """
+    """Choose the groups of a level (paper, section 4, "Re-sample"), or raise a `PluginError`."""
     with clock("resample"), level.attributing("resampler"):
         return require_groups(level.resampler.groups(n_frames, level.number), n_frames)
 

@@ -1,4 +1,4 @@
-"""What the motion of a camera may be: any homographies, or rotations of one camera."""
+"""The model of the motion: any homographies, or rotations of one camera."""
 
 from __future__ import annotations
 
@@ -16,21 +16,14 @@ _FIRST_FOCAL = 3.0
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
-    """What the motion of a camera may be.
+    """The model of the motion of a camera."""
 
-    Attributes:
-        kind: any homographies, rotations of one camera, or "auto": the model that the pairs support.
-        focal_px: of the camera; None if it is to be found.
-        centre_px: (x, y) of its principal point; None for the middle of the frames.
-        distortion: k1, k2, p1, p2 of its lens; None for those that are to be found.
-        known: the camera that the level before has found.
-    """
-
-    kind: ModelName = "homography"
-    focal_px: float | None = None
-    centre_px: tuple[float, float] | None = None
+    kind: ModelName = "homography"  # any homographies, rotations of one camera, or "auto": the model that the pairs support
+    focal_px: float | None = None  # of the camera; None if it is to be found
+    centre_px: tuple[float, float] | None = None  # (x, y) of its principal point; None for the middle of the frames
+    # k1, k2, p1, p2 of its lens; None for those that are to be found
     distortion: tuple[float | None, float | None, float | None, float | None] = (0.0, 0.0, 0.0, 0.0)
-    known: Camera | None = None
+    known: Camera | None = None  # the camera that the level before has found
 
     @property
     def unknown(self) -> tuple[int, ...]:

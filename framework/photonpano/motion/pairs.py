@@ -18,11 +18,9 @@ def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int,
     Exposures that share photons share their noise, which confirms the motion along which they were merged. Neighbours that
     overlap in time are therefore no pairs, unless the graph would fall apart without them.
 
-    Args:
-        groups: the groups of the level, in order of their instants.
-        skips: distances in group lengths, of the mean length of both groups. Each exposure is paired with those whose instants
-            are closest to these distances before and after its own; at the shortest, also with the next one beyond, since dense
-            exposures would otherwise fall into separate chains. Without skips, the pairs are a chain of neighbours.
+    Each exposure is paired with those whose instants are closest to the `skips`, in mean lengths of both groups, before and
+    after its own; at the shortest, also with the next one beyond, since dense exposures would otherwise fall into separate
+    chains. Without skips, the pairs are a chain of neighbours.
     """
     instants, lengths = instants_of(groups), lengths_of(groups)
     pairs: set[tuple[int, int]] = set()

@@ -13,8 +13,7 @@ from photonpano.geometry import inverse
 from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.diagnosis import Contrast
 from photonpano.motion.exposure_tasks import Descriptions, ExposureTasks, Notes, Pair
-from photonpano.motion.level import FrameHomography
-from photonpano.motion.merge import VirtualExposures
+from photonpano.motion.level import FrameHomography, VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of
 from photonpano.motion.tracking import Place, StartingMotion, starting_motion
 from photonpano.protocols import KeepsHypotheses
@@ -29,19 +28,12 @@ BRIDGE = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """An exposure whose pairs with earlier ones are registered.
+    """An exposure whose pairs with earlier ones are registered."""
 
-    Attributes:
-        edges: these pairs.
-        contrast: of its image.
-        place: where it lies, at a first level that is tracked; None at others.
-        alternatives_px: distance of a second motion that fits as well, by the other exposure of the pair.
-    """
-
-    edges: tuple[Edge, ...]
-    contrast: Contrast
-    place: Place | None
-    alternatives_px: Mapping[int, float]
+    edges: tuple[Edge, ...]  # these pairs
+    contrast: Contrast  # of its image
+    place: Place | None  # where it lies, at a first level that is tracked; None at others
+    alternatives_px: Mapping[int, float]  # distance of a second motion that fits as well, by the other exposure of the pair
 
 
 class Registrar:
@@ -54,13 +46,7 @@ class Registrar:
     """
 
     def __init__(self, exposures: VirtualExposures, log: Log, context: Context) -> None:
-        """Prepare to register.
-
-        Args:
-            exposures: of the level.
-            log: the first exposures in order, as `Registered`; receives the others.
-            context: its executor merges, describes and registers.
-        """
+        """Prepare to register; `log` has the first exposures in order, as `Registered`, and receives the others."""
         self._executor, self._exposures, self._clock, self._log = context.executor, exposures, exposures.clock, log
         self._at_once = context.executor.at_once(len(exposures.groups))
         tasks = ExposureTasks(exposures, independent_share(exposures.groups))
@@ -82,13 +68,9 @@ class Registrar:
     def edges(
         self, pairs: Sequence[tuple[int, int]], pool: ThreadPoolExecutor, threads: int, advance: Callable[[int], None]
     ) -> Iterator[Edge]:
-        """Register pairs, and yield them in order.
+        """Register pairs (moving, fixed), ordered by the moving exposure, the later one, and yield them in order.
 
-        Args:
-            pairs: (moving, fixed), ordered by the moving exposure, which is the later one.
-            pool: waits for tasks.
-            threads: how many exposures are worked on ahead.
-            advance: called with 1 after each moving exposure.
+        `threads` exposures are worked on ahead, and `advance` is called with 1 after each moving exposure.
         """
         partners: dict[int, list[int]] = {moving: [] for moving in range(len(self._exposures.groups))}
         needed_until = {index: index + BRIDGE for index in partners}
@@ -117,15 +99,11 @@ class Registrar:
     def closures(
         self, pairs: Sequence[tuple[int, int]], homographies: FloatArray, pool: ThreadPoolExecutor, log: Log
     ) -> Iterator[Edge]:
-        """Register candidates for loop closures; pairs that are not similar once aligned are not located.
+        """Register candidates (moving, fixed) for loop closures; pairs that are not similar once aligned are not located.
 
-        Both exposures of a pair are merged and described again.
-
-        Args:
-            pairs: (moving, fixed), ordered by the moving exposure.
-            homographies: (N, 3, 3) solution of the graph without these pairs, frame pixels to a common plane.
-            pool: waits for tasks: the two exposures of a pair are described at the same time.
-            log: the first pairs in order, as `Edge`; receives the others.
+        Both exposures of a pair are merged and described again, at the same time. The pairs are ordered by the moving exposure;
+        `homographies` (N, 3, 3), frame pixels to a common plane, are those without them. `log` has the first pairs in order, as
+        `Edge`, and receives the others.
         """
         self._kept.clear()
         needed_until = {index: position for position, pair in enumerate(pairs) for index in pair}

@@ -31,15 +31,10 @@ _GRID = 7  # points of a frame along each axis to which a homography is fitted
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rotations:
-    """The rotations of a camera.
+    """The rotations of a camera."""
 
-    Attributes:
-        rotations: (N, 3, 3) from the camera at each node to that at the anchor.
-        camera: of all of them.
-    """
-
-    rotations: FloatArray
-    camera: Camera
+    rotations: FloatArray  # (N, 3, 3) from the camera at each node to that at the anchor
+    camera: Camera  # of all of them
 
     def of(self, nodes: slice) -> Rotations:
         """Return the rotations of some nodes."""
@@ -48,17 +43,11 @@ class Rotations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensShift:
-    """Change of the homographies of pairs caused by undistorting pixels with the wrong lens.
+    """Change of the homographies of pairs caused by undistorting pixels with the wrong lens."""
 
-    Attributes:
-        frame_shape: (height, width) of a frame.
-        points: (P, 2) all over a frame.
-        seen: (E, P) which of them both exposures of each pair see.
-    """
-
-    frame_shape: tuple[int, int]
-    points: FloatArray
-    seen: BoolArray
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    points: FloatArray  # (P, 2) all over a frame
+    seen: BoolArray  # (E, P) which of them both exposures of each pair see
 
     @classmethod
     def of(cls, frame_shape: tuple[int, int], observed: FloatArray) -> LensShift:
@@ -75,10 +64,7 @@ class LensShift:
     def of_corners(self, relative: FloatArray, camera: Camera, assumed: Camera) -> FloatArray:
         """Return the change of corner displacement caused by undistorting with the wrong lens: (E, 4, 2) px.
 
-        Args:
-            relative: (E, 3, 3) homographies of the ideal pixels of the camera.
-            camera: the true one.
-            assumed: camera used to undistort the pixels.
+        `relative` (E, 3, 3) map ideal pixels of the true camera; pixels were undistorted with the one that was `assumed`.
         """
         ideal = camera.ideal(assumed.distorted(self.points))
         there = assumed.ideal(camera.distorted(transform_points(relative, ideal)))
@@ -107,12 +93,9 @@ class RotationAdjustment(Adjustment[Rotations]):
     _n_node = 3
 
     def __init__(self, problem: Problem, assumed: Camera, unknown: tuple[int, ...]) -> None:
-        """Set up the problem.
+        """Set up the problem, whose homographies are those of ideal pixels of the `assumed` camera.
 
-        Args:
-            problem: its homographies are those of ideal pixels of `assumed`.
-            assumed: camera used to undistort the pixels.
-            unknown: what is to be found of the camera: 0 for the focal length, 1 to 4 for k1, k2, p1, p2.
+        Unknown may be 0 for the focal length, and 1 to 4 for k1, k2, p1, p2.
         """
         super().__init__(problem, n_shared=len(unknown))
         self._assumed, self._unknown = assumed, unknown
@@ -202,21 +185,22 @@ class RotationAdjustment(Adjustment[Rotations]):
         chosen = np.unique(np.linspace(0, len(self._moving) - 1, _MOST_TRIED).astype(int))
         whitening, targets = self._whitening[chosen], self._targets[chosen]
         here = np.broadcast_to(self._corners, targets.shape)
-        rays = [_rays(camera, points) for points in (here, targets)]
+        rays = [Camera(camera.matrix).directions(points) for points in (here, targets)]
         # Of the rotations that bring four directions to four others, the one of least squares (Kabsch 1976); then one step.
         rotations = nearest_rotations(np.swapaxes(rays[1], -1, -2) @ rays[0])
         moves = camera.homographies(ROTATION_AXES)
+
+        def residuals_of(mapped: FloatArray) -> FloatArray:
+            away = transform_points(mapped, self._corners) - targets
+            return np.asarray(np.einsum("eij,ej->ei", whitening, away.reshape(-1, 8)))
+
         for _ in range(2):
             mapped = camera.homographies(rotations)
-            by_rotation = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))
-            residuals = np.einsum("eij,ej->ei", whitening, (transform_points(mapped, self._corners) - targets).reshape(-1, 8))
-            step = -np.linalg.solve(
-                np.swapaxes(by_rotation, -1, -2) @ by_rotation, np.einsum("eij,ei->ej", by_rotation, residuals)[..., None]
-            )
+            slope = whitening @ slopes(mapped @ self._rows, mapped[:, None] @ (moves @ self._rows))
+            gradient = np.einsum("eij,ei->ej", slope, residuals_of(mapped))
+            step = -np.linalg.solve(np.swapaxes(slope, -1, -2) @ slope, gradient[..., None])
             rotations = rotations @ rotation_matrices(step[..., 0])
-        residuals = np.einsum(
-            "eij,ej->ei", whitening, (transform_points(camera.homographies(rotations), self._corners) - targets).reshape(-1, 8)
-        )
+        residuals = residuals_of(camera.homographies(rotations))
         squares = (residuals**2).sum(axis=1)
         return float(np.log1p(squares / 8).sum() + (_away(camera, 0, 2 * self._half) / _PRIOR_STD) ** 2)
 
@@ -243,9 +227,3 @@ def _changed(camera: Camera, index: int, step: float) -> Camera:
 def _away(camera: Camera, index: int, side_px: float) -> float:
     """Return how far a number of a camera is from where it may be expected."""
     return float(np.log(camera.focal_px / (_PRIOR_FOCAL * side_px)) if index == 0 else camera.distortion[index - 1])
-
-
-def _rays(camera: Camera, points: FloatArray) -> FloatArray:
-    """Return the unit vectors in which ideal pixels look: (..., 2) to (..., 3)."""
-    rays = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1) @ np.linalg.inv(camera.matrix).T
-    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))

@@ -69,17 +69,11 @@ def fit_rotations(
     information: FloatArray | None,
     checked: Callable[..., Trajectory],
 ) -> Trajectory:
-    """Interpolate rotations by any angle.
+    """Interpolate N rotations by any angle at increasing instants, in frames.
 
     A coarse path passes some of the knots, 30 degrees apart; the interpolator gets the rotations of the others beyond it,
-    which are small: as rotation vectors if it `InterpolatesTurns`, else as homographies.
-
-    Args:
-        interpolator: of the level.
-        instants: (N,) increasing, in frames.
-        knots: N rotations of the camera.
-        information: (N, 3, 3) inverse covariances of their rotation vectors, each in its own frame; None if unknown.
-        checked: wraps what the interpolator fitted, given the (N, 3, 3) `homographies` of the knots.
+    which are small: as rotation vectors if it `InterpolatesTurns`, else as homographies. `information` (N, 3, 3) is of their
+    rotation vectors, each in its own frame. `checked` wraps what was fitted, given the (N, 3, 3) `homographies` of the knots.
     """
     path, camera = CoarsePath(instants, knots.rotations), knots.camera
     vectors = rotation_vectors(np.swapaxes(path.at(instants), -1, -2) @ knots.rotations)

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photonpano.geometry import apply, corners, inverse
+from photonpano.geometry import corners, inverse, transform_points
 from photonpano.protocols import Trajectory
 from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, Group
 
@@ -21,25 +21,19 @@ _SHORTEST_PART = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cut:
-    """A place where the image jumps from one frame to the next.
+    """A place where the image jumps from one frame to the next."""
 
-    Attributes:
-        frame: the first frame after the jump.
-        shift_px: (2,) by how much more than before and after it the image moves there, x and y in px of a frame.
-        sigmas: its size in standard deviations of what the image does nearby.
-        dark: frames around it that show nothing, so that the jump may lie anywhere among them; None where all have light.
-    """
-
-    frame: int
-    shift_px: FloatArray
-    sigmas: float
+    frame: int  # the first frame after the jump
+    shift_px: FloatArray  # (2,) by how much more than before and after it the image moves there, x and y in px of a frame
+    sigmas: float  # its size in standard deviations of what the image does nearby
+    # frames around it that show nothing, so that the jump may lie anywhere among them; None where all have light
     dark: FrameSpan | None = None
 
     def along(self, trajectory: Trajectory, frame_shape: tuple[int, int]) -> Cut:
         """Return this cut with the shift that a trajectory has there, beyond the motion from frame to frame beside it."""
         homographies = trajectory.at(self.frame + np.arange(-2, 2))
         middle = corners(frame_shape).mean(axis=0)
-        before, here, after = apply(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
+        before, here, after = transform_points(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
         return replace(self, shift_px=here - (before + after) / 2)
 
     @property
@@ -65,15 +59,10 @@ class Cut:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timeline:
-    """Time of each frame, and frames where the image jumps.
+    """Time of each frame, and frames where the image jumps."""
 
-    Attributes:
-        taken: (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated.
-        cuts: where the image jumps, in order.
-    """
-
-    taken: FloatArray
-    cuts: tuple[Cut, ...] = ()
+    taken: FloatArray  # (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated
+    cuts: tuple[Cut, ...] = ()  # where the image jumps, in order
 
     @classmethod
     def regular(cls, n_frames: int) -> Timeline:
@@ -82,11 +71,7 @@ class Timeline:
 
     @classmethod
     def with_repeats(cls, repeated: BoolArray) -> Timeline:
-        """Return that of a capture without missing frames.
-
-        Args:
-            repeated: (T,), True for frames that are copies of the frame before.
-        """
+        """Return that of a capture without missing frames; (T,) True for frames that are copies of the frame before."""
         return cls(np.cumsum(~repeated).astype(np.float64) - 1.0)
 
     @property
@@ -120,12 +105,7 @@ class Timeline:
         return tuple(found[time] for time in sorted(found))
 
     def fit(self, interpolate: Callable[[slice, FloatArray], Trajectory], instants: FloatArray) -> Trajectory:
-        """Interpolate each piece between two cuts by itself.
-
-        Args:
-            interpolate: fits some of the knots, given their times.
-            instants: (N,) of the knots, in frames.
-        """
+        """Interpolate each piece between two cuts by itself; `interpolate` fits some of the (N,) knots, given their times."""
         pieces, times = self.knot_pieces(instants), self.times(instants)
         # A piece without a knot goes on as the nearest one.
         known = [number for number, piece in enumerate(pieces) if piece.start < piece.stop]

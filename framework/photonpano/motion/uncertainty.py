@@ -23,25 +23,14 @@ class Uncertainty:
 
     It combines the expected error at the located instants, due to photon noise; the extrapolation at constant velocity beyond
     the first and the last of them; and a share of the last change, since exposures merged along a wrong motion confirm it.
-
-    Attributes:
-        change_px: mean displacement of the corners since the previous level, px of a frame; None at the first level.
-        std_camera: (5,) expected errors of the focal length, in px, and of k1, k2, p1 and p2, 0 for what is given; None for
-            homographies.
     """
 
-    change_px: float | None
+    change_px: float | None  # mean displacement of the corners since the previous level, px of a frame; None at the first level
+    # (5,) expected errors of the focal length, in px, and of k1, k2, p1 and p2, 0 for what is given; None for homographies
     std_camera: FloatArray | None
 
     def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, timeline: Timeline) -> None:
-        """Compare a level with the one before.
-
-        Args:
-            located: the exposures of the level.
-            trajectory: the motion after the level.
-            previous: the motion after the level before; None at the first level.
-            timeline: of the capture. Beyond a cut, nothing is known from the other side.
-        """
+        """Compare a level with the one before, None at the first; beyond a cut, nothing is known from the other side."""
         self.std_camera = _std_camera(located, camera_of_motion(previous))
         self._instants = located.instants
         self._std_px = located.std_px

@@ -1,20 +1,28 @@
 """Camera responses and flux estimation, similarity of images, tone curves, and sums of packed bits."""
 
-from photonpano.photometry.contrast import signal_to_noise
-from photonpano.photometry.noise import FluxRange, debiased, flux_std, measurable_range, saturated
+from photonpano.photometry.noise import FluxRange, debiased, flux_std, frame_variance, measurable_range, saturated
 from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits
-from photonpano.photometry.pictures import Tone, picture_of
+from photonpano.photometry.pictures import (
+    Tone,
+    WhiteBalance,
+    balanced,
+    grey_world,
+    linear_to_srgb,
+    picture_of,
+    srgb_to_linear,
+    tone_mapped,
+)
 from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, Factor, IntensityResponse
 from photonpano.photometry.similarity import (
     Similarity,
     autocorrelation,
     hann_window,
     noise_free_correlation,
+    signal_to_noise,
     similarity_of,
     tapered,
     without_local_mean,
 )
-from photonpano.photometry.tone import WhiteBalance, balanced, grey_world, linear_to_srgb, srgb_to_linear, tone_mapped
 
 __all__ = [
     "BinaryResponse",
@@ -30,6 +38,7 @@ __all__ = [
     "balanced",
     "debiased",
     "flux_std",
+    "frame_variance",
     "grey_world",
     "hann_window",
     "linear_to_srgb",

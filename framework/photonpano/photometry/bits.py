@@ -173,9 +173,8 @@ def reverse_bits(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> None:
 def transpose_bits(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> None:
     """Pack along the rows of an image what is packed along its columns (Hacker's Delight, section 7-3).
 
-    Args:
-        source: (rows, columns); the bits of a byte are eight pixels of a column, the first the highest.
-        target: (8 rows, ceil(columns / 8)), the output.
+    The bits of a byte of the source (rows, columns) are eight pixels of a column, the first the highest; the target is
+    (8 rows, ceil(columns / 8)).
     """
     rows, columns = source.shape
     for row in range(rows):

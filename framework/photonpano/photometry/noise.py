@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 _STEP = 0.01  # relative step of numerical derivatives
 _NEARLY = 0.9  # frames in which a pixel was dark, by its flux, below which it is saturated
 _MANY_FRAMES = 1e12
+_EXACT_FRAMES = 1e4  # for which the variance of a frame is derived, where stabilised scales hold
 _FLUXES = 4000  # fluxes at which the signal-to-noise ratio is computed, to find where it is 1
 
 
@@ -27,7 +29,6 @@ class KnowsNoise(Protocol):
         self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float, slope: Factor = 1.0, offset: Factor = 0.0
     ) -> NDArray[np.float32]:
         """Return the standard deviation of flux: see `flux_std`."""
-        ...
 
 
 @runtime_checkable
@@ -36,7 +37,6 @@ class Debiases(Protocol):
 
     def debiased(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return the flux without bias: see `debiased`."""
-        ...
 
 
 def debiased(flux: FluxImage, weight: FluxImage, response: Response) -> FluxImage:
@@ -75,6 +75,21 @@ def flux_std(flux: FluxImage, weight: FluxImage, response: Response, slope: Fact
     rise = response.stabilised(high, weight) - response.stabilised(low, weight)
     per_unit = (high - low) / np.maximum(rise, np.float32(1e-9))
     return np.asarray(response.stabilised_std(np.maximum(weight, 1)) * per_unit, np.float32)
+
+
+def frame_variance(
+    flux: FluxImage, response: Response, count: Callable[[FluxImage], FluxImage] = lambda flux: flux
+) -> FluxImage:
+    """Return the variance of the flux of one frame, for any response; of its count if that is a function of the flux.
+
+    On the stabilised scale the noise is known; the derivative of that scale converts it.
+    """
+    floor = max(1e-4 * float(flux.max(initial=0)), 1e-7)
+    low = np.asarray(np.maximum(flux * np.float32(0.98), floor), np.float32)
+    high = np.asarray(np.maximum(flux * np.float32(1.02), 2 * floor), np.float32)
+    steps = response.stabilised(high, _EXACT_FRAMES) - response.stabilised(low, _EXACT_FRAMES)
+    per_step = np.abs((count(high) - count(low)) / np.maximum(steps, np.float32(1e-9)))
+    return np.asarray(np.maximum(_EXACT_FRAMES * (response.stabilised_std(_EXACT_FRAMES) * per_step) ** 2, 1e-7), np.float32)
 
 
 def saturated(flux: FluxImage, weight: FluxImage, response: Response) -> BoolArray:

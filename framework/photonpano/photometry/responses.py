@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -12,24 +12,20 @@ Factor: TypeAlias = "NDArray[np.floating] | float"  # one number for all pixels,
 _LEAST_DARK = 0.75  # a pixel with fewer dark frames was lit in all: half a dark frame is what `flux` assumes then
 
 
-@dataclass(frozen=True, slots=True)
-class BinaryResponse:
-    """A pixel is 1 if it detected at least one photon (paper, equations 2 and 3).
+class _BinarySums:
+    """The response of frames that are sums of `n` binary frames: noise is that of binary frames, n times as many."""
 
-    The mean count at flux `f` (detected photons per pixel per frame, dark counts included) is `1 - exp(-f)`.
-
-    A pixel that is lit in all of n frames has no finite maximum-likelihood estimate. Half a frame is then counted as dark, so
-    that its flux is `ln(2 n)`.
-    """
+    __slots__ = ()
+    n: int
 
     def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the expected count of one frame: `1 - exp(-flux)` (equation 2)."""
-        return -np.expm1(-flux)
+        """Return the expected count of one frame: `n (1 - exp(-flux / n))` (equation 2)."""
+        return -self.n * np.expm1(-flux / self.n)
 
     def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return the maximum-likelihood flux `-ln(1 - mean_count)` (equation 3), at most `ln(2 frames)`."""
-        ceiling = 1 - 0.5 / np.maximum(frames, 1)
-        return np.asarray(-np.log1p(-np.clip(mean_count, 0, ceiling)), dtype=np.float32)
+        """Return the maximum-likelihood flux `-n ln(1 - mean_count / n)` (equation 3), at most `n ln(2 n frames)`."""
+        ceiling = 1 - 0.5 / np.maximum(self.n * frames, 1)
+        return np.asarray(-self.n * np.log1p(-np.clip(mean_count / self.n, 0, ceiling)), dtype=np.float32)
 
     def debiased(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Remove the bias of maximum-likelihood flux, which is too high where few frames are dark.
@@ -38,43 +34,57 @@ class BinaryResponse:
         dark frames, the bias falls from 26 % of the standard deviation to 1 %. A pixel that is lit in all frames gets
         `ln(2 n + 1)`, a lower bound.
         """
-        frames = np.maximum(frames, 1)
-        lit = -np.expm1(-flux)
+        frames = np.maximum(self.n * frames, 1)
+        lit = -np.expm1(-flux / self.n)
         lit = np.where((1 - lit) * frames < _LEAST_DARK, 1, lit)
-        return np.asarray(-np.log1p(-lit * (frames / (frames + 0.5))), dtype=np.float32)
+        return np.asarray(-self.n * np.log1p(-lit * (frames / (frames + 0.5))), dtype=np.float32)
 
     def flux_std(
         self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float, slope: Factor = 1.0, offset: Factor = 0.0
     ) -> NDArray[np.float32]:
         """Return the standard deviation of flux estimated from `frames` frames: see `photonpano.photometry.flux_std`.
 
-        Without corrections it is `sqrt((exp(flux) - 1) / frames)`. One and a half lit frames and a dark one are added, so that
-        95 % of estimates lie within two standard deviations also where there are few of these, and it is positive where there
-        are none.
+        Without corrections it is `sqrt((exp(flux) - 1) / frames)` for binary frames. One and a half lit frames and a dark one
+        are added, so that 95 % of estimates lie within two standard deviations also where there are few of these, and it is
+        positive where there are none.
         """
-        frames = np.maximum(np.asarray(frames, np.float64), 1)
-        dark = np.exp(-np.asarray(flux, np.float64))
-        raw_dark = np.clip((dark - 1 + slope + offset) / slope, 0, 1)
+        frames = np.maximum(self.n * np.asarray(frames, np.float64), 1)
+        dark = np.exp(-np.asarray(flux, np.float64) / self.n)
+        raw_dark = np.clip((dark - 1 + slope + np.asarray(offset) / self.n) / slope, 0, 1)
         lit, unlit = frames * (1 - raw_dark) + 1.5, frames * raw_dark + 1
         spread = np.sqrt(lit * unlit / frames) / (frames + 2.5)
-        return np.asarray(slope * spread / (dark + 0.5 / frames), dtype=np.float32)
+        return np.asarray(self.n * slope * spread / (dark + 0.5 / frames), dtype=np.float32)
 
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return `arcsin(sqrt((k + 3/8) / (n + 3/4)))` of k counts in n frames, from 0 to pi/2 (Anscombe 1948).
+        """Return `arcsin(sqrt((k + 3/8) / (n + 3/4)))` of k counts in n binary frames, from 0 to pi/2 (Anscombe 1948).
 
         It makes binomial noise uniform. Without the two fractions the mean of dark pixels would depend on the number of
         frames, and the ends of a merged exposure, which few frames saw, would look too dark.
         """
-        counts = np.clip(self.mean_count(flux), 0, 1) * frames
+        frames = self.n * frames
+        counts = np.clip(-np.expm1(-flux / self.n), 0, 1) * frames
         return np.asarray(np.arcsin(np.sqrt((counts + 0.375) / (frames + np.float32(0.75)))), dtype=np.float32)
 
     def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return `1 / (2 sqrt(frames))`."""
-        return np.asarray(0.5 / np.sqrt(frames), dtype=np.float32)
+        """Return `1 / (2 sqrt(n frames))`."""
+        return np.asarray(0.5 / np.sqrt(self.n * frames), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
-class BinarySumResponse:
+class BinaryResponse(_BinarySums):
+    """A pixel is 1 if it detected at least one photon (paper, equations 2 and 3).
+
+    The mean count at flux `f` (detected photons per pixel per frame, dark counts included) is `1 - exp(-f)`.
+
+    A pixel that is lit in all of n frames has no finite maximum-likelihood estimate. Half a frame is then counted as dark, so
+    that its flux is `ln(2 n)`.
+    """
+
+    n: int = field(default=1, init=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class BinarySumResponse(_BinarySums):
     """A frame is the sum of `n` binary frames, taken one after the other, so that a count goes from 0 to n.
 
     Flux is photons per pixel per frame, where a frame is the sum. Each binary frame gets the n-th part of it, so that the mean
@@ -85,33 +95,6 @@ class BinarySumResponse:
     """
 
     n: int
-
-    def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the expected count of one sum: `n (1 - exp(-flux / n))`."""
-        return np.asarray(self.n * BinaryResponse().mean_count(flux / np.float32(self.n)), dtype=np.float32)
-
-    def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return the maximum-likelihood flux `-n ln(1 - mean_count / n)`, at most `n ln(2 n frames)`."""
-        return np.asarray(self.n * BinaryResponse().flux(mean_count / np.float32(self.n), self.n * frames), dtype=np.float32)
-
-    def debiased(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Remove the bias of maximum-likelihood flux, as `BinaryResponse` does."""
-        return np.asarray(self.n * BinaryResponse().debiased(flux / np.float32(self.n), self.n * frames), dtype=np.float32)
-
-    def flux_std(
-        self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float, slope: Factor = 1.0, offset: Factor = 0.0
-    ) -> NDArray[np.float32]:
-        """Return the standard deviation of flux estimated from `frames` sums: see `photonpano.photometry.flux_std`."""
-        share = BinaryResponse().flux_std(flux / np.float32(self.n), self.n * frames, slope, np.asarray(offset) / self.n)
-        return np.asarray(self.n * share, dtype=np.float32)
-
-    def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return the stabilised flux of `BinaryResponse` for all binary frames, from 0 to pi/2."""
-        return BinaryResponse().stabilised(flux / np.float32(self.n), self.n * frames)
-
-    def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
-        """Return `1 / (2 sqrt(n frames))`."""
-        return BinaryResponse().stabilised_std(self.n * frames)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,14 +1,14 @@
-"""Similarity of two aligned images: their correlation without photon noise, and whether chance explains it."""
+"""Contrast of an image and similarity of two aligned ones, without photon noise, and whether chance explains it."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.values import BoolArray, FloatArray
+from photonpano.values import BoolArray, FloatArray, VirtualExposure
 
 _LOCAL_PX = 13  # side of the square whose mean is subtracted from each pixel before images are compared, px
 _MIN_INDEPENDENT = 50  # with fewer independent pixels, a correlation is not estimated
@@ -18,6 +18,8 @@ _LAGS = 4  # the largest lag of an autocorrelation is the side of the image over
 # flux 0.02 and 0.1, pale and blurred ones among them, those that `direct` aligned scored 6.6 and more; of 370 pairs of smears
 # or of different places none reached 5.2, at correlations of up to 0.77. Repeated texture, such as windows, may pass.
 _MIN_SCORE = 5.5
+_ROWS = 16  # rows of blocks that are sampled
+_BLOCK = 4  # side of the blocks, px, whose averages separate scene and noise: averaging reduces the noise and hardly the scene
 
 
 def hann_window(shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -167,3 +169,36 @@ def similarity_of(
     observed = covariance[0, 1] / math.sqrt(max(covariance[0, 0] * covariance[1, 1], np.finfo(float).tiny))
     score = math.atanh(min(float(observed), 1 - 1e-9)) * math.sqrt(max(0.0, structures - 3))
     return Similarity(noise_free_correlation(covariance, noise, independent), structures, score)
+
+
+def signal_to_noise(exposure: VirtualExposure) -> float:
+    """Return the standard deviation of the scene over that of a pixel's noise, on the scale where noise is uniform.
+
+    At 1 and below, single pixels are mostly noise, and registration needs larger structures. 0 if there is no contrast.
+    """
+    flux, weight = _some_rows(exposure.flux), _some_rows(exposure.weight)
+    seen = weight > 0
+    if not seen.any():
+        return 0.0
+    values = np.where(seen, exposure.response.stabilised(flux, weight), np.float32(0))
+    sums, counts = sums_of_blocks(values, _BLOCK), sums_of_blocks(seen.astype(np.float32), _BLOCK)
+    full = counts == _BLOCK**2
+    if np.count_nonzero(full) < 2:
+        return 0.0
+    noise = float(exposure.response.stabilised_std(np.median(weight[seen], keepdims=True)).item())
+    variance = float(np.var(sums[full] / _BLOCK**2)) - noise**2 / _BLOCK**2
+    return float(np.sqrt(max(variance, 0.0))) / noise
+
+
+def _some_rows(image: np.ndarray) -> np.ndarray:
+    """Return about `_ROWS` evenly spaced rows of blocks."""
+    rows = image[: len(image) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, image.shape[1])
+    step = max(1, len(rows) // _ROWS)
+    return rows[::step].reshape(-1, image.shape[1])
+
+
+def sums_of_blocks(images: NDArray[Any], side: int) -> NDArray[Any]:
+    """Sum squares of pixels, (..., H, W) to (..., h, w); those that the border cuts are left out."""
+    rows, columns = (length // side for length in images.shape[-2:])
+    whole = images[..., : rows * side, : columns * side]
+    return np.asarray(whole.reshape(*images.shape[:-2], rows, side, columns, side).sum(axis=(-3, -1)))

@@ -12,9 +12,8 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from photonpano.capture import Capture, capture_of, part_of
-from photonpano.contracts.attribution import attributing
 from photonpano.contracts.loop import require_groups
-from photonpano.contracts.rules import shown
+from photonpano.contracts.rules import attributing, shown
 from photonpano.contributions import (
     ExecutorContext,
     ExporterContribution,

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from photonpano.captures.repeats import timeline_of
+from photonpano.captures.obstacles import timeline_of
 from photonpano.context import Context
 from photonpano.errors import InputError
 from photonpano.motion.loop import LevelResult

@@ -10,8 +10,8 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from photonpano.contracts.attribution import attributing
 from photonpano.contracts.results import FILES
+from photonpano.contracts.rules import attributing
 from photonpano.errors import OutputError
 from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.merging.panorama import RenderedPanorama

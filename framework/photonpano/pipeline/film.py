@@ -14,9 +14,8 @@ from photonpano.capture import capture_of
 from photonpano.captures.picture_files import Picture
 from photonpano.geometry import Camera, Canvas, outline_of
 from photonpano.merging.colour import composed, in_colours
-from photonpano.merging.merge_renderer import MergeRenderer
-from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.smooth_path import smooth_view
+from photonpano.merging.panorama import MergeRenderer
+from photonpano.motion.frame_motion import FrameMotion, smooth_view
 from photonpano.photometry import WhiteBalance, balanced, grey_world, linear_to_srgb
 from photonpano.protocols import Source, camera_of
 from photonpano.threads import in_order

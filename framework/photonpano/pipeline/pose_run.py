@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from photonpano.captures.obstacles import naming_obstacles
-from photonpano.contracts.attribution import attributing
 from photonpano.contracts.results import POSES
+from photonpano.contracts.rules import attributing
 from photonpano.errors import OutputError
 from photonpano.geometry import Camera
 from photonpano.photometry import tone_mapped

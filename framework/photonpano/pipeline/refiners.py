@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from photonpano.contracts.attribution import attributing
 from photonpano.contracts.results import REFINED
+from photonpano.contracts.rules import attributing
 from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, nearest_rotations
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.passes import Proposal, tried

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonpano.contracts.attribution import attributing
 from photonpano.contracts.results import require_panorama
-from photonpano.contracts.rules import BrokenContract
+from photonpano.contracts.rules import BrokenContract, attributing
 from photonpano.errors import InputError
 from photonpano.geometry import Canvas
 from photonpano.merging import MergeRenderer

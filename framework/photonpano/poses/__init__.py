@@ -1,7 +1,16 @@
 """Poses of a camera: their gauge, and the files in which other programs read them."""
 
-from photonpano.poses.formats import POSE_FORMATS, PoseFormat, Poses, colmap, nerfstudio, ply, tum
-from photonpano.poses.gauge import centres, in_standard_world, path_length
+from photonpano.poses.formats import (
+    POSE_FORMATS,
+    PoseFormat,
+    Poses,
+    centres,
+    colmap,
+    in_standard_world,
+    nerfstudio,
+    ply,
+    tum,
+)
 
 __all__ = [
     "POSE_FORMATS",
@@ -11,7 +20,6 @@ __all__ = [
     "colmap",
     "in_standard_world",
     "nerfstudio",
-    "path_length",
     "ply",
     "tum",
 ]

@@ -1,4 +1,4 @@
-"""The poses of a camera, as files of other programs.
+"""The poses of a camera: their gauge, which is free and chosen here, and the files in which other programs read them.
 
 Convention:
     Rotations map directions of a camera to those of the world, x right, y down, z ahead; positions are those of the camera in
@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.errors import LocationError
 from photonpano.geometry import Camera
 from photonpano.photometry import tone_mapped
-from photonpano.values import FloatArray, ScenePoints
+from photonpano.values import FloatArray, PoseEstimate, ScenePoints
 
 PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "tum"]
 
@@ -31,27 +32,17 @@ _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Where a camera was, and where it looked.
+    """Where a camera was, and where it looked."""
 
-    Attributes:
-        camera: of all images.
-        frame_shape: (height, width) of an image.
-        names: file names of N images.
-        rotations: (N, 3, 3), directions of each camera to those of the world.
-        seconds: (N,) times of the images.
-        positions: (N, 3) of the cameras in the world; None if the camera only turned.
-        observed: for each image the indices of K points and where it shows them, (K, 2); empty if they are not known.
-        points: of the scene; None if they are not known.
-    """
-
-    camera: Camera
-    frame_shape: tuple[int, int]
-    names: tuple[str, ...]
-    rotations: FloatArray
-    seconds: FloatArray
-    positions: FloatArray | None = None
+    camera: Camera  # of all images
+    frame_shape: tuple[int, int]  # (height, width) of an image
+    names: tuple[str, ...]  # file names of N images
+    rotations: FloatArray  # (N, 3, 3), directions of each camera to those of the world
+    seconds: FloatArray  # (N,) times of the images
+    positions: FloatArray | None = None  # (N, 3) of the cameras in the world; None if the camera only turned
+    # for each image the indices of K points and where it shows them, (K, 2); empty if they are not known
     observed: tuple[tuple[NDArray[np.intp], FloatArray], ...] = ()
-    points: ScenePoints | None = None
+    points: ScenePoints | None = None  # of the scene; None if they are not known
 
     @property
     def places(self) -> FloatArray:
@@ -171,3 +162,43 @@ def _quaternions(rotations: FloatArray) -> FloatArray:
 
 def _line(*numbers: float) -> str:
     return " ".join(repr(float(number)) for number in numbers)
+
+
+def centres(camera_from_world: FloatArray) -> FloatArray:
+    """Return the positions of cameras in the world, -R^T t: (..., 3, 4) to (..., 3)."""
+    return np.asarray(-np.einsum("...ji,...j->...i", camera_from_world[..., :3], camera_from_world[..., 3]))
+
+
+def path_length(camera_from_world: FloatArray) -> float:
+    """Return the length of the path of (T, 3, 4) poses, without those that are NaN."""
+    known = centres(camera_from_world[np.isfinite(camera_from_world).all(axis=(1, 2))])
+    return float(np.linalg.norm(np.diff(known, axis=0), axis=1).sum())
+
+
+def in_standard_world(estimate: PoseEstimate) -> PoseEstimate:
+    """Move the world so that the first located camera is its origin and looks along z, and the path has the length 1.
+
+    Raises:
+        LocationError: the camera does not travel, so that there is no scale.
+    """
+    length = path_length(estimate.camera_from_world)
+    if not length > 0:
+        raise LocationError(
+            "the camera does not travel: all located frames have one position; if it turns, leave out `pose` and set "
+            "motion: {model: rotation}"
+        )
+    first = estimate.camera_from_world[int(np.argmax(estimate.located))]
+
+    def moved(camera_from_world: FloatArray) -> FloatArray:
+        rotation = camera_from_world[..., :3] @ first[:, :3].T
+        shift = (camera_from_world[..., 3] - rotation @ first[:, 3]) / length
+        return np.concatenate([rotation, shift[..., None]], axis=-1)
+
+    positions = (estimate.points.positions @ first[:, :3].T + first[:, 3]) / length
+    return replace(
+        estimate,
+        camera_from_world=moved(estimate.camera_from_world),
+        std_position=estimate.std_position / length,
+        points=ScenePoints(positions, estimate.points.flux),
+        views=tuple(replace(view, camera_from_world=moved(view.camera_from_world)) for view in estimate.views),
+    )

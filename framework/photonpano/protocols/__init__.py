@@ -12,7 +12,6 @@ from photonpano.protocols.motion import (
     Refiner,
     Resampler,
     Trajectory,
-    TurningMotion,
     camera_of_motion,
 )
 from photonpano.protocols.panorama import Exporter, FinishedPanorama, Renderer
@@ -59,7 +58,6 @@ __all__ = [
     "Resampler",
     "Source",
     "Trajectory",
-    "TurningMotion",
     "WeightedSource",
     "camera_of",
     "camera_of_motion",

@@ -40,7 +40,6 @@ class Resampler(Protocol):
         Raises:
             InputError: the capture is too short for this resampler.
         """
-        ...
 
 
 class Trajectory(Protocol):
@@ -52,7 +51,6 @@ class Trajectory(Protocol):
 
     def at(self, frame_indices: ArrayLike) -> FloatArray:
         """Return the homographies of N instants (in frames, fractions allowed): (N, 3, 3). Defined for every instant."""
-        ...
 
 
 @runtime_checkable
@@ -62,7 +60,6 @@ class TurningMotion(Trajectory, Protocol):
     @property
     def camera(self) -> Camera:
         """The camera of all frames."""
-        ...
 
 
 def camera_of_motion(trajectory: Trajectory | None) -> Camera | None:
@@ -82,7 +79,6 @@ class Merger(Protocol):
             trajectory: the current motion; None at the first level, where frames are summed without a warp.
             scale: pixels of the exposure per pixel of a frame.
         """
-        ...
 
 
 class Locator(Protocol):
@@ -93,7 +89,6 @@ class Locator(Protocol):
 
         The framework keeps the result until the last pair of the exposure is registered. Keep it small, without the exposure.
         """
-        ...
 
     def register(self, moving: Any, fixed: Any, initial: Homography | None) -> Located | NotLocated:
         """Estimate where `moving` lies in `fixed`. Return `NotLocated` for an image without texture.
@@ -107,7 +102,6 @@ class Locator(Protocol):
             fixed: what `describe` returned for the fixed exposure.
             initial: (3, 3) map to start from, None while no motion is known.
         """
-        ...
 
 
 @runtime_checkable
@@ -129,7 +123,6 @@ class KeepsHypotheses(Locator, Protocol):
             moving: what `describe` returned for the moving exposure.
             fixed: what `describe` returned for the fixed exposure.
         """
-        ...
 
 
 @runtime_checkable
@@ -147,7 +140,6 @@ class LocatesTurns(Locator, Protocol):
         Args:
             camera_matrix: (3, 3) K, in px of the exposures, which are free of lens distortion.
         """
-        ...
 
 
 class Interpolator(Protocol):
@@ -161,7 +153,6 @@ class Interpolator(Protocol):
             homographies: (N, 3, 3) float64, frame pixels to reference pixels.
             information: (N, 8, 8) inverse covariances of the parameters p1..p8, None if unknown.
         """
-        ...
 
 
 @runtime_checkable
@@ -181,7 +172,6 @@ class InterpolatesTurns(Protocol):
         Returns:
             A function from (M,) instants to (M, 3) turns, defined for every instant.
         """
-        ...
 
 
 class PanoramaView(Protocol):
@@ -193,7 +183,6 @@ class PanoramaView(Protocol):
         Returns:
             Two images, both (H, W) float32, NaN where the panorama was not seen.
         """
-        ...
 
 
 class Refiner(Protocol):
@@ -217,7 +206,6 @@ class Refiner(Protocol):
         Returns:
             None if the photons show nothing to correct.
         """
-        ...
 
 
 class PoseEstimator(Protocol):
@@ -236,4 +224,3 @@ class PoseEstimator(Protocol):
         Raises:
             LocationError: there are no poses to be found; the message says why, with numbers, and what to do.
         """
-        ...

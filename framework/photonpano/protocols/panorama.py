@@ -49,7 +49,6 @@ class Renderer(Protocol):
             Flux in photons per pixel of a frame per frame, whatever the scale of the canvas, and its weight, with
             `canvas.transform` as canvas. Flux is NaN exactly where the weight is 0.
         """
-        ...
 
 
 class FinishedPanorama(Protocol):
@@ -58,26 +57,21 @@ class FinishedPanorama(Protocol):
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width)."""
-        ...
 
     @property
     def in_colour(self) -> bool:
         """Whether pixels have red, green and blue."""
-        ...
 
     @property
     def canvas(self) -> Homography:
         """(3, 3), pixels of the reference plane to pixels of the panorama."""
-        ...
 
     @property
     def white_flux(self) -> float:
         """Flux that is white in panorama.png, photons per pixel per frame."""
-        ...
 
     def rows(self, start: int, stop: int) -> PanoramaRows:
         """Return flux, weight, standard deviation and saturated pixels of the rows from `start` to `stop - 1`."""
-        ...
 
 
 class Exporter(Protocol):
@@ -92,4 +86,3 @@ class Exporter(Protocol):
             panorama: what to write.
             path: the file; it does not exist yet.
         """
-        ...

@@ -26,29 +26,23 @@ class Source(Protocol):
     @property
     def info(self) -> StreamInfo:
         """Frames, size, rate."""
-        ...
 
     @property
     def response(self) -> Response:
         """How flux becomes counts."""
-        ...
 
     @property
     def valid(self) -> BoolArray:
         """(H, W) mask, False for pixels that must not be used (hot, dead, behind a colour filter)."""
-        ...
 
     def counts(self, span: FrameSpan) -> Counts:
         """Sum the frames of a span: (H, W) uint32."""
-        ...
 
     def frames(self, span: FrameSpan) -> Frames:
         """Return the frames of a span one by one: (n, H, W)."""
-        ...
 
     def close(self) -> None:
         """Release files; the source is not used afterwards."""
-        ...
 
     def __enter__(self) -> Source: ...
 
@@ -118,7 +112,6 @@ class PackedSource(Source, Protocol, metaclass=_Optional):
             (n, H, ceil(W / 8)), as `numpy.packbits` packs along the width: the first pixel is the highest bit, and unused bits
             of the last byte of a row are zero. The caller may write to it.
         """
-        ...
 
 
 @runtime_checkable
@@ -131,7 +124,6 @@ class LinearlyCorrectedSource(Source, Protocol, metaclass=_Optional):
         Returns:
             (H, W) float32.
         """
-        ...
 
 
 @runtime_checkable
@@ -139,11 +131,10 @@ class WeightedSource(Source, Protocol, metaclass=_Optional):
     """Its pixels carry different amounts of information, as those behind filters of different colours do."""
 
     def weights(self) -> FluxImage:
-        """Return how many frames of an ordinary pixel a frame of each pixel is worth: (H, W) float32; see `Capture`.
+        """Return the statistical weight of a frame of each pixel, 1 for an ordinary one: (H, W) float32; see `Capture`.
 
         Mergers weight the (corrected) counts of a pixel with it, and the number of frames in which it was seen.
         """
-        ...
 
 
 @runtime_checkable
@@ -159,11 +150,9 @@ class ColouredSource(Source, Protocol, metaclass=_Optional):
         Returns:
             Sources of "red", "green", "blue", and if there are pixels without filter, "clear", in this order.
         """
-        ...
 
     def clear_mix(self) -> FloatArray:
         """Return the flux of a clear pixel, as factors of the flux of red, green and blue ones, whose sum it is: (3,)."""
-        ...
 
 
 @runtime_checkable
@@ -176,7 +165,6 @@ class LitSource(Source, Protocol, metaclass=_Optional):
     @property
     def light(self) -> Light:
         """The gain of each frame."""
-        ...
 
 
 @runtime_checkable
@@ -189,7 +177,6 @@ class LensedSource(Source, Protocol, metaclass=_Optional):
     @property
     def camera(self) -> Camera:
         """The camera of all frames."""
-        ...
 
 
 def light_of(source: Source) -> Light | None:
@@ -226,7 +213,6 @@ class KnowsTruth(Protocol, metaclass=_Optional):
             `camera_from_world` (T, 3, 4), which maps points of the world to points of the camera, X_c = R X_w + t, and
             `camera_matrix`.
         """
-        ...
 
 
 @runtime_checkable
@@ -244,4 +230,3 @@ class KnowsSharpViews(KnowsTruth, Protocol, metaclass=_Optional):
         Raises:
             InputError: there is no such frame.
         """
-        ...

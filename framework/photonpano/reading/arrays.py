@@ -34,8 +34,13 @@ def read_arrays(path: Path, expected: str, names: Container[str] | None = None) 
         content = np.load(file, allow_pickle=False)
         if isinstance(content, np.ndarray):
             return {"": content}
+        arrays = {}
         with content:
-            return {name: _array_in(content, name, path) for name in content.files if names is None or name in names}
+            for name in content.files:
+                if names is None or name in names:
+                    with reading(path, f"is damaged: {name} cannot be read as an array of plain numbers; write it again"):
+                        arrays[name] = np.asarray(content[name])
+        return arrays
 
 
 def read_array(path: Path, expected: str, name: str = "") -> NDArray[Any]:
@@ -69,11 +74,6 @@ def read_picture(path: Path, otherwise: str, flags: int) -> NDArray[Any]:
     if picture is None:
         raise InputError(f"{path} {otherwise}")
     return picture
-
-
-def _array_in(archive: Any, name: str, path: Path) -> NDArray[Any]:
-    with reading(path, f"is damaged: {name} cannot be read as an array of plain numbers; write it again"):
-        return np.asarray(archive[name])
 
 
 def bayer_array(order: Bayer, shape: tuple[int, int]) -> NDArray[np.int8]:

@@ -75,11 +75,7 @@ def objections(read: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> 
 
 
 def require_readable(path: Path) -> None:
-    """Refuse a file that may not be opened, or a folder that may not be listed.
-
-    Raises:
-        InputError: the system refuses it, or it is no regular file.
-    """
+    """Raise an `InputError` for a file that may not be opened or is no regular file, or a folder that may not be listed."""
     with reading(path):
         if path.is_dir():
             next(path.iterdir(), None)
@@ -88,11 +84,7 @@ def require_readable(path: Path) -> None:
 
 
 def size_of(path: Location) -> int:
-    """Return the size of a file in bytes.
-
-    Raises:
-        InputError: there is no such file, or it cannot be read in parts.
-    """
+    """Return the size of a file in bytes; an `InputError` if it is missing, or cannot be read in parts."""
     if isinstance(path, Url):
         return remote_size(path)
     with reading(path):
@@ -100,11 +92,7 @@ def size_of(path: Location) -> int:
 
 
 def require_there(path: Location) -> None:
-    """Refuse a file or folder that is missing, or that may not be opened. Nothing is asked of a URL: its reader does.
-
-    Raises:
-        InputError: it is so.
-    """
+    """Raise an `InputError` for a path that is missing, or may not be opened. Nothing is asked of a URL: its reader does."""
     if isinstance(path, Url):
         return
     if not path.exists():
@@ -159,11 +147,7 @@ def natural_order(path: PurePath) -> list[tuple[list[tuple[str, int]], str]]:
 
 
 def read_json(path: Path, model: type[Model]) -> Model:
-    """Read a JSON file as a pydantic model.
-
-    Raises:
-        InputError: the file is missing, or does not fit the model.
-    """
+    """Read a JSON file as a pydantic model; an `InputError` if it is missing, or does not fit the model."""
     with reading(path):
         content = path.read_bytes()
     try:

@@ -1,4 +1,4 @@
-"""Have a process of its own look at files first: libraries in C may loop, crash or take all memory on damaged ones."""
+"""Read files in a separate process first: libraries in C may loop, crash or take all memory on damaged ones."""
 
 from __future__ import annotations
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from photonpano.errors import InputError
 from photonpano.paths import Location, Url
 from photonpano.reading.files import OpenFiles, is_gzip, size_of
-from photonpano.reading.gzipped import local, unpacked_start
-from photonpano.reading.npy import NpyHeader
+from photonpano.reading.npy import NpyHeader, local, unpacked_start
 from photonpano.reading.pixel_order import MIN_SCORE, other_order, score, units_of
 from photonpano.values import FrameSpan
 
@@ -96,13 +95,9 @@ def sampled_spans(n_frames: int, frame_values: int) -> list[FrameSpan]:
 
 
 def unpacked_content(samples: Sequence[NDArray[Any]]) -> Content | None:
-    """Return what the values of an array are if they are not bytes of eight pixels each.
+    """Return what the values of runs of frames (n, rows, columns), integers or bool, are.
 
-    Args:
-        samples: runs of consecutive frames, each (n, rows, columns), of integers or bool.
-
-    Returns:
-        None for packed pixels, and where too few pixels are lit.
+    None if they are bytes of eight pixels each, and where too few pixels are lit.
     """
     lowest, highest = (int(edge) for edge in (min(each.min() for each in samples), max(each.max() for each in samples)))
     n_values = sum(each.size for each in samples)
@@ -178,12 +173,9 @@ def _last_is_longest(first: int, second: int, last: int) -> bool:
 
 def _last_is_alike(samples: Sequence[NDArray[Any]], block: tuple[int, int, int]) -> bool:
     """Return whether neighbouring blocks of values correlate most along the last axis."""
-    first, second, last = np.sum([_moments(_blocks(each, block)) for each in samples], axis=0)
-    correlations = [_correlation(moments) for moments in (first, second, last)]
-    if not all(correlations):
-        return False
-    lead = correlations[2] - max(correlations[:2])
-    return lead > _MIN_LEAD * math.sqrt(2 / float(last[0]))
+    blocks = [_blocks(each, block) for each in samples]
+    (first, _), (second, _), (last, number) = (_correlation(blocks, axis) for axis in range(3))
+    return bool(first and second and last) and last - max(first, second) > _MIN_LEAD * math.sqrt(2 / number)
 
 
 def _blocks(frames: NDArray[Any], block: tuple[int, int, int]) -> NDArray[np.float64]:
@@ -194,46 +186,23 @@ def _blocks(frames: NDArray[Any], block: tuple[int, int, int]) -> NDArray[np.flo
     return np.asarray(in_blocks.mean(axis=(1, 3, 5)))
 
 
-def _moments(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (3, 6) sums over neighbours along the first, second and last axis: 1, x, y, x^2, y^2, x y."""
-    rows = []
-    for axis in range(3):
-        along = np.moveaxis(blocks, axis, 0)
-        x, y = along[:-1], along[1:]
-        rows.append([x.size, *(each.sum() for each in (x, y, x * x, y * y, x * y))])
-    return np.array(rows, np.float64)
-
-
-def _correlation(moments: NDArray[np.float64]) -> float:
-    """Return the correlation of neighbours; 0 if there are none, or no scatter."""
-    if not moments[0]:
-        return 0.0
-    x, y, xx, yy, xy = moments[1:] / moments[0]
-    scatter = float(np.sqrt(max(0.0, (xx - x * x) * (yy - y * y))))
-    return float(xy - x * y) / scatter if scatter > 0 else 0.0
+def _correlation(blocks: Sequence[NDArray[np.float64]], axis: int) -> tuple[float, int]:
+    """Return the correlation of neighbours along an axis, 0 if there are none, or no scatter; and how many there are."""
+    along = [np.moveaxis(each, axis, 0) for each in blocks]
+    x, y = (np.concatenate([each[part].ravel() for each in along]) for part in (slice(None, -1), slice(1, None)))
+    scatter = float(x.std() * y.std()) if x.size else 0.0
+    return (float(((x - x.mean()) * (y - y.mean())).mean()) / scatter if scatter > 0 else 0.0), x.size
 
 
 class Channel(NamedTuple):
-    """The channel that a recognised capture is read with.
+    """The channel that a recognised capture is read with."""
 
-    Attributes:
-        keys: the key `channel` of the source, if the capture has channels.
-        clause: follows the reason why the capture was recognised.
-    """
-
-    keys: dict[str, int]
-    clause: str
+    keys: dict[str, int]  # the key `channel` of the source, if the capture has channels
+    clause: str  # follows the reason why the capture was recognised
 
 
 def with_channel(read: Callable[[int | None], Capture]) -> tuple[Capture, Channel] | None:
-    """Read a capture without channels, or the middle one of three.
-
-    Args:
-        read: reads the capture with a `channel`, and raises an `InputError` if the capture does not have it.
-
-    Returns:
-        What `read` returned, and the channel; None if it raised for both.
-    """
+    """Return what `read` returns without a channel, or for the middle one of three; None if both raise an `InputError`."""
     for channel in (None, _MIDDLE):
         try:
             found = read(channel)

@@ -1,22 +1,31 @@
-"""Read and check headers of .npy files, without their data, and count the frames of those that are still being written."""
+"""Read and check headers of .npy and .npy.gz files, count the frames that are there, and unpack .npy.gz files once."""
 
 from __future__ import annotations
 
+import gzip
+import logging
 import math
 import operator
+import os
+import zlib
+from functools import lru_cache
 from gzip import GzipFile
 from io import BytesIO
+from pathlib import Path
 from typing import IO, NamedTuple
 
 import numpy as np
 
+from photonpano.atomic import atomic_path, require_space
 from photonpano.errors import InputError
+from photonpano.locks import hold
 from photonpano.paths import Location, Url
 from photonpano.reading.files import is_gzip, read_start, reading, size_of
 from photonpano.reading.remote import read_range
 
 _HEADER_BYTES = 4096  # bytes of a URL that are read for the header; that of a capture has 128
 _SHORTEST_HEADER = 128  # bytes of the shortest header that numpy writes
+_BLOCK_BYTES = 1024**2
 
 
 class NpyHeader(NamedTuple):
@@ -41,11 +50,7 @@ class NpyHeader(NamedTuple):
 
 
 def npy_header(path: Location) -> NpyHeader:
-    """Read the header of a .npy file.
-
-    Raises:
-        InputError: the file cannot be read, or is something else.
-    """
+    """Read the header of a .npy file; an `InputError` if it cannot be read, or is something else."""
     if isinstance(path, Url):
         start = read_range(path, 0, _HEADER_BYTES)
         header = read_npy_header(BytesIO(start))
@@ -60,11 +65,7 @@ def npy_header(path: Location) -> NpyHeader:
 
 
 def read_npy_header(file: IO[bytes] | GzipFile) -> NpyHeader | None:
-    """Return the header at the beginning of an open file; None if it is damaged or missing.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Return the header at the beginning of an open file; None if it is damaged or missing. An `OSError` passes."""
     try:
         version = np.lib.format.read_magic(file)
         # Version 3 differs only for structured types, which no capture has.
@@ -78,11 +79,7 @@ def read_npy_header(file: IO[bytes] | GzipFile) -> NpyHeader | None:
 
 
 def require_whole(path: Location, header: NpyHeader) -> None:
-    """Refuse a .npy file that is shorter than its header promises.
-
-    Raises:
-        InputError: the file is shorter.
-    """
+    """Raise an `InputError` for a .npy file that is shorter than its header promises."""
     size = size_of(path)
     if size < header.file_bytes:
         raise InputError(
@@ -92,16 +89,7 @@ def require_whole(path: Location, header: NpyHeader) -> None:
 
 
 def require_frames(path: Location, header: NpyHeader, axes: str) -> None:
-    """Refuse an array without values, or one that is not in C order.
-
-    Args:
-        path: the file, for the message.
-        header: its header.
-        axes: the names of the axes, such as "frames, height, width".
-
-    Raises:
-        InputError: it is so.
-    """
+    """Raise an `InputError` for an array without values, or not in C order; `axes` is such as "frames, height, width"."""
     if min(header.shape) < 1:
         raise InputError(f"{path} is empty: its shape is {header.shape} ({axes})")
     if header.fortran_order:
@@ -136,3 +124,121 @@ def _guess(start: bytes) -> str:
     if start.startswith(b"\x93NUM"):
         return " that can be read: its header is damaged; write it again"
     return ", by its first bytes; write it with numpy.save"
+
+
+logger = logging.getLogger(__name__)
+
+
+def local(path: Location) -> Path:
+    """Return the path of a compressed file; an `InputError` for a URL, of which it can only be read from its beginning."""
+    if isinstance(path, Url):
+        raise InputError(f"{path} is compressed with gzip, and cannot be read in parts; unpack it there, or download it")
+    return path
+
+
+def unpacked_start(path: Path, n_bytes: int) -> bytes:
+    """Return the first bytes of a file, unpacked if it is compressed; none if it cannot be read."""
+    if not is_gzip(path):
+        return read_start(path, n_bytes)
+    try:
+        with gzip.open(path) as file:
+            return file.read(n_bytes)
+    except (OSError, EOFError, zlib.error):
+        return b""
+
+
+def any_npy_header(path: Location) -> NpyHeader:
+    """Read the header of a .npy or .npy.gz file; raises as `npy_header` and `gzipped_npy_header`."""
+    return gzipped_npy_header(path) if is_gzip(path) else npy_header(path)
+
+
+def gzipped_npy_header(path: Location) -> NpyHeader:
+    """Read the header of the array in a .npy.gz file, without its data.
+
+    Raises:
+        InputError: the file cannot be read, or holds something else; or it is a URL.
+    """
+    path = local(path)
+    try:
+        with gzip.open(path) as file:
+            header = read_npy_header(file)
+    except (OSError, EOFError, zlib.error) as error:
+        raise _damaged(path) from error
+    if header is None:
+        raise InputError(f"{path} holds no .npy file; compress one that numpy.save has written")
+    return header
+
+
+def unpacked(path: Location) -> Path:
+    """Return the path of a .npy file with the content of a .npy.gz file.
+
+    For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. It is written, and a warning logged, unless it is there with the
+    checksum that the archive ends with. Until the process ends, it is locked for others who would remove it.
+
+    Raises:
+        InputError: the file is damaged, or holds something else.
+        OutputError: the unpacked file cannot be written, or does not fit on its disk.
+    """
+    path = local(path)
+    promised = gzipped_npy_header(path).file_bytes
+    target = unpacked_path(path)
+    if not _is_content(target, path, promised):
+        require_space(target, promised)
+        logger.warning("%s is unpacked to %s, once", path, target.name)
+        with atomic_path(target) as temporary:
+            _unpack(path, temporary, promised)
+    hold(target)
+    return target
+
+
+def unpacked_path(path: Path) -> Path:
+    """Return where a .npy.gz file is unpacked to."""
+    return path.with_name(f"{path.name}.unpacked.npy")
+
+
+def _is_content(target: Path, path: Path, promised: int) -> bool:
+    """Return whether a file has the checksum that an archive ends with; one of several parts is always unpacked again."""
+    if target.is_symlink() or not target.is_file() or target.stat().st_size != promised:
+        return False
+    with reading(path), path.open("rb") as archive:
+        archive.seek(-8, os.SEEK_END)
+        recorded = int.from_bytes(archive.read(4), "little")
+    return _crc32(target, target.stat().st_ctime_ns) == recorded
+
+
+@lru_cache(16)
+def _crc32(path: Path, changed_ns: int) -> int:
+    """Return the checksum of a file, which is read again if it has changed."""
+    del changed_ns
+    checksum = 0
+    with reading(path), path.open("rb") as file:
+        while block := file.read(_BLOCK_BYTES):
+            checksum = zlib.crc32(block, checksum)
+    return checksum
+
+
+def _unpack(path: Path, target: Path, promised: int) -> None:
+    """Unpack at most as many bytes as the header promises: a damaged file must not fill the disk."""
+    size = 0
+    with target.open("wb") as out, gzip.open(path) as file:
+        while block := _next_block(path, file):
+            size += len(block)
+            if size > promised:
+                break
+            out.write(block)
+    if size != promised:
+        more = "more" if size > promised else f"{size}"
+        raise InputError(
+            f"{path} is damaged: the header of its array promises {promised} bytes, there are {more}; copy or record it again"
+        )
+
+
+def _next_block(path: Path, file: gzip.GzipFile) -> bytes:
+    try:
+        return file.read(_BLOCK_BYTES)
+    except (OSError, EOFError, zlib.error) as error:
+        raise _damaged(path) from error
+
+
+def _damaged(path: Path) -> InputError:
+    return InputError(f"{path} is cut short or damaged: gzip cannot unpack it; copy it again")

@@ -40,19 +40,12 @@ class PixelOrder(NamedTuple):
 
 
 class OtherOrder(NamedTuple):
-    """An order of the pixels that the frames show instead of another.
-
-    Attributes:
-        order: the order.
-        within: correlation of adjacent bits of a byte, photon noise included.
-        expected: correlation across the borders of bytes in the order that was expected.
-        found: correlation across them in the order that was found.
-    """
+    """An order of the pixels that the frames show instead of another."""
 
     order: PixelOrder
-    within: float
-    expected: float
-    found: float
+    within: float  # correlation of adjacent bits of a byte, photon noise included
+    expected: float  # correlation across the borders of bytes in the order that was expected
+    found: float  # correlation across them in the order that was found
 
     def __str__(self) -> str:
         return (
@@ -76,16 +69,10 @@ _WORDS = {
 
 
 def other_order(samples: Sequence[NDArray[np.uint8]], expected: PixelOrder = ORDERS[0]) -> OtherOrder | None:
-    """Return the order of the pixels if the frames show another than the expected one.
+    """Return the order of the pixels that runs of frames (n, rows, bytes of a row) show instead of the expected one.
 
-    Noise, uniform light and static columns have no order; stripes and other regular patterns agree with the expected one.
-
-    Args:
-        samples: runs of consecutive frames, each (n, rows, bytes of a row).
-        expected: the order that the capture is read with.
-
-    Returns:
-        None where the expected order fits, or where the frames are too dark or too plain.
+    None where that fits, or where the frames are too dark or too plain. Noise, uniform light and static columns have no order;
+    stripes and other regular patterns agree with the expected one.
     """
     found = [_other(_Likeness(products), ORDERS.index(expected)) for products in _products_of(samples)]
     scored = [each for each in found if each is not None]

@@ -32,26 +32,15 @@ _NO_ANSWER = {
 
 
 class RemoteFile(NamedTuple):
-    """What a server says about a file.
+    """What a server says about a file."""
 
-    Attributes:
-        size: its bytes; None if the server does not say.
-        modified: when it was written; None if the server does not say.
-        etag: the server's mark of its content; None if there is none.
-    """
-
-    size: int | None
-    modified: datetime | None
-    etag: str | None
+    size: int | None  # its bytes; None if the server does not say
+    modified: datetime | None  # when it was written; None if the server does not say
+    etag: str | None  # the server's mark of its content; None if there is none
 
 
 def library(module: str, install: str, what: str) -> ModuleType:
-    """Import a library that only some files need.
-
-    Args:
-        module: its name.
-        install: what to pass to `pip install`, such as `photonpano[s3]`.
-        what: the subject of the message, such as "s3://bucket/cube.npy".
+    """Import a library that only some files need; `install` goes to pip, `what` is the subject of the message.
 
     Raises:
         InputError: it is not installed.
@@ -80,11 +69,7 @@ def remote_file(url: Url) -> RemoteFile:
 
 
 def size_of(url: Url) -> int:
-    """Return the size of a file in bytes, if it can be read in ranges.
-
-    Raises:
-        InputError: as `remote_file`; or the server does not give the size, or gives whole files only.
-    """
+    """Return the size of a file in bytes, if it can be read in ranges; raises as `remote_file`."""
     size = remote_file(url).size
     if size is None:
         raise InputError(f"{url} is of unknown size: its server does not give it; download the file")
@@ -94,11 +79,7 @@ def size_of(url: Url) -> int:
 
 
 def read_range(url: Url, start: int, stop: int) -> bytes:
-    """Read the bytes of a file from `start` to `stop` - 1; fewer if it ends before.
-
-    Raises:
-        InputError: as `remote_file`; or the server gives whole files only.
-    """
+    """Read the bytes of a file from `start` to `stop` - 1, fewer if it ends before; raises as `remote_file`."""
     with _asking(url):
         system, path = _file_system(url)
         data: bytes = system.cat_file(path, start=start, end=stop)
@@ -108,11 +89,7 @@ def read_range(url: Url, start: int, stop: int) -> bytes:
 
 
 def remote_files_in(url: Url, suffix: str) -> list[Url]:
-    """Return the files below a URL whose names have an ending, in no order; the URL itself if it has that ending.
-
-    Raises:
-        InputError: as `remote_file`; or the server lists no files.
-    """
+    """Return the files below a URL with an ending, in no order; the URL itself if it has it; raises as `remote_file`."""
     if url.suffix.lower() == suffix:
         return [url]
     with _asking(url):

@@ -27,7 +27,6 @@ class Arrangement(Protocol):
 
         The pixels of a byte stay together. The argument must not be changed.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,14 +103,9 @@ class BinarySource(Closing, ABC):
 
     @abstractmethod
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
-        """Yield the frames of a span, a few at a time.
+        """Yield the place of some frames in a span, and their packed rows, (n, rows, bytes of a row).
 
-        Returns:
-            The place of these frames in the span, and their packed rows, (n, rows, bytes of a row), which the next step may
-            overwrite.
-
-        Raises:
-            InputError: the frames cannot be read.
+        The next step may overwrite the rows. An `InputError` says why frames cannot be read.
         """
 
     def counts(self, span: FrameSpan) -> Counts:
@@ -157,8 +151,7 @@ class BlockSource(Closing, ABC):
     def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
         """Yield some frames of a span at a time, (n, H, W), whose values fit into the bits of `info`, and their place in it.
 
-        Raises:
-            InputError: the frames cannot be read.
+        An `InputError` says why frames cannot be read.
         """
 
     def counts(self, span: FrameSpan) -> Counts:
@@ -184,11 +177,7 @@ class SingleFrameSource(BlockSource):
 
     @abstractmethod
     def frame(self, index: int) -> NDArray[np.bool_] | Frames:
-        """Return a frame of the capture, (H, W), whose values fit into the bits of `info`.
-
-        Raises:
-            InputError: the frame cannot be read.
-        """
+        """Return a frame of the capture, (H, W), whose values fit into the bits of `info`, or raise an `InputError`."""
 
     def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
         """Yield the frames of a span one by one."""

@@ -22,8 +22,7 @@ from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
 from photonpano.report.figures import centre_of, instants_of, places_on
 from photonpano.report.residual_figures import misfit_cells, same_projection
-from photonpano.residuals.refinement import Explained
-from photonpano.residuals.unexplained import distance_to_nearest
+from photonpano.residuals.refinement import Explained, distance_to_nearest
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
 LINEAR_VALUES = 1_200_000

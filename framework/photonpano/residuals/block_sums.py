@@ -149,14 +149,9 @@ def add_pixel_sums(
     residual: NDArray[np.float32],
     total: NDArray[np.float32],
 ) -> None:
-    """Add residuals, and expected counts, to the sums of each pixel; unknown pixels are NaN in `counts` or `mean`.
+    """Add residuals and expected counts to the sums (H, W) of each pixel; unknown pixels are NaN in `counts` or `mean`.
 
-    Args:
-        counts: (H, W) summed counts.
-        n_frames: frames of the span.
-        mean: (H, W) expected count of a frame.
-        residual: (H, W) sum of residuals; added to.
-        total: (H, W) sum of expected counts; added to.
+    `counts` are summed over `n_frames`, `mean` is the expected count of one.
     """
     n, zero = np.float32(n_frames), np.float32(0)
     for y in range(mean.shape[0]):
@@ -170,27 +165,16 @@ def add_pixel_sums(
 
 
 class Totals(NamedTuple):
-    """Sums over spans that `fold` adds to: (h, w) for blocks of the sensor, (H', W') for squares of the panorama.
+    """Sums over spans that `fold` adds to: (h, w) for blocks of the sensor, (H', W') for squares of the panorama."""
 
-    Attributes:
-        blocks: (h, w, 12) sums over time.
-        block_misfit: squared residuals of blocks / their variance.
-        block_count: number of blocks in these sums.
-        cell_misfit: the same, by the square of the panorama that a block falls on.
-        cell_count: number of blocks in these sums.
-        cell_noise: variance of the residuals, relative to the squared prediction.
-        pixel_residual: (H, W) residuals of each pixel: see `add_pixel_sums`.
-        pixel_mean: (H, W) expected counts.
-    """
-
-    blocks: NDArray[np.float64]
-    block_misfit: NDArray[np.float64]
-    block_count: NDArray[np.float64]
-    cell_misfit: NDArray[np.float64]
-    cell_count: NDArray[np.float64]
-    cell_noise: NDArray[np.float64]
-    pixel_residual: NDArray[np.float32]
-    pixel_mean: NDArray[np.float32]
+    blocks: NDArray[np.float64]  # (h, w, 12) sums over time
+    block_misfit: NDArray[np.float64]  # squared residuals of blocks / their variance
+    block_count: NDArray[np.float64]  # number of blocks in these sums
+    cell_misfit: NDArray[np.float64]  # the same, by the square of the panorama that a block falls on
+    cell_count: NDArray[np.float64]  # number of blocks in these sums
+    cell_noise: NDArray[np.float64]  # variance of the residuals, relative to the squared prediction
+    pixel_residual: NDArray[np.float32]  # (H, W) residuals of each pixel: see `add_pixel_sums`
+    pixel_mean: NDArray[np.float32]  # (H, W) expected counts
 
     @classmethod
     def zeros(cls, shape: tuple[int, int], canvas_shape: tuple[int, int]) -> Totals:

@@ -12,11 +12,9 @@ from photonpano.context import Context
 from photonpano.geometry import steps_px
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.timeline import Cut
-from photonpano.motion.tracking.runs import DARK, SumTrack, track_sums
-from photonpano.motion.tracking.spans import span_image
+from photonpano.motion.tracking.spans import DARK, SumTrack, span_image, track_sums
 from photonpano.protocols import Source
-from photonpano.residuals.refinement import MotionFit
-from photonpano.residuals.unexplained import standing_out
+from photonpano.residuals.refinement import MotionFit, standing_out
 from photonpano.values import FloatArray, FluxImage, FrameSpan, true_spans
 
 # Sums searched on both sides of spans that stand out.
@@ -47,19 +45,12 @@ _NOISE_FLOOR = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class _Outlier:
-    """A shift between two sums that the motion before and after does not explain.
+    """A shift between two sums that the motion before and after does not explain."""
 
-    Attributes:
-        before: number of the sum before.
-        after: number of the sum after.
-        shift_px: (2,) what is not explained, in binned px.
-        sigmas: its size in standard deviations.
-    """
-
-    before: int
-    after: int
-    shift_px: FloatArray
-    sigmas: float
+    before: int  # number of the sum before
+    after: int  # number of the sum after
+    shift_px: FloatArray  # (2,) what is not explained, in binned px
+    sigmas: float  # its size in standard deviations
 
 
 def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ...]:
@@ -68,11 +59,6 @@ def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ..
     Places come into question where spans stand out from the motion. There, sums of a few frames are tracked by phase
     correlation, from frames alone. Where a shift is an outlier, each frame is compared with templates from before and after,
     and a jump at each frame with fast motions: see `_located`.
-
-    Args:
-        source: the capture.
-        fit: the result of the loop, and what it does not explain.
-        context: threads and progress.
     """
     size = _size_of_sums(fit)
     suspect = _suspect(fit, _MARGIN * size)
@@ -189,19 +175,12 @@ def _located(source: Source, track: SumTrack, outlier: _Outlier) -> Cut | None:
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """A smooth path of the image with a jump: a cubic polynomial of time, and a step.
+    """A smooth path of the image with a jump: a cubic polynomial of time, and a step."""
 
-    Attributes:
-        middle: the instant around which time is counted.
-        scale: frames of a unit of time.
-        coefficients: (4, 2) of the polynomial, in binned px.
-        jump: (2,) the step.
-    """
-
-    middle: float
-    scale: float
-    coefficients: FloatArray
-    jump: FloatArray
+    middle: float  # the instant around which time is counted
+    scale: float  # frames of a unit of time
+    coefficients: FloatArray  # (4, 2) of the polynomial, in binned px
+    jump: FloatArray  # (2,) the step
 
     @classmethod
     def of(cls, track: SumTrack, outlier: _Outlier) -> _Path:
@@ -257,12 +236,9 @@ def _moved(image: FluxImage, shift: FloatArray) -> FluxImage:
 
 
 def _log_likelihoods(image: FluxImage, expected: FloatArray, n_pixels: int) -> FloatArray:
-    """Return the log likelihoods of a frame, up to a constant, for each of P expectations: (P,).
+    """Return the log likelihoods (P,) of a frame, up to a constant, for P expectations (P, h, w), NaN where unknown.
 
-    Args:
-        image: (h, w) mean counts, binned.
-        expected: (P, h, w), NaN where nothing is known.
-        n_pixels: pixels of a binned one.
+    A binned pixel (h, w) is the mean of `n_pixels`.
     """
     seen = np.isfinite(expected).all(axis=0) & np.isfinite(image)
     variance = np.maximum(expected[:, seen].mean(axis=0), _NOISE_FLOOR) / n_pixels
@@ -272,9 +248,8 @@ def _log_likelihoods(image: FluxImage, expected: FloatArray, n_pixels: int) -> F
 def _likelihoods_of(likelihood: FloatArray, ramp: int) -> FloatArray:
     """Return the log likelihood of motions that take `ramp` frames from the old path to the new one, for each middle: (M,).
 
-    Args:
-        likelihood: (T, steps + 1) log likelihood of each frame, from the old path to the new one.
-        ramp: 0 for a jump, whose middle m is its first frame.
+    `likelihood` is (T, steps + 1), that of each frame from the old path to the new one. Of a jump, whose ramp is 0, the middle
+    is its first frame.
     """
     n_frames, steps = likelihood.shape[0], likelihood.shape[1] - 1
     frames, middles = np.arange(n_frames), np.arange(n_frames + 1)

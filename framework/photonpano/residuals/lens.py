@@ -17,16 +17,12 @@ _INSTANTS = 64  # instants of the motion at which the effect of a lens is comput
 
 @dataclass(frozen=True, slots=True)
 class LensDistortion:
-    """Radial distortion, as residuals show it.
+    """Radial distortion, as residuals show it."""
 
-    Attributes:
-        k1: displacement of a corner, relative to its distance from the centre; negative for a barrel. To first order: a strong
-            distortion is found too small.
-        std: its standard deviation.
-    """
-
+    # displacement of a corner, relative to its distance from the centre; negative for a barrel. To first order: a strong
+    # distortion is found too small.
     k1: float
-    std: float
+    std: float  # its standard deviation
 
     @property
     def sigmas(self) -> float:
@@ -41,13 +37,7 @@ def lens_distortion(
 
     The panorama averages the distortions of all frames that saw a place, and each homography follows the distortion as far as
     it can. What is left is a pattern over the sensor, which depends on the path and is computed here to first order. Its size
-    in the shifts is the distortion.
-
-    Args:
-        shifts: (h, w, 2) mean shift of each block, in px.
-        information: (h, w, 2, 2) inverse covariances, 0 for blocks without a shift.
-        homographies: (T, 3, 3) of the located frames.
-        frame_shape: (height, width) of a frame.
+    in the shifts, (h, w, 2) px, is the distortion; their information, (h, w, 2, 2), is 0 for blocks without a shift.
     """
     known = information[..., 0, 0] > 0
     if known.sum() < _INSTANTS // 4 or len(homographies) < 2:

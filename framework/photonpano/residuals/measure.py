@@ -50,43 +50,27 @@ _PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """Observed minus predicted photons, summed in four ways.
+    """Observed minus predicted photons, summed in four ways."""
 
-    Attributes:
-        spans: S spans of frames, in order, that together are the located frames.
-        instants: (S,) their centres.
-        normal: (S, 5, 5) matrices of the least-squares equations of the spans: shift along x and y in px, roll in radians,
-            zoom and gain as fractions.
-        gradient: (S, 5) right-hand sides of these equations.
-        misfit: (S,) mean over the blocks of a span of squared residual / variance, expected to be 1.
-        blocks: (h, w, 12) sums over time, for each block of the sensor: see `block_sums`.
-        block_misfit: (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen.
-        pixel_gain: (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted.
-        pixel_mean: (H, W) predicted photons of each pixel, in one of four spans.
-        cell_misfit: (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was
-            seen.
-        cell_count: (H', W') number of blocks that fell on each square.
-        cell_noise: (H', W') mean over these blocks of variance / squared prediction: the squared relative noise of a block.
-        frames_seen: frames that saw a place of the panorama, the median over its pixels.
-        frame_shape: (height, width) of a frame.
-        light: (S,) mean gain of the light of each span, 1 in steady light.
-    """
-
-    spans: tuple[FrameSpan, ...]
-    instants: FloatArray
+    spans: tuple[FrameSpan, ...]  # S spans of frames, in order, that together are the located frames
+    instants: FloatArray  # (S,) their centres
+    # (S, 5, 5) matrices of the least-squares equations of the spans: shift along x and y in px, roll in radians, zoom and gain
+    # as fractions
     normal: FloatArray
-    gradient: FloatArray
-    misfit: FloatArray
-    blocks: FloatArray
-    block_misfit: FloatArray
-    pixel_gain: FluxImage
-    pixel_mean: FluxImage
+    gradient: FloatArray  # (S, 5) right-hand sides of these equations
+    misfit: FloatArray  # (S,) mean over the blocks of a span of squared residual / variance, expected to be 1
+    blocks: FloatArray  # (h, w, 12) sums over time, for each block of the sensor: see `block_sums`
+    block_misfit: FloatArray  # (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen
+    pixel_gain: FluxImage  # (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted
+    pixel_mean: FluxImage  # (H, W) predicted photons of each pixel, in one of four spans
+    # (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was seen
     cell_misfit: FloatArray
-    cell_count: FloatArray
+    cell_count: FloatArray  # (H', W') number of blocks that fell on each square
+    # (H', W') mean over these blocks of variance / squared prediction: the squared relative noise of a block
     cell_noise: FloatArray
-    frames_seen: float
-    frame_shape: tuple[int, int]
-    light: FloatArray
+    frames_seen: float  # frames that saw a place of the panorama, the median over its pixels
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    light: FloatArray  # (S,) mean gain of the light of each span, 1 in steady light
 
     def steps(self) -> SpanResiduals:
         """Solve for the motion of each span; the gain of the light is solved for, too, and left out."""
@@ -106,10 +90,9 @@ class Residuals:
         return solved[:, N_STEPS], np.sqrt(covariance[:, N_STEPS, N_STEPS])
 
     def block_shifts(self) -> tuple[FloatArray, FloatArray]:
-        """Return the mean shift of each block of the sensor against the panorama, and its information.
+        """Return the mean shift of each block of the sensor against the panorama, (h, w, 2) in px, and its information.
 
-        Returns:
-            (h, w, 2) in px, and (h, w, 2, 2) inverse covariances by photon noise, 0 where a block carries no shift.
+        That is (h, w, 2, 2), inverse covariances by photon noise, 0 where a block carries no shift.
         """
         information = np.stack([self.blocks[..., [GXX, GXY]], self.blocks[..., [GXY, GYY]]], axis=-2)
         right = self.blocks[..., [GX_R, GY_R]]
@@ -120,13 +103,7 @@ class Residuals:
 
 
 def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Residuals:
-    """Compare the frames of a span with what the panorama predicts, each pixel in its colour.
-
-    Args:
-        span: the located frames.
-        predictions: the panorama along the motion, for each colour of the capture.
-        context: threads and progress; the result does not depend on the number of threads.
-    """
+    """Compare the located frames with what the panorama predicts along the motion, each pixel in its colour."""
     spans = spans_of(span, predictions)
     # The mean over the frames, which is not the motion at the centre where frames are repeated, or tremble.
     starts = [each.start - span.start for each in spans]
@@ -172,12 +149,7 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
 
 
 def spans_of(span: FrameSpan, predictions: Predictions) -> tuple[FrameSpan, ...]:
-    """Divide frames into spans: long enough for the photons to carry a shift, short enough for the motion.
-
-    Args:
-        span: the frames to divide.
-        predictions: the panorama along the motion.
-    """
+    """Divide frames into spans: long enough for the photons to carry a shift, short enough for the motion."""
     frames = np.arange(span.start, span.stop)
     frame_shape = predictions.first.frame_shape
     homographies = predictions.first.trajectory.at(frames)
@@ -220,36 +192,27 @@ def _shift_noise_px(predictions: Predictions, homographies: FloatArray) -> float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Colour:
-    """Counts and prediction in one colour of the capture.
+    """Counts and prediction in one colour of the capture."""
 
-    Attributes:
-        source: its pixels.
-        prediction: the panorama in this colour.
-        masked: (H, W) 0, NaN for pixels of other colours and masked ones; None if there is none.
-        corrected: takes everything but the flux out of a sum of frames; None if there is nothing else.
-        dark: (H, W) what it subtracts for each frame.
-        extra: (H, W) the variance that this adds to the count of a frame.
-        slope: (H, W) factor of the counts; None for frames of grey levels, and if there is nothing to correct.
-    """
-
-    source: Capture
-    prediction: Prediction
-    masked: FluxImage | None
+    capture: Capture  # its pixels
+    prediction: Prediction  # the panorama in this colour
+    masked: FluxImage | None  # (H, W) 0, NaN for pixels of other colours and masked ones; None if there is none
+    # takes everything but the flux out of a sum of frames; None if there is nothing else
     corrected: Callable[[Counts, int], FluxImage] | None
-    dark: FluxImage
-    extra: FluxImage
-    slope: FluxImage | None
+    dark: FluxImage  # (H, W) what it subtracts for each frame
+    extra: FluxImage  # (H, W) the variance that this adds to the count of a frame
+    slope: FluxImage | None  # (H, W) factor of the counts; None for frames of grey levels, and if there is nothing to correct
 
     @classmethod
-    def of(cls, source: Capture, prediction: Prediction) -> _Colour:
+    def of(cls, capture: Capture, prediction: Prediction) -> _Colour:
         shape = prediction.frame_shape
-        corrected = source.corrected if source.corrects_sums else None
+        corrected = capture.corrected if capture.corrects_sums else None
         zeros = np.zeros(shape, np.uint32)
         # Corrected counts are `slope * counts - n * dark`: counts of the dark, and of less sensitive pixels, add noise.
         dark = np.zeros(shape, np.float32) if corrected is None else -corrected(zeros, 1)
-        slope = corrected(zeros + 1, 1) + dark if corrected is not None and source.info.kind == "binary" else None
-        masked = None if source.valid.all() else np.where(source.valid, np.float32(0), np.float32(np.nan))
-        return cls(source, prediction, masked, corrected, dark, np.maximum(dark, 0), slope)
+        slope = corrected(zeros + 1, 1) + dark if corrected is not None and capture.info.kind == "binary" else None
+        masked = None if capture.valid.all() else np.where(capture.valid, np.float32(0), np.float32(np.nan))
+        return cls(capture, prediction, masked, corrected, dark, np.maximum(dark, 0), slope)
 
     def counted(self, raw: Counts, n_frames: int) -> NDArray[np.float32] | NDArray[np.int32]:
         """Return the counts of a span, corrected, NaN where masked: (H, W)."""
@@ -279,15 +242,15 @@ def _measured(
     row, column = np.mgrid[: grid[0], : grid[1]]
     middle = np.stack([_middles(column, width), _middles(row, height)], axis=-1)
     lever = middle - corners(shape).mean(axis=0)
-    colours = [_Colour.of(source, prediction) for source, prediction in predictions.parts]
-    source = colours[0].source
+    colours = [_Colour.of(*part) for part in predictions.parts]
+    capture = colours[0].capture
     normal, gradient, misfit = np.zeros((len(spans), 5, 5)), np.zeros((len(spans), 5)), np.zeros(len(spans))
     total = Totals.zeros(shape, first.canvas.shape)
     # A pixel adds to the image of its colour, which fewer frames have seen.
     frames_seen = max(predictions.frames_seen / len(colours), 1.0)
     images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
     for index, (span, homography) in enumerate(zip(spans, homographies, strict=True)):
-        raw = source.counts(span)
+        raw = capture.counts(span)
         sums[:] = 0
         for colour in colours:
             counts = colour.counted(raw, len(span))

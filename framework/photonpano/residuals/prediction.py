@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from photonpano.capture import Capture, capture_of
 from photonpano.geometry import Camera, Canvas, corners
 from photonpano.merging.light import gain_image
+from photonpano.photometry import frame_variance
 from photonpano.protocols import Source, Trajectory
 from photonpano.residuals.block_sums import sample_places, sample_view
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Panorama, Response
 
 _BLUR_PX = 0.7  # standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture
 _INTERPOLATION_PX2 = 1 / 6  # variance of the kernel of one linear interpolation, averaged over the fractions of a pixel
-_MANY_FRAMES = 1e4  # frames for which the variance of a count is derived; it is then divided by them
+_MANY_FRAMES = 1e4  # of a mean count that is exact
 _MARGIN = 4  # columns with which a full turn is continued on each side: more than the smoothing reaches
 _STRAIGHT_RUN_PX = 64  # from this length of straight runs on, the compiled interpolation is faster than OpenCV's
 
@@ -28,31 +29,21 @@ class Prediction:
 
     The panorama is smoothed, and then sharpened by as much as smoothing and interpolation have blurred it, to second order. So
     its noise is low and its edges are where they were.
-
-    Attributes:
-        canvas: of the panorama.
-        mean: (H, W) float32, expected count of a frame; NaN where the panorama was not seen. Of a full turn, it has `margin`
-            columns more on each side, which continue on the other side.
-        precision: (H, W) float32, 1 / variance of the count of a frame; 0 where the panorama was not seen.
-        trajectory: the motion.
-        frame_shape: (height, width) of a frame.
-        frames_seen: frames that saw a place of the panorama, the median over its pixels.
-        response: of the camera.
-        light: the gain of each frame; None in steady light.
-        ideal: (H, W, 3) homogeneous ideal pixels of the pixels of a frame; None if homographies map them to the panorama.
-        margin: see `mean`.
     """
 
-    canvas: Canvas
+    canvas: Canvas  # of the panorama
+    # (H, W) float32, expected count of a frame; NaN where the panorama was not seen. Of a full turn, it has `margin` columns
+    # more on each side, which continue on the other side.
     mean: FluxImage
-    precision: FluxImage
+    precision: FluxImage  # (H, W) float32, 1 / variance of the count of a frame; 0 where the panorama was not seen
     trajectory: Trajectory
-    frame_shape: tuple[int, int]
-    frames_seen: float
-    response: Response
-    light: Light | None = None
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    frames_seen: float  # frames that saw a place of the panorama, the median over its pixels
+    response: Response  # of the camera
+    light: Light | None = None  # the gain of each frame; None in steady light
+    # (H, W, 3) homogeneous ideal pixels of the pixels of a frame; None if homographies map them to the panorama
     ideal: FloatArray | None = None
-    margin: int = 0
+    margin: int = 0  # see `mean`
 
     @classmethod
     def of(
@@ -65,17 +56,7 @@ class Prediction:
         light: Light | None = None,
         camera: Camera | None = None,
     ) -> Prediction:
-        """Make the prediction of a panorama.
-
-        Args:
-            panorama: flux and weight, rendered along the trajectory.
-            canvas: on which it was rendered.
-            response: the response of the camera.
-            trajectory: frame pixels to reference pixels.
-            frame_shape: (height, width) of a frame.
-            light: the gain of each frame; None in steady light.
-            camera: of the frames; None if it is not known.
-        """
+        """Make the prediction of a panorama that was rendered along the trajectory, frame pixels to reference pixels."""
         margin = _MARGIN if canvas.is_full_turn else 0
         panorama = _continued(panorama, margin)
         seen = panorama.weight > 0
@@ -88,7 +69,7 @@ class Prediction:
         sharp = np.maximum(flux - blur / 2 * cv2.Laplacian(flux, cv2.CV_32F, ksize=1), 0)
         mean = response.mean_count(np.asarray(sharp, np.float32))
         mean[~inside] = np.nan
-        precision = np.asarray(1 / _variance(flux, response), np.float32)
+        precision = np.asarray(1 / frame_variance(flux, response, response.mean_count), np.float32)
         precision[~inside] = 0
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
         remapped = not canvas.planar or (camera is not None and camera.distorts)
@@ -96,12 +77,9 @@ class Prediction:
         return cls(canvas, mean, precision, trajectory, frame_shape, frames_seen, response, light, ideal, margin)
 
     def view(self, homography: Homography, into: NDArray[np.float32], span: FrameSpan | None = None) -> None:
-        """Sample both images at the pixels of a frame.
+        """Sample mean and precision at the pixels of a frame into (2, H, W) float32, NaN where the panorama was not seen.
 
-        Args:
-            homography: (3, 3), frame pixels to reference pixels.
-            into: (2, H, W) float32, output: mean and precision, NaN where the panorama was not seen.
-            span: the frames whose light is predicted; None for the mean light.
+        `homography` maps frame pixels to reference pixels; `span` is of the frames whose light is predicted, None for the mean.
         """
         self._sample(homography, into)
         if self.light is not None and span is not None:
@@ -114,7 +92,8 @@ class Prediction:
         flux = self.response.flux(np.where(known, mean, np.float32(0)), _MANY_FRAMES)
         lit = np.asarray(gain * flux, np.float32)
         mean[:] = np.where(known, self.response.mean_count(lit), np.float32(np.nan))
-        precision *= _variance(flux, self.response) / _variance(lit, self.response)
+        before, after = (frame_variance(each, self.response, self.response.mean_count) for each in (flux, lit))
+        precision *= before / after
 
     def _sample(self, homography: Homography, into: NDArray[np.float32]) -> None:
         if self.ideal is not None:
@@ -165,27 +144,15 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predictions:
-    """The predictions of all colours of a capture: a `PanoramaView`. A grey capture has one.
+    """The predictions of all colours of a capture: a `PanoramaView`. A grey capture has one."""
 
-    Attributes:
-        parts: the source of each colour, with its prediction. Their motion is the same.
-    """
-
-    parts: tuple[tuple[Capture, Prediction], ...]
+    parts: tuple[tuple[Capture, Prediction], ...]  # the source of each colour, with its prediction. Their motion is the same.
 
     @classmethod
     def of(
         cls, source: Source, panorama: Panorama, canvas: Canvas, trajectory: Trajectory, frame_shape: tuple[int, int]
     ) -> Predictions:
-        """Make the predictions of a panorama.
-
-        Args:
-            source: the capture.
-            panorama: flux and weight along the trajectory, as `render` returns them for the source.
-            canvas: on which it was rendered.
-            trajectory: frame pixels to reference pixels.
-            frame_shape: (height, width) of a frame.
-        """
+        """Make the predictions of a panorama that was rendered along the trajectory, as `render` returns it for the source."""
         capture = capture_of(source)
 
         def prediction(each: Capture, single: Panorama) -> Prediction:
@@ -240,17 +207,3 @@ def _ideal(frame_shape: tuple[int, int], camera: Camera | None) -> FloatArray:
 
 def _smoothed(image: FluxImage) -> FluxImage:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR_PX, borderType=cv2.BORDER_CONSTANT), np.float32)
-
-
-def _variance(flux: FluxImage, response: Response) -> FluxImage:
-    """Return the variance of the count of a frame, for any response.
-
-    On the stabilised scale the noise is known; the derivative of that scale by the mean count converts it.
-    """
-    floor = max(1e-4 * float(flux.max(initial=0)), 1e-7)
-    low, high = np.maximum(flux * np.float32(0.98), floor), np.maximum(flux * np.float32(1.02), 2 * floor)
-    counts = response.mean_count(high) - response.mean_count(low)
-    steps = response.stabilised(high, _MANY_FRAMES) - response.stabilised(low, _MANY_FRAMES)
-    per_step = counts / np.maximum(steps, np.float32(1e-9))
-    std = response.stabilised_std(_MANY_FRAMES) * np.abs(per_step)
-    return np.asarray(np.maximum(_MANY_FRAMES * std**2, 1e-7), np.float32)

@@ -1,4 +1,4 @@
-"""How well a motion explains the photons: render the panorama along it, and compare it with what was observed."""
+"""How well a motion explains the photons of the panorama along it, and its errors beyond photon noise, frame by frame."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from photonpano.context import Context
-from photonpano.geometry import Canvas
+from photonpano.filtering import SYSTEMATIC_PX
+from photonpano.geometry import Canvas, corners
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
@@ -18,64 +22,142 @@ from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.protocols import Refiner, Source
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
-from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, unexplained_px
-from photonpano.values import Panorama
+from photonpano.values import BoolArray, FloatArray, Panorama
 
+_SMOOTH_SPANS = 25  # the ratio is that of motion faster than this many spans
+_LOCAL_SPANS = 33  # the size is averaged over this many spans
+# Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations.
+_SIGNIFICANT = 3.0
+_MISFIT = 3.0  # a span also stands out if the mean squared residual / variance of its blocks exceeds this
+# A single span stands out if the sum of its four squared steps, over their variances, exceeds this. Noise does so once in
+# 200,000 spans.
+_STANDS_OUT = 30.0
+# The measured steps of three spans bound the error of frames that are at most one span away from one.
+_BOUND_SPANS, _NEAR_SPANS = 3, 1.0
+
+_DARK = -0.5  # spans that are darker than predicted by half of the light or more show too little to be measured
 # A motion is worse if the scatter of the shifts grows by this factor, or the reduced chi-square of the photons by this much.
 _WORSE_RATIO, _WORSE_MISFIT = 1.05, 0.01
 
 
+def residual_ratio(residuals: Residuals) -> float:
+    """Return the scatter of the shifts of short spans over that of photon noise and interpolation; NaN for fewer than 50.
+
+    It is 1 where the motion is all there is. Slow changes are left out, since the panorama follows them.
+    """
+    steps, variances = _series(residuals)
+    shifts, expected = steps[:, :2], variances[:, :2]
+    known = np.isfinite(expected).all(axis=1)
+    if known.sum() < 2 * _SMOOTH_SPANS:
+        return float("nan")
+    ratios = shifts[known] / np.sqrt(expected[known])
+    kernel = np.ones(_SMOOTH_SPANS) / _SMOOTH_SPANS
+    slow = np.stack([np.convolve(np.pad(each, _SMOOTH_SPANS // 2, mode="edge"), kernel, "valid") for each in ratios.T], axis=1)
+    return float(np.sqrt(np.mean((ratios - slow) ** 2) / (1 - 1 / _SMOOTH_SPANS)))
+
+
+def unexplained_px(residuals: Residuals, n_frames: int) -> FloatArray:
+    """Return the corner error that the residuals show beyond photon noise, for every frame of the capture: (n_frames,).
+
+    It is the root mean square over 33 spans around the frame, or the step of a single span if that stands out, as at a place
+    where frames are missing; 0 where noise explains it.
+    """
+    steps, variances = _series(residuals)
+    known = np.isfinite(variances).all(axis=1)
+    if known.sum() < 2:
+        return np.zeros(n_frames)
+    squares, noise = (steps[known] ** 2).sum(axis=1), variances[known].sum(axis=1)
+    spread = 2 * (variances[known] ** 2).sum(axis=1)
+    size = min(_LOCAL_SPANS, len(squares))
+    kernel = np.ones(size) / size
+    left, right = (size - 1) // 2, size // 2
+    local, floor, width = (
+        np.convolve(np.pad(each, (left, right), mode="reflect"), kernel, "valid") for each in (squares, noise, spread)
+    )
+    excess = local - floor
+    found = np.where(excess > _SIGNIFICANT * np.sqrt(width / size), np.sqrt(np.maximum(excess, 0)), 0)
+    # The frames of a span and of its neighbours may move by as much as its step.
+    single = np.where((steps[known] ** 2 / variances[known]).sum(axis=1) > _STANDS_OUT, np.sqrt(squares), 0)
+    found = np.maximum(found, sliding_window_view(np.pad(single, 1), 3).max(axis=1))
+    return np.asarray(np.interp(np.arange(n_frames), residuals.instants[known], found))
+
+
+def bounded_std_px(std_px: FloatArray, residuals: Residuals) -> FloatArray:
+    """Return the expected corner errors (T,), infinite where not located, no larger than the residuals allow.
+
+    A frame lies within its measured shift, roll and zoom of the panorama, and so of the surest frame that sees the same place.
+    At the ends of a capture, where motion is extrapolated, this is less than what extrapolation lets expect.
+    """
+    steps, variances = _series(residuals)
+    known = np.isfinite(variances).all(axis=1) & (residuals.gains()[0] > _DARK)
+    if known.sum() < _BOUND_SPANS:
+        return std_px
+    squares = np.pad((steps[known] ** 2 + variances[known]).sum(axis=1), _BOUND_SPANS // 2, mode="edge")
+    local = sliding_window_view(squares, _BOUND_SPANS).mean(axis=1)
+    frames, instants = np.arange(len(std_px)), residuals.instants[known]
+    measured = np.interp(frames, instants, local)
+    measured[distance_to_nearest(instants, frames) > _NEAR_SPANS * np.median(np.diff(residuals.instants))] = np.inf
+    reach = max(1, int(residuals.frames_seen / 4))
+    surest = minimum_filter1d(std_px**2 + measured, 2 * reach + 1, mode="nearest")
+    return np.asarray(np.minimum(std_px, np.where(np.isfinite(std_px), np.sqrt(surest + measured), np.inf)))
+
+
+def distance_to_nearest(instants: FloatArray, frames: NDArray[np.integer]) -> FloatArray:
+    """Return the distance of each frame to the nearest of instants that are in order, in frames."""
+    after = np.searchsorted(instants, frames).clip(1, len(instants) - 1)
+    return np.asarray(np.minimum(abs(frames - instants[after - 1]), abs(frames - instants[after])))
+
+
+def standing_out(residuals: Residuals) -> BoolArray:
+    """Return which spans show a step, or a misfit, that noise does not explain: (S,)."""
+    steps, variances = _series(residuals)
+    with np.errstate(invalid="ignore"):
+        excess = np.nansum(np.where(np.isfinite(variances), steps**2 / variances, 0), axis=1)
+    return np.asarray((excess > _STANDS_OUT) | (residuals.misfit > _MISFIT))
+
+
+def _series(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
+    """Return the steps of the spans as motions of a corner in px, and their expected variances: (S, 4) each."""
+    shape = corners(residuals.frame_shape)
+    radius_px = float(np.linalg.norm(shape[0] - shape.mean(axis=0)))
+    to_px = np.array([1, 1, radius_px, radius_px])
+    found = residuals.steps()
+    information = np.maximum(np.diagonal(found.information, axis1=1, axis2=2), 0)
+    with np.errstate(divide="ignore"):
+        variances = to_px**2 / information + SYSTEMATIC_PX**2
+    return found.steps * to_px, variances
+
+
 @dataclass(frozen=True, slots=True)
 class NamedRefiner:
-    """A refiner of a run.
-
-    Attributes:
-        name: as in the spec.
-        component: the refiner.
-        origin: who provides it, such as "refiner 'short-spans' of photonpano 0.1.0".
-    """
+    """A refiner of a run."""
 
     name: str
     component: Refiner
-    origin: str
+    origin: str  # who provides it, such as "refiner 'short-spans' of photonpano 0.1.0"
 
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """What a refiner did.
+    """What a refiner did."""
 
-    Attributes:
-        name: of the refiner.
-        rounds: the summary of each correction that was used.
-        change_px: mean displacement of the corners of the frames by all of them.
-        kept_out: why its last motion was not used; empty if it was.
-    """
-
-    name: str
-    rounds: tuple[str, ...]
-    change_px: float
-    kept_out: str = ""
+    name: str  # of the refiner
+    rounds: tuple[str, ...]  # the summary of each correction that was used
+    change_px: float  # mean displacement of the corners of the frames by all of them
+    kept_out: str = ""  # why its last motion was not used; empty if it was
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explained:
-    """The refined motion, and the residuals of the photons from the panorama along it.
+    """The refined motion, and the residuals of the photons from the panorama along it."""
 
-    Attributes:
-        motion: of every frame; its expected error covers what the residuals show.
-        panorama: rendered along the motion, for the residuals; in colour, with an image for each colour of the filter array.
-        canvas: of the panorama.
-        residuals: observed minus predicted photons.
-        ratio: see `residual_ratio`.
-        refinements: what each refiner did.
-    """
-
-    motion: FrameMotion
+    motion: FrameMotion  # of every frame; its expected error covers what the residuals show
+    # rendered along the motion, for the residuals; in colour, with an image for each colour of the filter array
     panorama: Panorama
-    canvas: Canvas
-    residuals: Residuals
-    ratio: float
-    refinements: tuple[Refinement, ...]
+    canvas: Canvas  # of the panorama
+    residuals: Residuals  # observed minus predicted photons
+    ratio: float  # see `residual_ratio`
+    refinements: tuple[Refinement, ...]  # what each refiner did
 
 
 class MotionFit:
@@ -90,14 +172,7 @@ class MotionFit:
     """
 
     def __init__(self, source: Source, motion: FrameMotion, tolerance_px: float, memory: int, context: Context) -> None:
-        """Measure the residuals.
-
-        Args:
-            source: the capture.
-            motion: of every frame.
-            tolerance_px: motion within which frames are summed before they are warped, in px of a frame.
-            memory: bytes that rendering may take.
-            context: threads, progress and checkpoints.
+        """Measure the residuals; frames are summed where the motion stays within `tolerance_px`. `memory` is in bytes.
 
         Raises:
             CanvasTooLargeError: the panorama is far larger than what fits into the memory.
@@ -138,11 +213,7 @@ class MotionFit:
         return float(self.residuals.misfit.mean())
 
     def explained(self, refinements: Sequence[Refinement] = ()) -> Explained:
-        """Return the motion with an expected error that covers the residuals, and what else a verdict needs.
-
-        Args:
-            refinements: what each refiner did.
-        """
+        """Return the motion with an expected error that covers the residuals, and what else a verdict needs."""
         std_px, residuals = self.motion.std_px, self.residuals
         std_px = np.hypot(bounded_std_px(std_px, residuals), unexplained_px(residuals, len(std_px)))
         motion = replace(self.motion, std_px=std_px)

@@ -20,29 +20,21 @@ from photonpano.values import BoolArray, Decision
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
 NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
-# These need the pairs of the loop, which a run folder does not hold.
-MAX_CONTRAST = 0.02  # of residuals, as a share of the light, beyond which a large misfit counts
+# Contrast of the residuals, as a share of the light, beyond which a large reduced chi-square counts.
+MAX_CONTRAST = 0.02
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why a run is doubtful.
+    """Why a run is doubtful."""
 
-    Attributes:
-        what: what was found, in a clause.
-        figure: the number that decided.
-        threshold: the largest number that is trusted.
-        where: the frames, pixels or places, in a clause; empty if it is everywhere.
-        what_to_do: advice, in a clause.
-    """
-
-    what: str
-    figure: float
-    threshold: float
-    where: str
-    what_to_do: str
+    what: str  # what was found, in a clause
+    figure: float  # the number that decided
+    threshold: float  # the largest number that is trusted
+    where: str  # the frames, pixels or places, in a clause; empty if it is everywhere
+    what_to_do: str  # advice, in a clause
 
     def __str__(self) -> str:
         where = f" ({self.where})" if self.where else ""
@@ -51,17 +43,11 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether motion and panorama explain the photons.
+    """Whether motion and panorama explain the photons."""
 
-    Attributes:
-        status: "trusted" or "doubtful".
-        reasons: why it is doubtful, the most telling first.
-        residual_ratio: scatter of the shifts of short spans, in units of what noise explains; None if it is unknown.
-    """
-
-    status: Literal["trusted", "doubtful"]
-    reasons: tuple[Reason, ...]
-    residual_ratio: float | None
+    status: Literal["trusted", "doubtful"]  # "trusted" or "doubtful"
+    reasons: tuple[Reason, ...]  # why it is doubtful, the most telling first
+    residual_ratio: float | None  # scatter of the shifts of short spans, in units of what noise explains; None if it is unknown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,13 +106,7 @@ def _doubtful_above(threshold: float, what: str, what_to_do: str) -> Callable[[_
 
 
 def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
-    """Test the result of a run.
-
-    Args:
-        explained: motion and residuals.
-        levels: the results of the loop; empty if they are not known.
-        decisions: what was chosen from the capture, such as the share of the frame that stands still.
-    """
+    """Test the result of a run; `levels` are empty if they are not known, `decisions` hold the share that stands still."""
     run = _Run(explained, levels, decisions)
     reasons = tuple(reason for test in TESTS if (reason := test.reason(test.find(run))) is not None)
     ratio = explained.ratio if np.isfinite(explained.ratio) else None
@@ -134,12 +114,7 @@ def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequen
 
 
 def contradictions(dropped: int, pairs: int) -> Reason | None:
-    """Judge the pairs of the last level.
-
-    Args:
-        dropped: pairs that contradict the others.
-        pairs: all pairs.
-    """
+    """Judge the pairs of the last level, of which some, `dropped`, contradict the others."""
     return _contradictions.reason(_contradicting(dropped, pairs))
 
 

@@ -2,13 +2,11 @@
 
 from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Frames, Homography
 from photonpano.values.capture import Bayer, CaptureSummary, Decision, DecisionValue, StreamInfo
-from photonpano.values.exposure import Panorama, Response, VirtualExposure
+from photonpano.values.exposure import Panorama, PanoramaRows, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, true_spans
 from photonpano.values.light import Light
-from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated
+from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated, Refined, SpanResiduals
 from photonpano.values.poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
-from photonpano.values.refinement import Refined, SpanResiduals
-from photonpano.values.rendered import PanoramaRows
 
 __all__ = [
     "Ambiguity",

@@ -92,14 +92,8 @@ class CaptureSummary:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """A value that the spec leaves open and that was chosen from the capture.
+    """A value that the spec leaves open and that was chosen from the capture."""
 
-    Attributes:
-        what: name of the value, such as "group_size".
-        value: the chosen number, text or flag.
-        reason: a clause with the numbers that decided.
-    """
-
-    what: str
-    value: DecisionValue
-    reason: str
+    what: str  # name of the value, such as "group_size"
+    value: DecisionValue  # the chosen number, text or flag
+    reason: str  # a clause with the numbers that decided

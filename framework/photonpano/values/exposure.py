@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano.notebooks import facts, picture
 from photonpano.text import share
-from photonpano.values.arrays import FluxImage, Homography
+from photonpano.values.arrays import BoolArray, FluxImage, Homography
 from photonpano.values.frames import Group
 
 
@@ -22,22 +22,18 @@ class Response(Protocol):
 
     def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the expected count of one frame at this flux."""
-        ...
 
     def flux(self, mean_count: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return the maximum-likelihood flux of a mean count over `frames` frames; finite for finite input."""
-        ...
 
     def stabilised(self, flux: NDArray[np.float32], frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Map flux estimated from `frames` frames to a scale on which its noise is uniform: see `stabilised_std`.
 
         The mean does not depend on the number of frames, so that exposures of different lengths are comparable.
         """
-        ...
 
     def stabilised_std(self, frames: NDArray[np.float32] | float) -> NDArray[np.float32]:
         """Return the standard deviation, on that scale, of flux estimated from `frames` frames."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,3 +86,20 @@ class Panorama:
                 ("weight, median", f"{np.median(self.weight[seen]):,.0f} frames"),
             ]
         return picture(self.flux, "the panorama") + facts(rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PanoramaRows:
+    """Some rows of a panorama.
+
+    Attributes:
+        flux: (h, W), or (h, W, 3) of red, green and blue; float32, photons per pixel per frame, NaN where nothing was seen.
+        weight: the same shape, float32, number of frames in which each pixel was seen; 0 where nothing was seen.
+        std: the same shape, float32, standard deviation of the flux; NaN where nothing was seen.
+        saturated: the same shape, bool, pixels that were lit in every frame, whose flux is a lower bound.
+    """
+
+    flux: FluxImage
+    weight: FluxImage
+    std: FluxImage
+    saturated: BoolArray

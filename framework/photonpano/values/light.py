@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from photonpano.values.arrays import FloatArray, FluxImage, Homography
 from photonpano.values.frames import FrameSpan
 
-_CLASSES = 8
-"""Frames are divided by their gain, or by the phase of the lamps, into at most this many classes."""
-_CLASS_WIDTH = 0.1
-"""Least range of the gains of a class."""
+_CLASSES = 8  # most classes into which frames are divided by their gain, or by the phase of the lamps
+_CLASS_WIDTH = 0.1  # least range of the gains of a class
 
 
 @dataclass(frozen=True, slots=True, eq=False)

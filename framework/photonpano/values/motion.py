@@ -1,4 +1,4 @@
-"""Pairwise motions: located with their quality, or not located with the reason. Never an identity for a failure."""
+"""Motions: of pairs, located or not located with the reason, never an identity for a failure; of spans; and refined ones."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from photonpano.values.arrays import FloatArray, Homography
+from photonpano.values.frames import FrameSpan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,31 +45,58 @@ class NotLocated:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """A pair of virtual exposures in the motion graph, with its motion.
+    """A pair of virtual exposures in the motion graph, with its motion."""
 
-    Attributes:
-        moving: index of the exposure that is mapped.
-        fixed: index of the exposure that it is mapped to.
-        motion: the map in pixels of frames (not of rescaled exposures), or the reason why there is none.
-        locator: the name of the locator that found the motion; empty where none did.
-    """
-
-    moving: int
-    fixed: int
-    motion: Located | NotLocated
-    locator: str = ""
+    moving: int  # index of the exposure that is mapped
+    fixed: int  # index of the exposure that it is mapped to
+    motion: Located | NotLocated  # the map in pixels of frames (not of rescaled exposures), or the reason why there is none
+    locator: str = ""  # the name of the locator that found the motion; empty where none did
 
 
 @dataclass(frozen=True, slots=True)
 class Ambiguity:
-    """Pairs of a level that fit a scene that repeats at more than one place, and that nothing decided between.
-
-    Attributes:
-        level: its number, from 1.
-        pairs: (moving, fixed) numbers of the exposures of each pair, in order.
-        alternative_px: how far from the motion taken the other one is, in px of a frame: the median of the pairs.
-    """
+    """Pairs of a level that fit a scene that repeats at more than one place, and that nothing decided between."""
 
     level: int
-    pairs: tuple[tuple[int, int], ...]
-    alternative_px: float
+    pairs: tuple[tuple[int, int], ...]  # (moving, fixed) numbers of the exposures of each pair, in order
+    alternative_px: float  # how far from the motion taken the other one is, in px of a frame: the median of the pairs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpanResiduals:
+    """What the frames of short spans show of the motion, beyond a trajectory.
+
+    Convention:
+        A step moves points of a frame: what the frames of a span show at the point q, the trajectory predicts at `step(q)`. So
+        `trajectory.at(frame) @ step` explains the photons better; `photonpano.geometry.step_motions` makes the (3, 3) matrices.
+        Points are (x, y), integers are pixel centres.
+
+    Attributes:
+        spans: S spans of frames, in order; together they contain the located frames.
+        steps: (S, 4) float64, one weighted least-squares step of the motion of each span: shift along x and along y, in px of a
+            frame; roll from x towards y, in radians; zoom, as a fraction. Roll and zoom are about the centre of the frame.
+        information: (S, 4, 4) float64, inverse covariance of the steps from photon noise alone; singular where the photons of
+            a span do not determine a step, which is then 0.
+    """
+
+    spans: tuple[FrameSpan, ...]
+    steps: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """A motion that a refiner corrected.
+
+    Convention:
+        Homographies map pixels of a frame to pixels of the reference plane. That of the reference frame stays the identity.
+
+    Attributes:
+        homographies: (T, 3, 3) float64, one for each frame of the capture, h33 = 1.
+        std_px: (T,) expected corner error of each frame, in px of a frame; infinite where it was infinite before.
+        summary: what was corrected, in one line, such as "tremor of 0.9 px at 223 and 590 Hz".
+    """
+
+    homographies: FloatArray
+    std_px: FloatArray
+    summary: str

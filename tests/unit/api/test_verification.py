@@ -11,7 +11,7 @@ import pytest
 
 from photonpano import InputError, clean, verify
 from photonpano.pipeline.run import RunResult
-from photonpano.reading.gzipped import unpacked
+from photonpano.reading.npy import unpacked
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from photonpano.captures.repeats import timeline_of
+from photonpano.captures.obstacles import timeline_of
 from photonpano.context import Context
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource
 from photonpano.testing import MemorySource

@@ -15,7 +15,7 @@ import photonpano.pipeline.run as run_module
 from photonpano import FrameSpan, InputError, Light, PluginError, parse_spec, run
 from photonpano.capture import Capture, capture_of, part_of, seen_through
 from photonpano.corrections import ColourFilter, HotPixels, Vignette, corrected_source, divided_by
-from photonpano.execution.packing import packed, unpacked
+from photonpano.execution.remote import packed, unpacked
 from photonpano.geometry import Camera
 from photonpano.lighting import in_light
 from photonpano.pipeline.executors import CaptureOpener, as_read, met_elsewhere

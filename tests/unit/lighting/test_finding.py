@@ -9,7 +9,7 @@ from photonpano import FrameSpan
 from photonpano.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.lighting import decision_of, find_light
-from photonpano.lighting.series import flicker_frequency, gain_of_frames
+from photonpano.lighting.finding import flicker_frequency, gain_of_frames
 from photonpano.merging.light import gain_image
 from photonpano.testing import KnownMotion, MemorySource, Scene
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import corner_displacements, from_parameters, parameters, transform_points
-from photonpano.locating.fitting import MIN_NOISE_PX, fit_homography
+from photonpano.locating.points import MIN_NOISE_PX, fit_homography
 
 SHAPE = (160, 240)
 TRUE = from_parameters([0.03, -0.02, 0.01, -0.04, 12, 9, 1e-4, -5e-5])

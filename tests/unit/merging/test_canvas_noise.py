@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.corrections.colours import with_colours
+from photonpano.corrections.colour_filter import with_colours
 from photonpano.geometry import Canvas, translation
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.photometry import BinaryResponse, flux_std

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photonpano.merging.colour import noise_of_a_frame, with_shared_detail
-from photonpano.photometry import BinaryResponse
+from photonpano.merging.colour import with_shared_detail
+from photonpano.photometry import BinaryResponse, frame_variance
 
 SHAPE = (96, 128)
 FRAMES = np.float32([400, 800, 400])
@@ -45,6 +45,6 @@ def test_detail_of_single_colours_stays_with_many_photons() -> None:
     assert (rms(found, truth) < 1.05 * rms(flux, truth)).all()
 
 
-def test_noise_of_a_frame_is_the_binomial_one() -> None:
+def test_frame_variance_is_the_binomial_one() -> None:
     flux = np.float32([0.01, 0.1, 1, 3])
-    assert noise_of_a_frame(flux, BinaryResponse()) == pytest.approx(np.expm1(flux), rel=0.01)
+    assert frame_variance(flux, BinaryResponse()) == pytest.approx(np.expm1(flux), rel=0.01)

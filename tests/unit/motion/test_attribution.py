@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import PluginError
-from photonpano.contracts.attribution import AttributedTrajectory
+from photonpano.contracts.loop import AttributedTrajectory
 
 
 def raising(error: BaseException) -> Callable[..., Any]:

@@ -7,8 +7,7 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.geometry import Camera, FrameTrajectory, corner_displacements, rotation_matrices, translation
-from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.smooth_path import smooth_view
+from photonpano.motion.frame_motion import FrameMotion, smooth_view
 
 SHAPE = (96, 128)
 

@@ -24,8 +24,7 @@ from photonpano.pipeline.run_folder import run_folder
 from photonpano.report import render_report
 from photonpano.report.viewer import shared_instant
 from photonpano.residuals.measure import Residuals
-from photonpano.residuals.refinement import Explained
-from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, standing_out, unexplained_px
+from photonpano.residuals.refinement import Explained, bounded_std_px, residual_ratio, standing_out, unexplained_px
 from photonpano_core.configs import ShortSpansConfig
 from photonpano_core.refiners.short_spans import ShortSpansRefiner
 

@@ -13,7 +13,7 @@ from photonpano.context import Context
 from photonpano.geometry import FrameTrajectory, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut
-from photonpano.motion.tracking import runs
+from photonpano.motion.tracking import spans
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import MotionFit
 from photonpano.testing import MemorySource
@@ -96,7 +96,7 @@ def test_dark_frames_without_jump_are_not_cut(cuts_of: Callable[..., tuple[Cut, 
 
 def test_long_tremor_is_searched_without_keeping_its_sums(street: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of a capture that trembles is searched: sums of 48x64 px that are kept would take 12 kB each."""
-    monkeypatch.setattr(runs, "_BLOCK", 8)
+    monkeypatch.setattr(spans, "_BLOCK", 8)
 
     def peak(n_frames: int) -> int:
         frames = np.arange(n_frames)

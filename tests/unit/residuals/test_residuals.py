@@ -15,7 +15,7 @@ from photonpano.merging.canvas_plan import plan_canvas
 from photonpano.merging.panorama import render
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
-from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, unexplained_px
+from photonpano.residuals.refinement import bounded_std_px, residual_ratio, unexplained_px
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded
 from photonpano.testing.scenes import Scene
 

@@ -15,17 +15,11 @@ from photonpano.values import FloatArray, Group, Homography
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where an exposure lies.
+    """Where an exposure lies."""
 
-    Attributes:
-        segment: number of the first exposure of those that are tied to this one.
-        homography: (3, 3), pixels of its frame to those of that exposure's frame.
-        velocity: (2,) shift of the middle of the image per frame period, px, along the last pair that was located; None where
-            none was.
-    """
-
-    segment: int
-    homography: Homography
+    segment: int  # number of the first exposure of those that are tied to this one
+    homography: Homography  # (3, 3), pixels of its frame to those of that exposure's frame
+    # (2,) shift of the middle of the image per frame period, px, along the last pair that was located; None where none was
     velocity: FloatArray | None
 
 
@@ -44,14 +38,7 @@ class Track:
         frame_shape: tuple[int, int],
         places: Mapping[int, Place],
     ) -> None:
-        """Take what is known so far.
-
-        Args:
-            start: the motion that short spans of frames show.
-            groups: of all exposures of the level.
-            frame_shape: (height, width) of a frame.
-            places: of some exposures.
-        """
+        """Take the motion that short spans show, all groups of the level, and the places of some of them."""
         self._start, self._groups = start, groups
         self._middle = corners(frame_shape).mean(axis=0)
         self.places = dict(places)
@@ -62,11 +49,8 @@ class Track:
     ) -> FrameHomography | None:
         """Return where the registration of a pair starts: (3, 3); None if nothing is known.
 
-        Args:
-            place: where `moving` lies, if one of its pairs was located before.
-            moving: number of the later exposure.
-            fixed: number of the earlier one.
-            hypotheses: returns the motions that the two images themselves suggest, likeliest first.
+        `place` is where `moving` lies, if one of its pairs was located before; `hypotheses` returns the motions that the two
+        images themselves suggest, likeliest first.
         """
         there = self.places[fixed]
         if place is not None and place.segment == there.segment:

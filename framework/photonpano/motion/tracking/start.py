@@ -48,19 +48,12 @@ _TIE = 4.0  # difference of the log likelihoods of hypotheses below which both a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypotheses:
-    """Possible velocities of the image within one window.
+    """Possible velocities of the image within one window."""
 
-    Attributes:
-        velocities: (P, 2) in px of a frame per frame period, likeliest first.
-        heights: (P,) of the peaks, as shares of the highest.
-        px_per_frame: velocity that moves the image by one binned pixel between spans.
-        suspect: whether a part of the image may move otherwise than the likeliest velocity of its peaks.
-    """
-
-    velocities: FloatArray
-    heights: FloatArray
-    px_per_frame: float
-    suspect: bool = False
+    velocities: FloatArray  # (P, 2) in px of a frame per frame period, likeliest first
+    heights: FloatArray  # (P,) of the peaks, as shares of the highest
+    px_per_frame: float  # velocity that moves the image by one binned pixel between spans
+    suspect: bool = False  # whether a part of the image may move otherwise than the likeliest velocity of its peaks
 
     @property
     def apart(self) -> float:
@@ -71,21 +64,13 @@ class Hypotheses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StartingMotion:
-    """A motion without rotation, from the velocity of the image in windows of the length of a group.
+    """A motion without rotation, from the velocity of the image in windows of the length of a group."""
 
-    Attributes:
-        instants: (N,) centres of the windows in which the velocity was found.
-        velocities: (N, 2) of the image there, in px of a frame per frame period.
-        alternatives: (N, 2) velocities that are as likely; NaN where there is none.
-        reach: frames from the nearest of these instants within which the motion is known.
-        timeline: where the image jumps; None if it is not known to.
-    """
-
-    instants: FloatArray
-    velocities: FloatArray
-    alternatives: FloatArray
-    reach: float
-    timeline: Timeline | None = None
+    instants: FloatArray  # (N,) centres of the windows in which the velocity was found
+    velocities: FloatArray  # (N, 2) of the image there, in px of a frame per frame period
+    alternatives: FloatArray  # (N, 2) velocities that are as likely; NaN where there is none
+    reach: float  # frames from the nearest of these instants within which the motion is known
+    timeline: Timeline | None = None  # where the image jumps; None if it is not known to
 
     def between(self, moving: float, fixed: float) -> FloatArray | None:
         """Return the homography from the frame at one instant to that at another: (3, 3); None where it is not known."""
@@ -114,14 +99,11 @@ class StartingMotion:
 def starting_motion(
     source: Source, groups: Sequence[Group], context: Context, timeline: Timeline | None = None
 ) -> StartingMotion | None:
-    """Measure the velocity of the image all over a capture, before any motion is known.
+    """Measure the velocity of the image all over a capture, before any motion is known; None if no window has a peak.
 
     The capture is divided into windows of the length of a group, and each of them into short spans of frames. The phase
     correlations of successive spans are averaged over the window; their peaks are the hypotheses. Of several, continuity from
     window to window decides.
-
-    Returns:
-        None if no window has a significant peak.
     """
     n_frames = source.info.n_frames
     length = min(n_frames, max(2 * SHORTEST[source.info.kind], round(float(np.median(lengths_of(groups))))))
@@ -136,16 +118,11 @@ def starting_motion(
 
 
 def _hypotheses(source: Source, length: int, start: int, offered: Sequence[FloatArray] = ()) -> Hypotheses | None:
-    """Return the velocities that a window may have; None if no peak is significant.
+    """Return the velocities that a window, its first frame `start`, may have; None if no peak is significant.
 
-    Where a part of the image does not follow the highest peak, its own velocity is a hypothesis, too. The heights of both are
-    then the extents of these parts, for an object with strong contrast makes the highest peak even if it is small.
-
-    Args:
-        source: the capture.
-        length: frames of a window.
-        start: its first frame.
-        offered: velocities that such a part may have beside its own, in px of a frame per frame period.
+    Where a part of the image does not follow the highest peak, its own velocity is a hypothesis, too, and so are those
+    `offered`, in px per frame period. The heights of both are then the extents of these parts, for an object with strong
+    contrast makes the highest peak even if it is small.
     """
     short = max(SHORTEST[source.info.kind], length // _SPANS)
     spans = [FrameSpan(first, first + short) for first in range(start, start + length - short + 1, short)]
@@ -190,11 +167,7 @@ def _with_those_near(
 def _following(source: Source, binned: NDArray[np.float32], n_frames: int, shift: FloatArray) -> Follows:
     """Find the part of a window that follows a shift between successive spans: compare its first third with its last.
 
-    Args:
-        source: the capture.
-        binned: (S, h, w) means of the spans.
-        n_frames: of a span.
-        shift: (x, y) in binned pixels.
+    `binned` (S, h, w) are means of spans of `n_frames`; the shift (x, y) is in binned pixels.
     """
     middle, third = (len(binned) - 1) / 2, max(1, len(binned) // 3)
     aligned = [shifted(image, shift * (index - middle)) for index, image in enumerate(binned)]
@@ -206,13 +179,9 @@ def _following(source: Source, binned: NDArray[np.float32], n_frames: int, shift
 def _velocities(
     images: NDArray[np.float32], weight: NDArray[np.float32] | None = None
 ) -> tuple[FloatArray, FloatArray, int] | None:
-    """Return the (P, 2) shifts between successive images, in their pixels, the heights of the peaks, and how many were summed.
+    """Return the (P, 2) shifts between successive images (S, h, w), the heights of the peaks, and how many were summed.
 
     Images are summed in twos until a peak is significant; then on, to make the shift exact, as long as the peak is found again.
-
-    Args:
-        images: (S, h, w).
-        weight: (h, w) of their pixels, 1 by default.
     """
     spectra, shape, doubled = spectra_of(images, weight), images.shape[1:], 1
     while len(spectra) >= 2:
@@ -258,11 +227,10 @@ def _summed_in_twos(spectra: Spectrum) -> Spectrum:
 def _continuous(windows: Sequence[Hypotheses]) -> tuple[FloatArray, FloatArray]:
     """Choose one hypothesis of each window, so that together they are the likeliest (Viterbi 1967).
 
-    A hypothesis is the likelier the higher its peak, and the nearer it is to that of the next window. Of the first
-    window, slow ones are likelier, by the square of the speed: before it is known, its order of magnitude may be any.
+    A hypothesis is the likelier the higher its peak, and the nearer it is to that of the next window. Of the first window, slow
+    ones are likelier, by the square of the speed: before it is known, its order of magnitude may be any.
 
-    Returns:
-        (N, 2) velocities, and the (N, 2) velocities that are as likely; NaN where there is none.
+    Return (N, 2) velocities, and the (N, 2) velocities that are as likely; NaN where there is none.
     """
     scores = [np.log(each.heights) for each in windows]
     scores[0] = scores[0] - 2 * np.log(np.maximum(np.linalg.norm(windows[0].velocities, axis=1), windows[0].px_per_frame))

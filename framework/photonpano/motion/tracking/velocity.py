@@ -48,16 +48,11 @@ class Velocity:
 
     Convention:
         Points are (x, y), y down, integers are pixel centres. A positive turn is clockwise as one sees the picture.
-
-    Attributes:
-        turn: of the image, in radians per frame period.
-        shift: (2,) velocity of what is at `middle`, in px per frame period.
-        middle: (2,) point of the frame.
     """
 
-    turn: float
-    shift: FloatArray
-    middle: FloatArray
+    turn: float  # of the image, in radians per frame period
+    shift: FloatArray  # (2,) velocity of what is at `middle`, in px per frame period
+    middle: FloatArray  # (2,) point of the frame
 
     @property
     def centre(self) -> FloatArray:
@@ -79,12 +74,7 @@ class Velocity:
 
 
 class ConstantVelocity:
-    """The trajectory of an image that moves at a constant velocity.
-
-    Args:
-        velocity: of the image.
-        reference: the frame whose homography is the identity.
-    """
+    """The trajectory of an image that moves at a constant velocity; the reference frame's homography is the identity."""
 
     def __init__(self, velocity: Velocity, reference: float) -> None:
         self._velocity, self._reference = velocity, reference
@@ -95,12 +85,7 @@ class ConstantVelocity:
 
 
 def mean_shift(shift: FloatArray, angle: ArrayLike) -> FloatArray:
-    """Return the mean of shifts that turn at a constant rate: (..., 2).
-
-    Args:
-        shift: (..., 2) at first.
-        angle: (...) in radians, by which they turn in all.
-    """
+    """Return the mean of shifts, (..., 2) at first, that turn at a constant rate by angles (...) in radians: (..., 2)."""
     angle = np.asarray(angle, dtype=np.float64)
     along, across = np.sinc(angle / np.pi), np.sinc(angle / 2 / np.pi) * np.sin(angle / 2)
     x, y = shift[..., 0], shift[..., 1]
@@ -109,19 +94,12 @@ def mean_shift(shift: FloatArray, angle: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundVelocity:
-    """A velocity that was found, and how certain it is.
-
-    Attributes:
-        velocity: of the image.
-        covariance: (3, 3) of the turn and the shift, from the scatter of the spans.
-        significance: height of the peak, in standard deviations over all velocities.
-        halves: the velocities that the first and second half of the capture show each by itself.
-    """
+    """A velocity that was found, and how certain it is."""
 
     velocity: Velocity
-    covariance: FloatArray
-    significance: float
-    halves: tuple[Velocity, Velocity]
+    covariance: FloatArray  # (3, 3) of the turn and the shift, from the scatter of the spans
+    significance: float  # height of the peak, in standard deviations over all velocities
+    halves: tuple[Velocity, Velocity]  # the velocities that the first and second half of the capture show each by itself
 
     @property
     def std_turn(self) -> float:
@@ -194,9 +172,6 @@ def _residuals(source: Source, context: Context) -> tuple[Images, Images, int]:
     """Return what varies over time, in binned pixels: (S, h, w), which pixels are seen: (h, w), and the frames of a span.
 
     What stands still, such as hot pixels and the light on the scene, is subtracted in proportion to the brightness of a span.
-
-    Raises:
-        InputError: there are too few frames.
     """
     n_frames = -(-source.info.n_frames // _SPANS)
     spans = [FrameSpan(start, start + n_frames) for start in range(0, source.info.n_frames - n_frames + 1, n_frames)]
@@ -227,17 +202,11 @@ def _halved(images: Images) -> Images:
 
 
 def _searched(images: Images, context: Context) -> tuple[FloatArray, float]:
-    """Return the velocity at which spans fit the next ones best, and by how many standard deviations of all velocities.
+    """Return the velocity at which spans (S, h, w) fit the next ones best, and its height in standard deviations over all.
 
-    For each turn, the correlation of images that are turned back, as a function of the shift, is computed for all pairs of
-    spans of each distance at once: the motion between them is the same.
-
-    Args:
-        images: (S, h, w).
-        context: threads.
-
-    Returns:
-        (3,): the turn, and the shift in binned pixels, from one span to the next.
+    It is (3,): the turn, and the shift in binned pixels, from one span to the next. For each turn, the correlation of images
+    that are turned back, as a function of the shift, is computed for all pairs of spans of each distance at once: the motion
+    between them is the same.
     """
     step = _STEP_PX / _LAGS
     turn_step = step / (min(images.shape[1:]) / 2)
@@ -282,12 +251,7 @@ def _warped(image: Images, there: FloatArray) -> Images:
 
 
 class _Contrast:
-    """The contrast of sums of spans along a velocity, without what each span adds by itself.
-
-    Args:
-        images: (S, h, w).
-        size: spans of a window; those of each window are summed.
-    """
+    """The contrast of sums of spans (S, h, w) along a velocity, over windows of some spans, without that of each by itself."""
 
     def __init__(self, images: Images, size: int) -> None:
         height, width = images.shape[1:]

@@ -12,9 +12,8 @@ import pytest
 from photonpano import Group, Located, NotLocated, Trajectory
 from photonpano.context import Context
 from photonpano.geometry import inverse
-from photonpano.motion.level import Level
+from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, locate
-from photonpano.motion.merge import VirtualExposures
 from photonpano.specs.settings import GraphSettings
 from photonpano.threads import Stopwatch
 

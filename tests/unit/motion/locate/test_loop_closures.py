@@ -16,9 +16,8 @@ from photonpano import Group, Located, NotLocated, Trajectory, VirtualExposure
 from photonpano.context import Context
 from photonpano.geometry import inverse, rescaling, translation
 from photonpano.motion.closures import MIN_SIMILARITY
-from photonpano.motion.level import Level
+from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, locate
-from photonpano.motion.merge import VirtualExposures
 from photonpano.photometry import BinaryResponse
 from photonpano.specs.settings import GraphSettings
 from photonpano.threads import Stopwatch
