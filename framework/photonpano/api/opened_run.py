@@ -34,14 +34,9 @@ class OpenedRun:
     """A finished run, with its capture.
 
     Attributes:
-        folder: the run folder.
-        record: its run.json.
-        plan: of its spec.
-        capture: the capture, as its source and the corrections of the spec give it.
-        source: the same, divided by the vignette that the run found, in the light that it found, and through its lens.
-        vignette: by which it is divided.
+        capture: the capture, with the corrections of the spec.
+        source: the same, divided by the vignette, in the light and through the lens that the run found.
         motion: of every frame; where the run did not record `std_px`, it is 0.
-        has_std_px: whether the run recorded `std_px`.
     """
 
     folder: Path
@@ -61,13 +56,7 @@ def opened_run(
     changes: Sequence[str] = (),
     output: Path | None = None,
 ) -> Iterator[OpenedRun]:
-    """Open a finished run and its capture.
-
-    Args:
-        folder: the run folder.
-        catalog: what can be chosen; by default what the installed plugins offer.
-        changes: values of the recorded spec to change, such as `render.scale=2`.
-        output: the run folder of the changed spec.
+    """Open a finished run and its capture, with changes of its spec such as `render.scale=2`.
 
     Raises:
         InputError: the folder is no run folder, its files are of several runs, its capture cannot be opened, or it is another

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 from photonpano.geometry import corners, jacobian
 from photonpano.values import FluxImage, Homography, Response
 
-_NOISELESS = 1e9
-"""Number of frames for which photon noise is negligible."""
+_NOISELESS = 1e9  # number of frames for which photon noise is negligible
 
 
 def pair_bound_px(flux: FluxImage, response: Response, first_frames: ArrayLike, second_frames: ArrayLike) -> float:

@@ -16,8 +16,7 @@ from photonpano.reading import read_arrays
 from photonpano.values import BoolArray, FloatArray
 
 POSES = "poses.npz"
-_ORTHONORMAL = 1e-3
-"""Largest difference of R R^T from the identity in a pose."""
+_ORTHONORMAL = 1e-3  # largest difference of R R^T from the identity in a pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)

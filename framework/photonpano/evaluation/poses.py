@@ -20,8 +20,7 @@ from photonpano.poses import centres
 from photonpano.record.contents import require_one_run
 from photonpano.values import BoolArray, FloatArray
 
-_RPE_SHARE = 0.01
-"""The relative error is that over this share of the frames."""
+_RPE_SHARE = 0.01  # the relative error is that over this share of the frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -51,9 +51,7 @@ LARGE_FRAME_PX = 192  # frames whose shorter side is below this are not halved: 
 def open_source(plan: Plan, look: bool = True) -> Iterator[Capture]:
     """Open the capture of a plan, and check the stages against it. With `corrections: auto`, what stands still is masked.
 
-    Args:
-        plan: the plan.
-        look: whether corrections may read frames. If not, what depends on frames is left out.
+    Without `look`, no frame is read, and corrections that depend on frames are left out.
 
     Raises:
         InputError: the capture cannot be used as it is.
@@ -66,15 +64,9 @@ def open_source(plan: Plan, look: bool = True) -> Iterator[Capture]:
 
 
 def require_suitable(plan: Plan, capture: Capture, info: StreamInfo) -> None:
-    """Check the stages of a plan against its capture.
+    """Raise `SpecError` if a stage does not suit a capture, or it is grey and the spec balances its colours.
 
-    Args:
-        plan: the plan.
-        capture: the capture.
-        info: its frames, which may be more than those that are there.
-
-    Raises:
-        SpecError: a stage does not suit it, or it is grey and the spec balances its colours.
+    `info` describes the frames that the capture will have, which may be more than those that are there.
     """
     problems = check_stream(plan, info)
     if plan.render.white_balance != "none" and capture.colour is None:
@@ -105,11 +97,7 @@ def build_source(plan: Plan, look: bool = True) -> Capture:
 
 
 def with_corrections(plan: Plan, capture: Capture, look: bool = True) -> Capture:
-    """Return a capture with the corrections of a plan.
-
-    Raises:
-        SpecError: a correction does not suit the capture, or its file is not what it should be; the capture is closed.
-    """
+    """Return a capture with the corrections of a plan; it is closed if one of them raises `SpecError`."""
     if not plan.corrections:
         return capture
 
@@ -140,10 +128,7 @@ def _part(plan: Plan, capture: Capture) -> Capture:
 def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:
     """Build the components of all levels. Levels that choose the same component with the same config share one.
 
-    Args:
-        plan: which components.
-        source: the capture.
-        decisions: receives the decisions that components take from the capture while they work, such as a group size.
+    `decisions` receives what components choose from the capture while they work, such as a group size.
     """
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
@@ -180,13 +165,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
 
 
 def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
-    """Build the refiners of a plan, in order.
-
-    Args:
-        plan: which refiners.
-        source: the capture.
-        decisions: receives the decisions that they take.
-    """
+    """Build the refiners of a plan, in order; `decisions` receives their choices."""
     from photonpano.residuals.refinement import NamedRefiner  # imports OpenCV, which is not needed to check a spec
 
     context = _stage_context(plan, source, Recorder(decisions))
@@ -196,14 +175,7 @@ def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tup
 def build_renderer(
     plan: Plan, source: Source, decisions: list[Decision], in_order: InOrder | None = None
 ) -> AttributedRenderer:
-    """Build the renderer of a plan.
-
-    Args:
-        plan: which renderer.
-        source: the capture.
-        decisions: receives the decisions that it takes.
-        in_order: works on parts of the panorama at once; by default, threads do.
-    """
+    """Build the renderer of a plan; `decisions` receives its choices. Without `in_order`, threads share the work."""
     from photonpano.pipeline.renderers import AttributedRenderer  # imports OpenCV, which is not needed to check a spec
 
     choice, contribution = plan.renderer, plan.renderer.contribution
@@ -221,13 +193,7 @@ def build_renderer(
 
 
 def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[AttributedExporter, ...]:
-    """Build the exporters of a plan, in order.
-
-    Args:
-        plan: which exporters.
-        source: the capture.
-        decisions: receives the decisions that they take.
-    """
+    """Build the exporters of a plan, in order; `decisions` receives their choices."""
     from photonpano.pipeline.exports import AttributedExporter  # imports tifffile, which is not needed to check a spec
 
     context = _stage_context(plan, source, Recorder(decisions))
@@ -239,13 +205,7 @@ def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tu
 
 
 def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) -> PoseEstimator:
-    """Build the pose estimator of a plan that has one.
-
-    Args:
-        plan: which pose estimator.
-        source: the capture.
-        decisions: receives the decisions that it takes.
-    """
+    """Build the pose estimator of a plan that has one; `decisions` receives its choices."""
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     assert plan.pose is not None
@@ -255,15 +215,10 @@ def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) 
 
 
 def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:
-    """Return the scale of a level's exposures.
+    """Return the scale of a level's exposures; `number` counts from 1.
 
     With `scale: auto`, the first two levels are located at half size if frames are large and a later level refines the motion.
     While the motion is known to about a pixel only, a quarter of the pixels locates it nearly as well.
-
-    Args:
-        plan: the levels.
-        number: the number of the level, from 1.
-        frame_shape: (height, width) of a frame.
     """
     scale = plan.levels[number - 1].scale
     if scale != "auto":
@@ -303,14 +258,7 @@ def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> l
 def _stage_context(
     plan: Plan, source: Source, recorder: Recorder, capture: Callable[[], CaptureSummary] | None = None
 ) -> StageContext:
-    """Return the run for which components are built.
-
-    Args:
-        plan: has seed and threads.
-        source: the capture.
-        recorder: records the decisions that components take.
-        capture: returns the flux and the speed of the capture; None for components that cannot ask for them.
-    """
+    """Return what components are built for; without `capture`, they cannot ask for its flux and speed."""
     threads = thread_count(plan.run.threads)
     at_once = partial(in_order, threads=threads)
     context = StageContext(source.info, source.response, plan.run.seed, threads, decide=recorder, in_order=at_once)
@@ -349,11 +297,7 @@ def _named(choices: Iterable[Choice]) -> Iterator[tuple[str, Choice]]:
 
 
 def built(choice: Choice, context: SourceContext | StageContext | ExecutorContext) -> Any:
-    """Build a component.
-
-    Raises:
-        PluginError: a library is missing, or the plugin failed in its own way.
-    """
+    """Build a component; `PluginError` if a library is missing, or the plugin failed in its own way."""
     contribution = choice.contribution
     who = choice.label
     for requirement in contribution.requires:

@@ -19,18 +19,13 @@ from photonpano.protocols import Source
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision
 
-# What the decision is called on a motion that is known before the first level.
-START = "start"
+START = "start"  # what the decision is called on a motion that is known before the first level
 
 
 def estimate(plan: Plan, source: Source, journal: list[Decision], context: Context) -> State:
     """Estimate the motion of a capture, and correct what its own frames show to be in the way.
 
-    Args:
-        plan: what to do.
-        source: the capture.
-        journal: receives the decisions, in the order in which components and passes take them.
-        context: threads, progress and checkpoints.
+    `journal` receives the decisions, in the order in which components and passes take them.
 
     Raises:
         InputError: all frames are copies of the first one, or too few for the start, or the camera has other frames.

@@ -63,7 +63,6 @@ class CaptureOpener:
 
     Attributes:
         run: unique ID of the run: workers may outlive a run, and files may change.
-        seed: of the run.
         source: the name of the source.
         keys: its keys under `with`.
         needed: what the run needs, as `met_by` returns it.

@@ -28,7 +28,6 @@ class StoredPanorama:
         weight: the same shape, on disk.
         canvas: (3, 3), pixels of the reference plane to pixels of the panorama.
         white_flux: flux that is white in the picture.
-        noise: of the canvas.
     """
 
     flux: NDArray[np.float32]
@@ -62,13 +61,7 @@ class StoredPanorama:
 
 @dataclass(frozen=True, slots=True)
 class AttributedExporter:
-    """An exporter whose errors name its plugin, and whose file is checked.
-
-    Attributes:
-        component: the exporter.
-        origin: who provides it, such as "exporter 'exr' of photonpano 0.1.0".
-        suffix: the ending of its file.
-    """
+    """An exporter whose errors name its `origin`, such as "exporter 'exr' of photonpano 0.1.0", and whose file is checked."""
 
     component: Exporter
     origin: str

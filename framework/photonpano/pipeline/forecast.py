@@ -23,12 +23,9 @@ from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
-# Length of the trial in the middle of the capture, in groups of the first level.
-TRIAL_GROUPS = 12
-# Length of an untimed trial before it, in groups, for what is done once, such as compiling.
-_WARM_UP_GROUPS = 3
-# Memory for the motion of one frame, as measured in the benchmarks.
-BYTES_PER_FRAME = 1200
+TRIAL_GROUPS = 12  # length of the trial in the middle of the capture, in groups of the first level
+_WARM_UP_GROUPS = 3  # length of an untimed trial before it, in groups, for what is done once, such as compiling
+BYTES_PER_FRAME = 1200  # memory for the motion of one frame, as measured in the benchmarks
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,7 @@ from photonpano.values import Decision, Light
 
 logger = logging.getLogger(__name__)
 
-# Light that lowers the reduced chi-square of the photons by this factor, or more, is there.
-_EXPLAINED = 0.9
+_EXPLAINED = 0.9  # light that lowers the reduced chi-square of the photons by this factor, or more, is there
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,9 +35,7 @@ class Proposal:
         worse: returns how the new motion explains the photons worse than the old one, as a clause, empty if it does not. None
             to accept the new state without comparison, so that its errors end the run.
         settle: completes the new state once it is accepted.
-        rejection: begins the message about a proposal that is rejected.
-        severity: of this message.
-        summary: of the change.
+        rejection: begins the message about a proposal that is rejected, of this severity.
     """
 
     make: Callable[[], State | None]
@@ -94,7 +91,7 @@ def without_shading(state: State) -> Proposal | None:
     """Divide the capture by the flat field that its spec asks for, or by its vignette.
 
     Raises:
-        InputError: the motion cannot tell a flat field from the scene, or the camera turns too far.
+        InputError: the motion does not separate a flat field from the scene, or the camera turns too far.
     """
     plan, source = state.plan, state.view.source
     asked = any(isinstance(each, FlatField) for each in plan.corrections)

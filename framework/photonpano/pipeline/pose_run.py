@@ -25,8 +25,7 @@ from photonpano.report import render_pose_report
 from photonpano.specs.plan import Plan
 from photonpano.values import CameraGuess, FluxImage, PoseEstimate, StreamInfo
 
-# Quantile of the flux of an exposure that is white in its picture.
-_WHITE_QUANTILE = 0.995
+_WHITE_QUANTILE = 0.995  # quantile of the flux of an exposure that is white in its picture
 
 
 def find_poses(run: BegunRun) -> None:
@@ -62,16 +61,9 @@ def _estimated(run: BegunRun) -> PoseEstimate:
 
 
 def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:
-    """Write poses.npz, sparse/, transforms.json, points.ply, poses.tum, and if they are asked for pictures in images/.
+    """Write poses.npz, sparse/, transforms.json, points.ply, poses.tum, and with `exposures` pictures in images/.
 
-    Args:
-        folder: where the files of the run are gathered.
-        estimate: in a world in which the path has the length 1.
-        stream: the capture.
-        exposures: whether the exposures are written.
-
-    Returns:
-        Warnings.
+    The path of the estimate has the length 1. Returns warnings.
 
     Raises:
         OutputError: the disk is full.

@@ -20,11 +20,9 @@ from photonpano.values import FrameSpan, Panorama
 
 @dataclass(frozen=True, slots=True)
 class AttributedRenderer:
-    """A renderer whose errors name its plugin, and whose panoramas are checked.
+    """A renderer whose errors name its `origin`, and whose panoramas are checked.
 
     Attributes:
-        component: the renderer.
-        origin: who provides it, such as "renderer 'merge' of photonpano 0.1.0".
         bytes_per_pixel: peak memory of rendering for a pixel of the canvas.
         any_canvas: whether it renders on a canvas of any projection, and through a lens.
     """
@@ -75,11 +73,7 @@ class AttributedRenderer:
             raise InputError(f"{self.origin} does not leave out frames that reach behind the plane; write render.use: merge")
 
     def require_seen(self, coverage_share: float) -> None:
-        """Refuse a panorama of which nothing was seen, although frames were located.
-
-        Raises:
-            PluginError: the renderer broke its contract.
-        """
+        """Raise `PluginError` if nothing of the panorama was seen, although frames were located."""
         with attributing(self.origin, "the panorama"):
             if not coverage_share:
                 raise BrokenContract("no pixel has a positive weight")

@@ -20,12 +20,7 @@ from photonpano.values import Decision, Panorama
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rendering:
-    """A panorama whose files are written.
-
-    Attributes:
-        panorama: what the files hold.
-        decisions: what renderer and exporters chose.
-    """
+    """A panorama whose files are written, and the decisions of renderer and exporters."""
 
     panorama: RenderedPanorama
     decisions: tuple[Decision, ...]
@@ -42,14 +37,8 @@ def render_into(
 ) -> Rendering:
     """Render the panorama, and write it, its motion, and what its capture was divided by.
 
-    Args:
-        folder: receives the files.
-        plan: renderer, exporters and settings.
-        source: the capture, divided by its vignette and in its light.
-        vignette: by which it is divided.
-        motion: of every frame.
-        context: threads, progress and checkpoints.
-        ready: the merge of all frames along this motion, and its canvas, where it is known.
+    `source` is divided by the vignette and in its light. `ready` is the merge of all frames along this motion, where it is
+    known.
 
     Raises:
         CanvasTooLargeError: the panorama would exceed the memory of the spec.

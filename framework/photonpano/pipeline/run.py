@@ -25,8 +25,7 @@ from photonpano.report.notebook import run_html
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 
-# Seconds without a new frame after which a capture that is followed is complete, by default.
-END_AFTER_S = 5.0
+END_AFTER_S = 5.0  # seconds without a new frame after which a capture that is followed is complete, by default
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,24 +41,17 @@ from photonpano.record.contents import RECORD, contents_of, names_of_results, re
 from photonpano.record.schema import FileContent, RunRecord
 from photonpano.values import FluxImage, Light, Panorama
 
-# Files that a message names.
-SHOWN_FILES = 3
+SHOWN_FILES = 3  # files that a message names
 
 
 class RunFolder:
-    """A folder in which the files of a run are gathered, and from which they replace those of the run before.
-
-    Attributes:
-        directory: the run folder.
-        staging: where the files are written.
-    """
+    """A folder, `staging`, in which the files of a run are gathered, and from which they replace those of the run before."""
 
     def __init__(self, directory: Path, stack: ExitStack) -> None:
         self.directory = directory
         self._stack = stack
         self.staging = stack.enter_context(staging_of(directory))
-        self._contents: dict[str, FileContent] = {}
-        """Sizes and hashes of files that were committed before."""
+        self._contents: dict[str, FileContent] = {}  # sizes and hashes of files that were committed before
 
     def write_tile(self, tile: Tile, rendered: Panorama, canvas: Canvas) -> None:
         """Write a part of panorama.tiff and coverage.tiff (float32); the parts make up the canvas."""
@@ -114,11 +107,7 @@ class RunFolder:
             raise
 
     def commit(self, record: RunRecord) -> RunRecord:
-        """Put the written files and run.json into the run folder, in one step.
-
-        Returns:
-            The content of run.json: the record, with sizes and hashes of the files.
-        """
+        """Put the written files and run.json into the run folder, in one step; return the record with sizes and hashes."""
         with _writing(self.directory):
             self._contents = contents_of(self.staging, self._contents)
             record = {**record, "files": self._contents}
@@ -138,15 +127,13 @@ class RunFolder:
 
 @contextmanager
 def run_folder(directory: Path, *, overwrite: bool = False, inputs: Sequence[Path] = ()) -> Iterator[RunFolder]:
-    """Lock a run folder, and gather the files of a run beside it.
+    """Lock a run folder, which may be missing, and gather the files of a run beside it.
 
     The place is proved to be writable before the work starts. When the block raises before `commit`, what was there stays as it
     was, and folders that were not there are gone again.
 
-    Args:
-        directory: the run folder; it may be missing.
-        overwrite: whether it may hold files that no run has written, which stay, or a run of another capture.
-        inputs: files and folders that the run reads, which must not lie in it.
+    With `overwrite`, it may hold files that no run has written, which stay, or a run of another capture. `inputs` are what the
+    run reads, which must not lie in it.
 
     Raises:
         OutputError: the folder cannot be made or written to, another process writes it, or it is none that a run may write.

@@ -44,15 +44,9 @@ class BegunRun:
     """A run that has begun.
 
     Attributes:
-        plan: what is run.
-        source: the capture, which shows something.
-        folder: the run folder, which is written.
-        observers: of the run.
-        progress: receives stages and messages.
         start: when the capture was open, in seconds of `time.perf_counter`.
         journal: the decisions so far, in the order in which they were taken.
         levels: the levels so far; one that was located again is there more than once.
-        work: what the run finds, for the case of an interruption.
         was_finished: whether the run was finished before, so that nothing is left to do.
         record: of the finished run.
         verdict: whether motion and panorama explain the photons; None for poses.

@@ -21,13 +21,13 @@ from photonpano.record.schema import FileContent
 logger = logging.getLogger(__name__)
 
 RECORD = "run.json"
+# The files of a run. Runs of older versions do not list theirs.
 RESULTS = frozenset(
     {
         *("panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "light.npz", "vignette.npz", "report.html"),
         RECORD,
     }
 )
-"""The files of a run. Runs of older versions do not list theirs."""
 
 
 def contents_of(folder: Path, known: Mapping[str, FileContent] | None = None) -> dict[str, FileContent]:

@@ -8,10 +8,8 @@ from photonpano.geometry import Camera
 from photonpano.record.schema import PosesRecord
 from photonpano.values import FloatArray, PoseEstimate
 
-DOUBTFUL = "doubtful: "
-"""Begins the warnings that are doubts."""
-_SHOWN = 3
-"""Spans of lost frames that a warning names."""
+DOUBTFUL = "doubtful: "  # begins the warnings that are doubts
+_SHOWN = 3  # spans of lost frames that a warning names
 
 
 def poses_record(estimate: PoseEstimate) -> PosesRecord:

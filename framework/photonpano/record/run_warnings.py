@@ -11,10 +11,9 @@ from photonpano.motion.loop import LevelResult
 from photonpano.residuals.refinement import Refinement
 from photonpano.values import FloatArray, true_spans
 
+# A warning names the frames whose expected corner error exceeds this: an error of this size is likely to be visible.
 UNCERTAIN_PX = 0.5
-"""A warning names the frames whose expected corner error exceeds this: an error of this size is likely to be visible."""
-SHOWN_SPANS = 4
-"""Spans of uncertain frames that a warning names, the worst first."""
+SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst first
 
 
 def level_warnings(results: Sequence[LevelResult]) -> list[str]:

@@ -102,8 +102,7 @@ def _link(directory: Path, row: BatchRow) -> str | None:
     return None if row.report is None else quote(os.fsencode(Path(os.path.relpath(row.report, directory)).as_posix()))
 
 
-COLOURED = len(SERIES)
-"""Number of lines up to which each has a colour and a name."""
+COLOURED = len(SERIES)  # number of lines up to which each has a colour and a name
 _ERRORS = {
     "true_error_px": "true error (px)",
     "expected_error_px": "expected error (px)",

@@ -21,8 +21,7 @@ from photonpano.report.figures import instants_of
 from photonpano.text import byte_size, count, duration, pixels, share
 from photonpano.values import FloatArray
 
-_MOST_DIFFERENCES = 60
-"""Number of settings that are listed."""
+_MOST_DIFFERENCES = 60  # number of settings that are listed
 
 
 @dataclass(frozen=True, slots=True, eq=False)

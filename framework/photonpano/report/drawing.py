@@ -24,11 +24,9 @@ JPEG_QUALITY = 90
 WIDTH_IN = 10.0
 MAX_MAP_HEIGHT_IN = 5.0
 MIN_MAP_IN = 0.8
-BAR_IN = 1.0
-"""Room for a colour bar to the right of a map, with its numbers and its label."""
+BAR_IN = 1.0  # room for a colour bar to the right of a map, with its numbers and its label
 MAP_PIXELS = 1000
-_X_LABEL_IN, _Y_LABEL_IN, _BAR_LABEL_IN = 0.25, 0.55, 0.45
-"""Distance of the labels of axes, and of colour bars, from these."""
+_X_LABEL_IN, _Y_LABEL_IN, _BAR_LABEL_IN = 0.25, 0.55, 0.45  # distance of the labels of axes, and of colour bars, from these
 
 # matplotlib knows no CSS variables: each of these stand-ins is replaced by one in the finished SVG.
 INK, MUTED, LINE, PAPER, BAD = "#010101", "#010102", "#010103", "#010104", "#010105"

@@ -19,10 +19,8 @@ from photonpano.report.page import head_of
 from photonpano.report.tables import FailureGroup, failure_groups
 from photonpano.values import NotLocated, VirtualExposure
 
-MAX_PAIRS = 8
-"""Number of pairs whose exposures are shown."""
-EXPOSURE_PIXELS = 480
-"""Longer side of an exposure on the page."""
+MAX_PAIRS = 8  # number of pairs whose exposures are shown
+EXPOSURE_PIXELS = 480  # longer side of an exposure on the page
 _WHITE_QUANTILE = 0.995
 
 

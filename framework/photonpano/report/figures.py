@@ -38,11 +38,9 @@ from photonpano.values import FloatArray, FluxImage, Group, true_spans
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
 
-MAX_INSTANTS = 1500
-"""Number of instants at which a long trajectory is drawn, evenly spaced."""
+MAX_INSTANTS = 1500  # number of instants at which a long trajectory is drawn, evenly spaced
 
-MAX_PARTS = 5
-"""Number of parts of a motion graph that have a row of their own."""
+MAX_PARTS = 5  # number of parts of a motion graph that have a row of their own
 
 STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "interpolate": "interpolate"}
 

@@ -11,8 +11,7 @@ from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import shrunk
 from photonpano.text import counted, duration, pixels, share
 
-_MAX_PIXELS = 900
-"""Longer side of the picture."""
+_MAX_PIXELS = 900  # longer side of the picture
 
 
 def run_html(folder: Path, record: RunRecord) -> str:

@@ -23,11 +23,9 @@ from photonpano.report.viewer import viewer_data
 from photonpano.residuals.refinement import Explained
 from photonpano.values import Light, true_spans
 
-PICTURE_PIXELS = 1600
-"""Longer side of the panorama on the page; the files of the run folder have all pixels."""
+PICTURE_PIXELS = 1600  # longer side of the panorama on the page; the files of the run folder have all pixels
 
-MAX_SPANS = 12
-"""Number of spans of frames that are listed."""
+MAX_SPANS = 12  # number of spans of frames that are listed
 
 
 @dataclass(frozen=True, slots=True, eq=False)

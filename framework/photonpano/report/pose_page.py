@@ -31,8 +31,7 @@ def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
     )
 
 
-MAX_FRAMES = 2000
-"""Frames that are drawn; of more, every nth."""
+MAX_FRAMES = 2000  # frames that are drawn; of more, every nth
 
 
 def errors_over_time(estimate: PoseEstimate, frame_rate_hz: float | None) -> str | None:

@@ -13,8 +13,7 @@ from photonpano.record.contents import RECORD
 from photonpano.record.schema import FailureRecord, FileContent, LevelRecord
 from photonpano.text import counted
 
-MAX_FILES = 30
-"""Number of files that are listed."""
+MAX_FILES = 30  # number of files that are listed
 
 _CONTENTS = {
     "panorama.tiff": "linear flux in photons per pixel per frame, float32; NaN where nothing was seen",
@@ -74,8 +73,7 @@ def _content(name: str, n_files: int) -> str:
     return ": ".join(filter(None, (counted(n_files, "file"), content))) if name.endswith("/") else content
 
 
-MAX_EXAMPLES = 3
-"""Number of pairs of a group that are listed."""
+MAX_EXAMPLES = 3  # number of pairs of a group that are listed
 
 
 class FailedLevel(TypedDict):

@@ -27,12 +27,7 @@ _THUMBNAIL_PIXELS = 240  # longer side
 def run_job(job: Job, catalog: Catalog | None = None) -> BatchRow:
     """Do one run, unless it was finished before, and score it if the truth lies beside the capture.
 
-    Args:
-        job: what to do.
-        catalog: what can be chosen; by default what the installed plugins offer.
-
-    Returns:
-        The row of the summary. Errors become its reason; only what ends the process escapes.
+    Errors become the reason of the row; only what ends the process escapes.
     """
     with _warnings() as warnings:
         row = _attempted(job, catalog)

@@ -28,14 +28,7 @@ def write_summary(
     common: Sequence[str],
     keys: Sequence[str],
 ) -> None:
-    """Write both files, each whole or not at all.
-
-    Args:
-        directory: the folder of the batch.
-        rows: all runs.
-        spec: the text of the spec, or its data.
-        common: what was changed in it for all runs.
-        keys: the swept keys.
+    """Write both files, each whole or not at all; for the arguments, see `render_batch`.
 
     Raises:
         OutputError: they cannot be written.
@@ -47,11 +40,7 @@ def write_summary(
 
 
 def require_own(directory: Path) -> None:
-    """Refuse a folder that holds a summary that no batch has written.
-
-    Raises:
-        OutputError: there is one.
-    """
+    """Raise `OutputError` if the folder holds a summary that no batch has written."""
     path = directory / TABLE
     try:
         with path.open(encoding="utf-8", errors="replace") as file:

@@ -39,11 +39,7 @@ class SpecText:
     file: Path | None = None
 
     def plan(self, overrides: Sequence[str], output: Path, catalog: Catalog | None = None) -> Plan:
-        """Resolve the spec with overrides.
-
-        Raises:
-            SpecError: it is wrong.
-        """
+        """Resolve the spec with overrides; `SpecError` if it is wrong."""
         name = self.file.stem if self.file else "spec"
         return parse_spec(
             self.content,
@@ -58,15 +54,7 @@ class SpecText:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What a process needs to know to do one run of a batch. It can be pickled.
-
-    Attributes:
-        row: the capture, the run folder, and the swept settings.
-        spec: the spec.
-        overrides: what the run changes in it: the capture, the settings, and what is set for all runs.
-        threads: how many threads it uses if the spec leaves that open.
-        overwrite: as in `run`.
-    """
+    """What a process needs to do one run of a batch; it can be pickled. `threads` counts if the spec leaves that open."""
 
     row: BatchRow
     spec: SpecText
@@ -93,15 +81,12 @@ def override(key: str, value: Any) -> str:
 def read_changes(
     changes: Iterable[str], swept: Iterable[str], takes_list: Callable[[str, str], bool]
 ) -> tuple[list[str], dict[str, list[Any]]]:
-    """Sort what is set for all runs from what is swept.
+    """Sort what is set for all runs from what is swept: the overrides for all runs, and the values of each swept key.
 
     Args:
         changes: overrides such as `run.seed=1`. A list sweeps, as in `levels.0.scale=[0.5, 1]`, where the key takes no list.
         swept: such as `resample.with.group_size=50,100`; with brackets or without.
         takes_list: returns whether a key, given with its override, takes the list.
-
-    Returns:
-        The overrides for all runs, and the values of each swept key.
 
     Raises:
         SpecError: with all problems.
@@ -147,7 +132,7 @@ def combinations(swept: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 def folder_name(capture: str, settings: Mapping[str, Any]) -> str:
     """Return the name of a run folder: that of the capture, and its settings, as in `night,levels=2,run.seed=1`.
 
-    Where file systems or shells would stumble over the settings, they are shortened and end in a hash.
+    Settings that are long, or hold characters that file systems or shells do not take, are shortened and end in a hash.
     """
     text = ",".join(f"{key}={written(value)}" for key, value in settings.items())
     safe = _UNSAFE.sub("_", text)

@@ -26,18 +26,11 @@ _STAGES = ("resample", "merge", "locate", "interpolate")
 
 
 def run_fingerprint(plan: Plan, capture: CaptureRecord, frame_shape: tuple[int, int]) -> Fingerprint:
-    """Return what the results of a run depend on, as plain data.
-
-    The number of threads and the run folder are left out: results do not depend on them.
-
-    Args:
-        plan: what is run.
-        capture: the fingerprint of the capture.
-        frame_shape: (height, width) of a frame.
+    """Return what the results of a run depend on, as plain data; neither the threads nor the run folder.
 
     Returns:
         `versions`, `code` and `capture`, on which everything depends; `common`, the parts of the spec on which it does;
-        `levels`, a list; and `rest`, what only the steps after the last level depend on.
+            `levels`, a list; and `rest`, what only the steps after the last level depend on.
     """
     document = plan.document
     rest = {
@@ -67,13 +60,7 @@ def run_fingerprint(plan: Plan, capture: CaptureRecord, frame_shape: tuple[int, 
 
 
 def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None) -> list[str]:
-    """Return what differs between two fingerprints, a clause each.
-
-    Args:
-        before: of what was kept.
-        now: of the run.
-        levels: number of levels on whose dependencies the comparison stops; None for everything.
-    """
+    """Return what differs between two fingerprints, a clause each; with `levels`, on which that many levels depend."""
     found = [
         f"the version of {path} was {old} and is {new}" for path, old, new in _changed(before["versions"], now["versions"])
     ]
@@ -88,12 +75,7 @@ def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None
 
 
 def finished_run(plan: Plan, capture: CaptureRecord) -> RunRecord | None:
-    """Return the record in the run folder of a plan, if it is of this spec, capture and software, and unchanged.
-
-    Args:
-        plan: what would be run.
-        capture: the fingerprint of the capture as it is now.
-    """
+    """Return the record in the run folder of a plan, if it is of this spec, capture and software, and unchanged."""
     try:
         record = read_record(plan.output.directory)
         same = (
@@ -140,10 +122,7 @@ def _component(choice: Choice) -> dict[str, Any]:
 
 
 def _code(choices: Sequence[Choice], *packages: Any) -> dict[str, str]:
-    """Return a hash of the Python files of the plugins that provide components, by package.
-
-    The version of a plugin stays the same while its author works on it.
-    """
+    """Return hashes of the Python files of plugins, by package: while its author works on a plugin, its version stays."""
     built_by = (sys.modules.get(choice.contribution.build.__module__.partition(".")[0]) for choice in choices)
     return {
         module.__name__: _hash_of(module.__file__) for module in (*packages, *built_by) if getattr(module, "__file__", None)

@@ -26,14 +26,7 @@ class Kept:
     def __init__(
         self, store: Store, decisions: list[Decision], given: tuple[Any, ...] = (), logs: list[KeptLog] | None = None
     ) -> None:
-        """Open the checkpoints of a run.
-
-        Args:
-            store: where results are kept.
-            decisions: the decisions of the run, to which components add.
-            given: what all results depend on, beside what the whole store is for.
-            logs: receives the logs that are open.
-        """
+        """Open the checkpoints of a run; all results depend on `given`, beside what the whole store is for."""
         self._store, self._decisions, self._given = store, decisions, given
         self._logs: list[KeptLog] = [] if logs is None else logs
 
@@ -70,11 +63,7 @@ class Kept:
 
 
 class KeptLog:
-    """The results of a step with many of them, in files of what was found within a few seconds: see `photonpano.context.Log`.
-
-    Attributes:
-        found: the results that were kept before.
-    """
+    """Results of a step with many of them, in files of what was found within some seconds: see `photonpano.context.Log`."""
 
     def __init__(self, store: Store, name: str, decisions: list[Decision]) -> None:
         self._store, self._name, self._decisions = store, name, decisions

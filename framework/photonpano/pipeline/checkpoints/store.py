@@ -17,19 +17,11 @@ from photonpano.text import byte_size
 logger = logging.getLogger(__name__)
 
 SUFFIX = ".npz"
-# Free space that a record needs, in multiples of its own size: results come first.
-_SPARE = 8
+_SPARE = 8  # free space that a record needs, in multiples of its own size: results come first
 
 
 class Store:
-    """Named records in a folder.
-
-    A record that cannot be written, or is damaged, costs time and no result: a warning says so.
-
-    Attributes:
-        folder: it exists.
-        holds_something: whether a record was written or found.
-    """
+    """Named records in a folder that exists. One that cannot be written, or is damaged, is a warning and computed again."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -24,8 +24,7 @@ logger = logging.getLogger(__name__)
 
 MANIFEST = "work.json"
 FORMAT = 1
-# Differences that a message names.
-_SHOWN = 3
+_SHOWN = 3  # differences that a message names
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +43,7 @@ class Continuation:
 
 
 class Work:
-    """The work of a run.
-
-    Attributes:
-        checkpoints: keep what the run finds.
-    """
+    """The work of a run; its `checkpoints` keep what the run finds."""
 
     def __init__(self, folder: Path | None, now: Fingerprint, decisions: list[Decision], keep: bool) -> None:
         self._folder, self._now, self._keep = folder, now, keep
@@ -71,8 +66,7 @@ class Work:
     def close(self, *, failed: bool = False) -> bool:
         """Write what has not been written yet; return whether there is work to go on with.
 
-        Args:
-            failed: whether the same run would fail again, so that only finished levels are of use.
+        A run that `failed` would fail again, so that only finished levels are of use.
         """
         if self._finished or self._kept is None or self._store is None or self._folder is None:
             return False
@@ -96,13 +90,6 @@ def work_folder(
     """Open the work folder of a run, whose lock is held.
 
     What it holds stays after an interruption or an error. Where nothing can be kept, a warning says so, and the run goes on.
-
-    Args:
-        run_folder: of the run.
-        now: what its results depend on.
-        decisions: the decisions of the run, to which components add.
-        how: what to take from the run before.
-        progress: receives a line for an interrupted run.
 
     Raises:
         InputError: the levels before `how.from_level` cannot be taken.
@@ -134,11 +121,7 @@ def finished_before(folder: Path) -> bool:
 
 
 def _prepare(folder: Path, now: Fingerprint, how: Continuation, progress: Progress) -> None:
-    """Leave in the work folder only what this run may take.
-
-    Raises:
-        OutputError: it cannot be written, or it is the folder of somebody else.
-    """
+    """Leave in the work folder only what this run may take; `OutputError` if it is the folder of somebody else."""
     there = os.path.lexists(folder)
     if there and not _is_ours(folder):
         raise OutputError("it is there already, and is not the work folder of a run")
@@ -169,11 +152,7 @@ def _prepare(folder: Path, now: Fingerprint, how: Continuation, progress: Progre
 
 
 def _require_levels(folder: Path, now: Fingerprint, from_level: int | None) -> None:
-    """Refuse to start from a level that is not there, or was found in another way.
-
-    Raises:
-        InputError: names the levels that are there, or what is different now.
-    """
+    """Raise `InputError` if levels to start from are missing, or were found in another way."""
     if from_level is None:
         return
     n_levels, option = len(now["levels"]), f"--from-level {from_level}"

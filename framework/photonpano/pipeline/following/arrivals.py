@@ -13,12 +13,9 @@ from photonpano.errors import PhotonpanoError
 from photonpano.protocols import Arrived, Source
 
 _POLL_S = 0.02
-# How long an unreadable capture is tolerated: a file may appear before the one before it is complete.
-_TOLERATED_S = 1.0
-# Times of arrival that are kept. While frames wait for minutes, they get coarser.
-_MOST_MARKS = 4096
-# Resolution and number of the bins of delays: 10 ms, up to two minutes.
-_STEP_S, _STEPS = 0.01, 12_000
+_TOLERATED_S = 1.0  # how long an unreadable capture is tolerated: a file may appear before the one before it is complete
+_MOST_MARKS = 4096  # Times of arrival that are kept. While frames wait for minutes, they get coarser.
+_STEP_S, _STEPS = 0.01, 12_000  # resolution and number of the bins of delays: 10 ms, up to two minutes
 
 
 class Arrivals:
@@ -33,32 +30,24 @@ class Arrivals:
     """
 
     def __init__(self, look: Callable[[], Arrived], is_over: Callable[[], bool] | None, silence_s: float) -> None:
-        """Begin to watch.
+        """Begin to watch what `look` returns.
 
-        Args:
-            look: returns what is there.
-            is_over: returns whether no more will come, for a capture that is copied from a pipe. Otherwise a capture is over
-                when all frames are there that it promises, or when nothing comes.
-            silence_s: for how long, in seconds.
+        A capture that is copied from a pipe is over when `is_over` returns true; another one when all frames are there that it
+        promises, or nothing has come for `silence_s` seconds.
         """
         self.n_frames, self.ended, self.fell_silent, self.seconds = 0, False, False, 0.0
         self.promised: int | None = None
         self._look, self._is_over, self._silence_s = look, is_over, silence_s
         self._source: Source | None = None
         self._failure: PhotonpanoError | None = None
-        self._marks: deque[tuple[int, float]] = deque()
-        """Numbers of frames, and when they were not there yet."""
+        self._marks: deque[tuple[int, float]] = deque()  # numbers of frames, and when they were not there yet
         self._forgotten = 0
         self._lock, self._changed, self._stopped = threading.Lock(), threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._watch, name="arrivals", daemon=True)
         self._thread.start()
 
     def source(self) -> Source | None:
-        """Return the frames that are there; None as long as there is none.
-
-        Raises:
-            InputError: what arrives is no capture.
-        """
+        """Return the frames that are there, None as long as there is none; `InputError` if what arrives is no capture."""
         if self._failure is not None:
             raise self._failure
         return self._source

@@ -45,8 +45,7 @@ _REFRESH_S = 1.0
 _NOTE_S = 10.0
 # Least time between windows. Long windows take less time for a frame: each repeats the last exposure of the one before.
 _WINDOW_S = 0.2
-# Longest wait for frames between two looks at the page.
-_IDLE_S = 0.1
+_IDLE_S = 0.1  # longest wait for frames between two looks at the page
 
 
 def live_folder(run_directory: Path) -> Path:
@@ -58,14 +57,8 @@ def live_folder(run_directory: Path) -> Path:
 def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: float) -> Iterator[tuple[Plan, LiveFigures]]:
     """Follow a capture until it is complete; the block then runs the whole of it, and the page says how that ended.
 
-    Args:
-        plan: what to do with the capture. One on standard input is copied to a file in the `live_folder`, as it comes.
-        progress: receives messages.
-        overwrite: whether a file of an earlier capture there is replaced, and the run folder; see `run`.
-        end_after: seconds without a new frame after which a growing file counts as complete, unless it promises more frames.
-
-    Yields:
-        The plan that runs the capture, which is now in a file; and how far behind its frames were located.
+    A capture on standard input is copied to a file in the `live_folder`, as it comes. Yields the plan that runs the capture,
+    which is now in a file, and how far behind its frames were located. For `overwrite` and `end_after`, see `run`.
 
     Raises:
         InputError: the source cannot be followed; or what arrives is no capture, or is incomplete. What arrived is kept.
@@ -140,11 +133,7 @@ def _from_file(plan: Plan, path: Path) -> Plan:
 
 
 def _standard_input() -> int:
-    """Return the descriptor of standard input.
-
-    Raises:
-        InputError: it is closed, or a terminal.
-    """
+    """Return the descriptor of standard input; `InputError` if it is closed, or a terminal."""
     if sys.__stdin__ is None or sys.__stdin__.closed or os.isatty(0):
         raise InputError("no frames come on standard input; write PROGRAM | photonpano run SPEC --follow")
     return 0
@@ -166,11 +155,7 @@ def _made(folder: Path) -> Iterator[None]:
 
 
 def _free(path: Path, plan: Plan, overwrite: bool) -> Path:
-    """Return the path of a file that is not there.
-
-    Raises:
-        OutputError: it holds the frames of an earlier capture.
-    """
+    """Return the path, at which no file is; `OutputError` if it holds the frames of an earlier capture."""
     if path.exists() and path.stat().st_size and not overwrite:
         raise OutputError(
             f"{path} holds the frames of an earlier capture: {_way_on(plan)}. To follow another capture, choose another folder "
@@ -190,11 +175,7 @@ def _way_on(plan: Plan) -> str:
 
 
 def _require_complete(plan: Plan, arrivals: Arrivals, end_after: float) -> None:
-    """Refuse a capture with too few frames.
-
-    Raises:
-        InputError: none has come, or fewer than it promises.
-    """
+    """Raise `InputError` if no frame has come, or fewer than the capture promises."""
     where = plan.document["source"]["with"].get("path", "the capture")
     waited = f"within {end_after:g} s"
     if not arrivals.n_frames:

@@ -16,8 +16,7 @@ from photonpano.specs.plan import Plan
 
 logger = logging.getLogger(__name__)
 
-# Time over which the rate of arrival is measured.
-_RATE_S = 3.0
+_RATE_S = 3.0  # time over which the rate of arrival is measured
 # Frames come too fast if they wait for longer than the first, once the second has passed since the first were located.
 _FAR_BEHIND_S, _STARTED_S = 2.0, 10.0
 
@@ -33,12 +32,9 @@ class LiveRun:
         self._rates: deque[tuple[float, int]] = deque([(time.monotonic(), 0)])
 
     def next_window(self, *, last: bool) -> Window | None:
-        """Locate the next frames; None if too few have come, or they cannot be located.
+        """Locate the next frames; None if too few have come, or they cannot be located. `last` says that no more frames come.
 
-        What goes wrong while frames are located ends that with a warning, and not the run: the frames still come.
-
-        Args:
-            last: whether no more frames come.
+        If locating fails, a warning says so, and no more frames are located; the run goes on, as the frames still come.
 
         Raises:
             InputError: what arrives is no capture.

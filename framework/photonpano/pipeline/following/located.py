@@ -19,8 +19,7 @@ from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch
 from photonpano.values import FrameSpan, Homography
 
-# Frames from which the first group size is chosen.
-LEAST_FRAMES = {"binary": 256, "intensity": 16}
+LEAST_FRAMES = {"binary": 256, "intensity": 16}  # frames from which the first group size is chosen
 # Groups of the longest window: as many are located in one call if frames come faster than they are located.
 _MOST_GROUPS = 8
 
@@ -64,14 +63,10 @@ class LocatedSoFar:
         self._joins = False
 
     def next_window(self, source: Source, *, last: bool = False) -> Window | None:
-        """Locate the next frames, a few groups of them.
+        """Locate the next frames of `source`, which is all that are there: a few groups of them.
 
-        Args:
-            source: all frames that are there.
-            last: whether there will be no more, so that the next window need not wait for more frames.
-
-        Returns:
-            None if there are no new groups yet, or they could not be located: see `problem`.
+        None if there are no new groups yet, or they could not be located: see `problem`. With `last`, there will be no more
+        frames, so that it does not wait for more.
 
         Raises:
             PhotonpanoError: a component failed.

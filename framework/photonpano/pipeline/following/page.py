@@ -20,19 +20,10 @@ PAGE, PICTURE, FIGURES = "live.html", "live.png", "live.json"
 
 
 class LivePage:
-    """Writes the page of a run, each file whole or not at all.
-
-    Attributes:
-        figures: those that it shows.
-    """
+    """Writes the page of a run, each file whole or not at all; it shows `figures`."""
 
     def __init__(self, folder: Path, run_folder: Path) -> None:
-        """Prepare to write.
-
-        Args:
-            folder: for the files; those of an earlier run are removed.
-            run_folder: where the report will be, beside this folder.
-        """
+        """Remove the files of an earlier run from `folder`; the report will be in `run_folder`, beside it."""
         self.figures = LiveFigures()
         self._folder, self._run_folder = folder, run_folder
         self._failed = False

@@ -23,20 +23,13 @@ from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Resp
 
 logger = logging.getLogger(__name__)
 
-# Most pixels of the canvas; beyond, its scale is halved.
-_MOST_PIXELS = 2_000_000
-# Least scale; beyond, the picture begins anew.
-_LEAST_SCALE = 1 / 8
-# Greatest ratio between the area of a frame on the canvas and that of the first frame, either way.
-_MOST_AREA_CHANGE = 4.0
-# How much more than necessary the canvas grows, in longer sides of a frame.
-_MARGIN = 0.25
-# Motion within which frames are summed before they are warped.
-_TOLERANCE_PX = 1.0
-# Quantile of the flux that is white.
-_WHITE = 0.995
-# Pixels from which that quantile is estimated.
-_SAMPLES = 100_000
+_MOST_PIXELS = 2_000_000  # most pixels of the canvas; beyond, its scale is halved
+_LEAST_SCALE = 1 / 8  # least scale; beyond, the picture begins anew
+_MOST_AREA_CHANGE = 4.0  # greatest ratio between the area of a frame on the canvas and that of the first frame, either way
+_MARGIN = 0.25  # how much more than necessary the canvas grows, in longer sides of a frame
+_TOLERANCE_PX = 1.0  # motion within which frames are summed before they are warped
+_WHITE = 0.995  # quantile of the flux that is white
+_SAMPLES = 100_000  # pixels from which that quantile is estimated
 # The made-up capture: a frame, a block, how many frames, and how far the camera pans.
 _SHAPE, _BLOCK_PX, _N_FRAMES, _LENGTH_PX = (64, 96), 8, 2048, 32
 
@@ -44,21 +37,15 @@ _SHAPE, _BLOCK_PX, _N_FRAMES, _LENGTH_PX = (64, 96), 8, 2048, 32
 class PictureSoFar:
     """Sums the frames of windows.
 
-    Convention:
-        The plane of the canvas is that of the first window; (x, y) of the canvas are those of the plane times the scale.
-
-    Attributes:
-        scale: pixels of the canvas per pixel of a frame.
+    Convention: The plane of the canvas is that of the first window; (x, y) of the canvas are those of the plane times `scale`,
+    the pixels of the canvas per pixel of a frame.
     """
 
     def __init__(self) -> None:
         self.scale = 1.0
-        self._sums = np.zeros((2, 0, 0), np.float32)
-        """Counts, and their weights in frames."""
-        self._origin: NDArray[np.integer] = np.zeros(2, int)
-        """(x, y) of the first pixel."""
-        self._to_plane: Homography = np.eye(3)
-        """From the frame that the next window has in common with the last one."""
+        self._sums = np.zeros((2, 0, 0), np.float32)  # counts, and their weights in frames
+        self._origin: NDArray[np.integer] = np.zeros(2, int)  # (x, y) of the first pixel
+        self._to_plane: Homography = np.eye(3)  # from the frame that the next window has in common with the last one
         self._response: Response | None = None
 
     def add(self, window: Window) -> None:
@@ -150,7 +137,7 @@ def _upright(placed: FloatArray, shape: tuple[int, int]) -> bool:
 def rehearse(plan: Plan, context: Context) -> None:
     """Locate a made-up capture and draw its picture, so that compiling and loading do not delay the first frames.
 
-    Problems do not matter.
+    Problems are only logged.
     """
     located, picture = LocatedSoFar(plan, context), PictureSoFar()
     try:

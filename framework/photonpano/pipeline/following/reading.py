@@ -11,8 +11,7 @@ from photonpano.protocols import Source
 from photonpano.specs.plan import Plan
 from photonpano.values import BoolArray
 
-# Frames of a capture whose length is not known yet, for checks of the stages.
-_LONG = 1_000_000
+_LONG = 1_000_000  # frames of a capture whose length is not known yet, for checks of the stages
 
 
 class ArrivedFrames:

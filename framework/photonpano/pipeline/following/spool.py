@@ -13,29 +13,14 @@ from photonpano.errors import InputError, OutputError, PhotonpanoError
 from photonpano.protocols import Piped
 
 _BUFFER_BYTES = 1024**2
-# How long a spool that is stopped may wait for the writer.
-_WAIT_S = 0.2
+_WAIT_S = 0.2  # how long a spool that is stopped may wait for the writer
 
 
 class Spool:
-    """Copies a pipe to a file, until the pipe ends or the spool is closed.
-
-    Attributes:
-        path: the file.
-        ended: whether nothing more comes.
-    """
+    """Copies a pipe to a file, until the pipe ends or the spool is closed; then it has `ended`."""
 
     def __init__(self, descriptor: int, path: Path, piped: Piped) -> None:
-        """Make the file, which must not be there, and begin to copy.
-
-        Args:
-            descriptor: of the pipe.
-            path: the file.
-            piped: how long frames are.
-
-        Raises:
-            OutputError: the file cannot be made.
-        """
+        """Make the file, which must not be there, and begin to copy; `OutputError` if it cannot be made."""
         self.path, self.ended = path, False
         self._empty = True
         self._failure: PhotonpanoError | None = None
