@@ -28,8 +28,7 @@ _IN_NOTEBOOK = "JPY_PARENT_PID"  # set for commands of a notebook, whose termina
 def progress_for_stderr(*, notes: bool = False) -> Progress:
     """Return bars for a terminal, lines for pipes, files and continuous integration, and nothing with `-q`.
 
-    Args:
-        notes: whether notes are printed without a terminal, too.
+    Notes are printed on a terminal, and elsewhere if `notes` says so.
     """
     shown = _progress_for_stderr(notes or is_verbose())
     return Logged(shown) if is_logged() else shown
@@ -66,12 +65,7 @@ class Bars:
 
 
 class Lines:
-    """Prints a line every `INTERVAL_S`, with what is done and the time left. Short commands print none.
-
-    Args:
-        notes: whether notes are printed.
-        stages: whether each stage has a line when it is done.
-    """
+    """Prints a line every `INTERVAL_S`, with what is done and the time left, and on request notes, and stages when done."""
 
     def __init__(self, *, notes: bool = False, stages: bool = False) -> None:
         self._notes, self._stages = notes, stages

@@ -48,12 +48,7 @@ class LoadedCommand(TyperCommand):
 
 
 def loaded(words: str, module: str) -> Any:
-    """Import the module of a command, and return the command.
-
-    Args:
-        words: its name, such as `plugins list`.
-        module: that declares it.
-    """
+    """Import the module of a command such as `plugins list`, and return the command."""
     importlib.import_module(module)
     declared = COMMANDS[module]
     text, _ = _documented(declared.function)

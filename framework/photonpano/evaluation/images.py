@@ -42,8 +42,7 @@ class ImageScore:
 def covered(weight: FluxImage) -> BoolArray:
     """Return which pixels were seen in enough frames to be compared, (H, W): see `MIN_COVERAGE`.
 
-    Args:
-        weight: (H, W), number of frames in which each pixel was seen; of (H, W, 3), the sum over the colours counts.
+    The weight is the number of frames in which each pixel was seen; of (H, W, 3), the sum over the colours counts.
     """
     weight = weight if weight.ndim == 2 else weight.sum(axis=-1)
     seen = weight > 0
@@ -59,22 +58,15 @@ def known(image: FluxImage) -> BoolArray:
 
 
 def white_flux(scene: FluxImage) -> float:
-    """Return the flux that becomes white in a comparison: see `WHITE_QUANTILE`.
-
-    Args:
-        scene: (H, W) or (H, W, 3), true flux; NaN where unknown.
-    """
+    """Return the flux that becomes white in a comparison, of a scene that is NaN where unknown: see `WHITE_QUANTILE`."""
     return float(np.nanquantile(scene, WHITE_QUANTILE))
 
 
 def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, white: float) -> ImageScore:
-    """Compare a panorama with the truth.
+    """Compare a panorama with the truth on the same pixels: flux, (H, W), or (H, W, 3), of which all colours count alike.
 
-    Args:
-        panorama: (H, W), flux; or (H, W, 3), of which all colours count alike.
-        truth: true flux on the same pixels, of the same shape.
-        compared: (H, W), the pixels to compare; those where either image is not finite, in any colour, are left out.
-        white: the flux that becomes 1 in sRGB, such as `white_flux` of the true scene. Brighter pixels are clipped to it.
+    Pixels of `compared`, (H, W), where either image is not finite in any colour are left out. Flux brighter than `white`, such
+    as the `white_flux` of the true scene, is clipped to it.
 
     Raises:
         ValueError: no pixel is compared, or white is not positive.
@@ -118,12 +110,9 @@ def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography, aroun
 
     A scene that is finer than the canvas is averaged over the areas of its pixels, rounded to whole pixels of the scene.
 
-    Args:
-        scene: (H, W), true flux on the true plane; or (H, W, 3).
-        canvas: the pixel grid of the panorama, which shows the estimated reference plane.
-        alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
-        around: (3, 3), the matrix of the camera to whose pixels the alignment maps, if the scene is an equirectangular
-            panorama, 360 degrees wide, whose middle that camera looks at.
+    The alignment is (3, 3), pixels of the estimated reference plane to pixels of the true plane. `around` is (3, 3), the matrix
+    of the camera to whose pixels the alignment maps, if the scene is an equirectangular panorama, 360 degrees wide, whose
+    middle that camera looks at.
     """
     from scipy.ndimage import map_coordinates
 

@@ -100,9 +100,8 @@ class RunTrajectory:
 def load_truth(path: Path) -> Truth:
     """Read the truth of a simulated capture.
 
-    Args:
-        path: an `.npz` archive of `homographies`, `frame_shape` and, for image scores, `scene`. If the lens distorts,
-            `homographies` are those of an ideal lens, and `undistorted_corners` (4, 2) are its pixels of the frame's corners.
+    The file is an `.npz` archive of `homographies`, `frame_shape` and, for image scores, `scene`. If the lens distorts,
+    `homographies` are those of an ideal lens, and `undistorted_corners` (4, 2) are its pixels of the frame's corners.
 
     Raises:
         InputError: the file is missing, is no such archive, lacks an array, or contains one of another shape or type.
@@ -126,14 +125,9 @@ def load_truth(path: Path) -> Truth:
 
 
 def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajectory:
-    """Read the trajectory of a run folder.
+    """Read the trajectory of a run folder; `InputError` if the file is missing or damaged.
 
-    Args:
-        folder: the run folder.
-        needs_std_px: whether the expected error must be there; runs of older versions lack it, and it is NaN then.
-
-    Raises:
-        InputError: the file is missing or damaged.
+    Runs of older versions lack the expected error: it is NaN then, unless it is needed.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; give the run folder that `photonpano run` wrote")
@@ -287,12 +281,8 @@ _MAX_SIDE = 100  # longer side of a drawing, in sides of a frame; of a camera th
 def drawn_path(homographies: FloatArray, frame_shape: tuple[int, int]) -> str:
     """Return the path of the middle of the frame over the reference plane, with the outlines of the first and last frame.
 
-    Args:
-        homographies: (N, 3, 3) of the located frames, frame pixels to reference pixels.
-        frame_shape: (height, width) of a frame.
-
-    Returns:
-        An SVG element, which takes the colour of the text around it; empty where the path goes out of the plane.
+    The homographies are (N, 3, 3) of the located frames. The SVG element takes the colour of the text around it; it is empty
+    where the path goes out of the plane.
     """
     if not len(homographies):
         return ""

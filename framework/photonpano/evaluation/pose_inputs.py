@@ -24,9 +24,7 @@ class RunPoses:
     """Content of `poses.npz` in a run folder.
 
     Attributes:
-        camera: of all frames.
         camera_from_world: (T, 3, 4), NaN where a frame is not located.
-        located: (T,).
         std_position: (T,) expected error of the position, where the path has the length 1.
         std_rotation_deg: (T,) expected error of the rotation.
         frame_shape: (height, width) of a frame.
@@ -42,12 +40,7 @@ class RunPoses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruePoses:
-    """True poses of a capture.
-
-    Attributes:
-        camera_from_world: (T, 3, 4), in m.
-        focal_px: true focal length; None if it is not known.
-    """
+    """True poses of a capture, (T, 3, 4) in m, and its focal length; None if it is not known."""
 
     camera_from_world: FloatArray
     focal_px: float | None = None
@@ -59,11 +52,7 @@ def has_poses(folder: Path) -> bool:
 
 
 def load_run_poses(folder: Path) -> RunPoses:
-    """Read the poses of a run folder.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
+    """Read the poses of a run folder; `InputError` if the file is missing or damaged."""
     path = folder / POSES
     if not path.exists():
         raise InputError(f"{folder} has no {POSES}; give the folder of a finished run with `pose`")
@@ -84,10 +73,7 @@ def load_run_poses(folder: Path) -> RunPoses:
 
 
 def load_true_poses(path: Path) -> TruePoses:
-    """Read the true poses of a capture.
-
-    Args:
-        path: an `.npz` archive of `camera_from_world` (T, 3, 4) in m, and if it is known `camera_matrix` (3, 3).
+    """Read an `.npz` archive of `camera_from_world` (T, 3, 4) in m, and if it is known `camera_matrix` (3, 3).
 
     Raises:
         InputError: the file is missing, is no such archive, or has no poses.

@@ -113,14 +113,10 @@ def evaluate_poses(run_folder: Path | str, truth: Path | str, rpe_frames: int | 
 def pose_errors(
     found: FloatArray, true: FloatArray, located: BoolArray, rpe_frames: int, std_position: FloatArray | None = None
 ) -> PoseScore:
-    """Score poses against the true ones.
+    """Score poses (T, 3, 4), world to camera, of a world of any scale against the true ones in m, at the `located` frames.
 
-    Args:
-        found: (T, 3, 4), world to camera, in a world of any scale.
-        true: (T, 3, 4), in m.
-        located: (T,) the frames to compare.
-        rpe_frames: frames over which the relative error is taken, for every pair of located frames that are so far apart.
-        std_position: (T,) expected errors of the positions, in units of the found world; None or not finite if not known.
+    The relative error is that of every pair of located frames that are `rpe_frames` apart. `std_position` is (T,), in units of
+    the found world; None or not finite if not known.
 
     Raises:
         ValueError: fewer than three located frames, or their true or found positions are all the same.

@@ -33,9 +33,7 @@ RESULTS = frozenset(
 def contents_of(folder: Path, known: Mapping[str, FileContent] | None = None) -> dict[str, FileContent]:
     """Return size and SHA-256 of the files in a folder by their paths in it, such as `sparse/images.txt`, without run.json.
 
-    Args:
-        folder: all files of it count, those in folders as well.
-        known: those of some files, which are not read.
+    Files that are `known` are not read.
     """
     paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
     names = sorted(name for path in paths if (name := path.relative_to(folder).as_posix()) != RECORD)
@@ -83,12 +81,7 @@ def finish_run_folder(folder: Path) -> None:
 
 
 def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str] | None:
-    """Return the files that are there, and are not what run.json lists; None if it lists none.
-
-    Args:
-        folder: the run folder.
-        names: the files to compare; all by default.
-    """
+    """Return the files, of those with the names or of all, that are not what run.json lists; None if it lists none."""
     recorded = recorded_contents(folder)
     if recorded is None:
         return None
@@ -97,11 +90,7 @@ def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str]
 
 
 def require_one_run(folder: Path, names: Iterable[str]) -> None:
-    """Refuse files that do not belong to the run.json beside them; warn if it lists no hashes.
-
-    Raises:
-        InputError: a file is another one than the run wrote.
-    """
+    """Raise `InputError` if files are not those of the run.json beside them; warn if it lists no hashes."""
     if not folder.is_dir():
         return
     finish_run_folder(folder)
@@ -117,10 +106,9 @@ def require_one_run(folder: Path, names: Iterable[str]) -> None:
 
 
 def require_same_frames(folder: Path, record: Mapping[str, Any], source: Source) -> None:
-    """Refuse a capture whose sampled frames are not those that a run has read; runs of older versions did not record them.
+    """Raise `InputError` if the sampled frames of a capture are not those that a run has read.
 
-    Raises:
-        InputError: the frames are others.
+    Runs of older versions did not record them.
     """
     recorded = record.get("capture")
     if isinstance(recorded, dict) and frames_sha256(source) != recorded.get("frames_sha256"):

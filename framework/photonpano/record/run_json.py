@@ -51,20 +51,7 @@ def record_of(
     seconds: float,
     capture: CaptureRecord,
 ) -> RunRecord:
-    """Return the record of a finished run.
-
-    Args:
-        plan: what was run.
-        stream: the capture.
-        decisions: the choices that the spec left open.
-        levels: the results of the loop.
-        explained: the motion of every frame, and what refiners did.
-        verdict: whether it is trusted.
-        panorama: the panorama.
-        rendered: the choices of renderer and exporters.
-        seconds: time that the run took.
-        capture: its fingerprint.
-    """
+    """Return the record of a finished run; `rendered` are the decisions of renderer and exporters."""
     motion = explained.motion
     if plan.until_converged:
         decisions = [*decisions, levels_decision(levels)]
@@ -82,15 +69,7 @@ def record_of(
 def started_record(
     plan: Plan, stream: StreamInfo, decisions: Sequence[Decision], seconds: float, capture: CaptureRecord
 ) -> RunRecord:
-    """Return the record of a finished run without its results.
-
-    Args:
-        plan: what was run.
-        stream: the capture.
-        decisions: the choices that the spec left open.
-        seconds: time that the run took.
-        capture: its fingerprint.
-    """
+    """Return the record of a finished run without its results."""
     return {
         "photonpano": importlib.metadata.version("photonpano"),
         "status": "done",
@@ -123,11 +102,7 @@ def started_record(
 
 
 def read_record(run_folder: Path) -> RunRecord:
-    """Read the `run.json` of a run folder.
-
-    Raises:
-        InputError: there is none, or it is no record of a run.
-    """
+    """Read the `run.json` of a run folder; `InputError` if there is none, or it is no record of a run."""
     file = run_folder / "run.json"
     if not file.is_file():
         raise InputError(f"{run_folder} has no run.json, so no run has finished in it; give the folder of a finished run")
@@ -177,12 +152,7 @@ def level_record(result: LevelResult) -> LevelRecord:
 
 
 def failure_records(groups: Sequence[Group], edges: Sequence[Edge]) -> list[FailureRecord]:
-    """Describe the pairs that were not located.
-
-    Args:
-        groups: of the level.
-        edges: the pairs that were tried.
-    """
+    """Describe the pairs that were not located."""
     return [
         FailureRecord(
             **_pair(groups, edge),
@@ -244,8 +214,7 @@ def _rounded(decibels: float | None) -> float | None:
 def motion_record(std_px: FloatArray) -> MotionRecord | None:
     """Describe the expected error of the motion; None where no motion is known, as with a single exposure.
 
-    Args:
-        std_px: (T,) expected corner error, infinite where nothing was located.
+    `std_px` is (T,), infinite where nothing was located.
     """
     known = np.flatnonzero(np.isfinite(std_px))
     if not len(known):
@@ -306,6 +275,6 @@ def _pair(groups: Sequence[Group], edge: Edge) -> PairRecord:
 
 
 def _number(value: float) -> float | None:
-    """Convert a number to what JSON can hold: a number of Python, None if it is not finite."""
+    """Return a number as JSON holds it: plain Python, None if it is not finite."""
     plain: float = value.item() if isinstance(value, np.generic) else value
     return plain if np.isfinite(plain) else None

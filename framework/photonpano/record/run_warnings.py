@@ -56,11 +56,7 @@ def motion_warnings(motion: FrameMotion) -> list[str]:
 
 
 def uncertain_frames(std_px: FloatArray) -> list[str]:
-    """Warn of the frames whose expected error exceeds `UNCERTAIN_PX`.
-
-    Args:
-        std_px: (T,) expected corner error, infinite where nothing was located.
-    """
+    """Warn of frames whose expected error, (T,) and infinite where nothing was located, exceeds `UNCERTAIN_PX`."""
     if not np.isfinite(std_px).any():
         return ["only one exposure was located, so no motion is known: its frames are summed without motion compensation"]
     uncertain = np.isfinite(std_px) & (std_px > UNCERTAIN_PX)

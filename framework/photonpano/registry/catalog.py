@@ -82,12 +82,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class BrokenPlugin:
-    """A plugin that failed to load, and offers nothing.
-
-    Attributes:
-        origin: the plugin.
-        error: what went wrong, in a line.
-    """
+    """A plugin that failed to load, and offers nothing, with what went wrong, in a line."""
 
     origin: Origin
     error: str
@@ -98,12 +93,7 @@ class BrokenPlugin:
 
 @dataclass(frozen=True, slots=True)
 class DisabledPlugin:
-    """A plugin that was not imported, because the environment disables it.
-
-    Attributes:
-        origin: the plugin.
-        by: what disables it, such as "PHOTONPANO_DISABLE_PLUGINS=core".
-    """
+    """A plugin that was not imported, and what disables it, such as "PHOTONPANO_DISABLE_PLUGINS=core"."""
 
     origin: Origin
     by: str
@@ -114,12 +104,7 @@ class DisabledPlugin:
 
 @dataclass(frozen=True, slots=True)
 class Observer:
-    """A plugin with observation hooks.
-
-    Attributes:
-        origin: the plugin.
-        hook: calls the observation hooks of the plugin by their names; a hook that it lacks does nothing.
-    """
+    """A plugin with observation hooks; `hook` calls them by their names, and one that the plugin lacks does nothing."""
 
     origin: Origin
     hook: pluggy.HookRelay

@@ -41,7 +41,6 @@ class ConfigRow:
         type: such as "integer" or "first, last or number".
         default: as it is written in YAML, or "computed"; None if the key is required.
         bounds: such as "at least 1"; empty if there are none.
-        description: the meaning of the key.
     """
 
     key: str

@@ -26,10 +26,7 @@ MAX_OFFERED = 1000  # most components that a hook may offer
 
 
 def contributions_of(plugin: object) -> tuple[Contribution, ...]:
-    """Call the hooks of one plugin that offer components, and check what they return.
-
-    Args:
-        plugin: a module, or any object, with hooks.
+    """Call the hooks of one plugin, a module or any object, that offer components, and check what they return.
 
     Raises:
         PluginError: a hook is unknown, lacks its mark, takes arguments that it does not have, raises, or offers something of
@@ -51,11 +48,7 @@ def observation_of(plugin: object) -> pluggy.HookRelay | None:
 
 
 def require_same_contract(contribution: Contribution) -> None:
-    """Refuse a contribution that was made for another version of the contract.
-
-    Raises:
-        PluginError: the message has both versions, and what to upgrade.
-    """
+    """Raise `PluginError` if a contribution was made for another version of the contract."""
     made_for = contribution.api_version
     if made_for == API_VERSION:
         return

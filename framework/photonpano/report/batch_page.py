@@ -66,12 +66,8 @@ def render_batch(
 ) -> str:
     """Return the summary of a batch as one HTML page that needs no other file, no network and no script.
 
-    Args:
-        directory: the folder of the page, from which it links to the reports of the runs.
-        rows: all runs.
-        spec: the text of the spec, or its data.
-        common: what was changed in it for all runs.
-        keys: the swept keys.
+    The page lies in `directory`. `spec` is its text, or its data, `common` what was changed in it for all runs, and `keys` are
+    the swept keys.
     """
     figures = {key: errors_over_setting(rows, key, number) for number, key in enumerate(keys)}
     return filled(
@@ -114,13 +110,7 @@ _ERRORS = {
 def errors_over_setting(rows: Sequence[BatchRow], key: str, number: int = 0) -> str | None:
     """Draw the errors of runs over a swept setting, a line for each capture and for what else is swept.
 
-    Args:
-        rows: all runs.
-        key: of the setting. Numbers are drawn to scale, other values at equal distances.
-        number: of the figure on its page.
-
-    Returns:
-        SVG; None if no run that is done has an error.
+    Numbers are drawn to scale, other values at equal distances. None if no run that is done has an error.
     """
     errors = [name for name in _ERRORS if any(getattr(row, name) is not None for row in rows)]
     if not errors:

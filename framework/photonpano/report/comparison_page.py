@@ -26,18 +26,15 @@ _MOST_DIFFERENCES = 60  # number of settings that are listed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ComparedRun:
-    """A run that is laid beside others.
+    """A run that is compared with others.
 
     Attributes:
         name: short, and different from those of the others.
-        folder: the run folder.
-        record: its run.json.
         picture: (H, W) or (H, W, 3) uint8, its panorama on the canvas of the first run.
         difference_px: (T,) mean distance of the corners of each frame from where the first run has them, after the best
             alignment of the planes, in px of a frame; NaN where either has not located it. None for the first run.
         corner_error_px: mean distance of the corners from their true places; None without a truth.
-        psnr_db: of the panorama; None without a true scene.
-        ssim: of the panorama; None without a true scene.
+        psnr_db: of the panorama, as is `ssim`; None without a true scene.
     """
 
     name: str
@@ -56,12 +53,7 @@ class ComparedRun:
 
 
 def render_comparison(runs: Sequence[ComparedRun], output: Path) -> str:
-    """Return the page as HTML that needs no other file and no network.
-
-    Args:
-        runs: at least two.
-        output: where the page will lie; it links to the reports of the runs from there.
-    """
+    """Return the page as HTML that needs no other file and no network, and links to the reports of at least two runs."""
     first = runs[0].record
     shown, hidden = _differing([run.record["spec"] for run in runs])
     return filled(

@@ -105,13 +105,7 @@ def add_axes(
 ) -> list[Axes]:
     """Add axes in a column or in a row, with their labels at fixed distances.
 
-    Args:
-        figure: a new one.
-        margins: around all axes.
-        rows: relative heights of the rows.
-        columns: number of equal columns.
-        gap_in: room between axes.
-        share_x: whether all have one range of x.
+    The rows have these relative heights, and the columns are equal.
     """
     from matplotlib.transforms import ScaledTranslation
 
@@ -179,14 +173,7 @@ def _show_pixels(axes: Axes, height: int, width: int) -> None:
 
 
 def add_colour_bar(axes: Axes, image: Any, label: str, numbers: str) -> Colorbar:
-    """Add the colours of an image to the right of its axes.
-
-    Args:
-        axes: with `BAR_IN` inches of room.
-        image: drawn in them.
-        label: of the colours.
-        numbers: their format.
-    """
+    """Add the colours of an image to the right of its axes, which have `BAR_IN` inches of room there."""
     from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
     figure: Any = axes.get_figure(root=True)

@@ -131,11 +131,7 @@ def _cut_at_seam(path: FloatArray, width: int) -> FloatArray:
 
 
 def coverage_map(coverage: FluxImage) -> str:
-    """Draw the number of frames that saw each pixel of the panorama, in any colour; unseen pixels are grey.
-
-    Args:
-        coverage: (H, W), or (H, W, 3) of red, green and blue pixels.
-    """
+    """Draw the number of frames that saw each pixel, (H, W) or (H, W, 3), in any colour; unseen pixels are grey."""
     coverage = coverage if coverage.ndim == 2 else coverage.sum(axis=-1)
     height, width = coverage.shape
     with map_figure(height, width, side_in=BAR_IN) as (figure, axes):
@@ -149,9 +145,7 @@ def coverage_map(coverage: FluxImage) -> str:
 def tied_parts(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
     """Draw the exposures of a level over the frames: a row for each part that is tied together, and one for lone exposures.
 
-    Args:
-        groups: of the level.
-        parts: (N,) number of the connected component of each exposure, 0 for the largest.
+    `parts` is (N,), the number of the connected component of each exposure, 0 for the largest.
     """
     sizes = np.bincount(parts)
     tied = np.flatnonzero(sizes > 1)[:MAX_PARTS]

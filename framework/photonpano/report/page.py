@@ -30,12 +30,7 @@ MAX_SPANS = 12  # number of spans of frames that are listed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenCapture:
-    """A capture that the viewer of a report looks at.
-
-    Attributes:
-        source: the capture, as the panorama was rendered from it.
-        levels: of its motion.
-    """
+    """A capture that the viewer of a report reads, as the panorama was rendered from it, with the levels of its motion."""
 
     source: Source
     levels: Sequence[LevelResult]
@@ -50,14 +45,7 @@ def render_report(
 ) -> str:
     """Return the report of a run as one HTML page that needs no other file and no network.
 
-    A script in it shows the panorama in a viewer; where scripts are off, all figures are there.
-
-    Args:
-        record: the content of `run.json`.
-        explained: the motion of every frame, and what the panorama does not explain.
-        panorama: the panorama.
-        light: that the run found; None if it is steady.
-        capture: for the viewer; None for a page without one.
+    A script in it shows the panorama in a viewer, unless there is no capture; where scripts are off, all figures are there.
     """
     files, more_files = listed_files(record.get("files", {}))
     return filled(

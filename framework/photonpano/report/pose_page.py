@@ -16,9 +16,7 @@ from photonpano.values import PoseEstimate
 def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
     """Return the report of a run with `pose` as one HTML page that needs no other file, no network and no script.
 
-    Args:
-        record: the content of `run.json`.
-        estimate: the poses, in a world in which the path has the length 1.
+    The path of the estimate has the length 1.
     """
     shape = record["source"]["height"], record["source"]["width"]
     return filled(

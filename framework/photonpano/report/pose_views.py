@@ -41,13 +41,11 @@ _FRUSTUM = 0.14  # depth of a camera's frustum, relative to the radius of what i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Viewpoint:
-    """A place to look from.
+    """A place to look from at `middle`, from the side `name`, such as "from above".
 
     Attributes:
         axes: (3, 3) rows to the right, up, and towards the viewer, in the world.
-        middle: (3,) what is looked at.
         distance: of the viewer from the middle.
-        name: the side, such as "from above".
     """
 
     axes: FloatArray
@@ -69,9 +67,7 @@ class Viewpoint:
 def viewpoints(shown: FloatArray, poses: FloatArray) -> tuple[Viewpoint, Viewpoint]:
     """Choose two places from which things spread widely: along their least and their second principal axis, from aslant.
 
-    Args:
-        shown: (N, 3) what is to be in the picture.
-        poses: (T, 3, 4) of located cameras, which tell above from below.
+    `shown` is (N, 3); the poses (T, 3, 4) of located cameras give the directions up and ahead.
     """
     low, high = np.min(shown, axis=0), np.max(shown, axis=0)
     middle = (low + high) / 2

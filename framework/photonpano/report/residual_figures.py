@@ -48,10 +48,7 @@ _GAIN_RANGE_PERCENT = 5.0  # the smallest range of colours of the brightness, to
 def misfit_over_panorama(residuals: Residuals, measured: Canvas, canvas: Canvas) -> str:
     """Draw the misfit of each place of the panorama.
 
-    Args:
-        residuals: of the run.
-        measured: the canvas of the panorama of the residuals, on which the misfit is drawn if the projections differ.
-        canvas: of the panorama.
+    On its canvas, or on the one on which the residuals were `measured` if that has another projection.
     """
     same = same_projection(measured, canvas)
     shape, onto = (canvas.shape, canvas.transform) if same else (measured.shape, measured.transform)
@@ -74,10 +71,7 @@ def same_projection(one: Canvas, other: Canvas) -> bool:
 def misfit_cells(residuals: Residuals, measured: Canvas, onto: FloatArray) -> tuple[Any, tuple[float, float, float, float]]:
     """Return the misfit over the panorama, masked where it was seen too briefly, and its box.
 
-    Args:
-        residuals: of the run.
-        measured: the canvas of the panorama of the residuals.
-        onto: (3, 3) transform of the canvas in whose pixels the box is: left, top, right, bottom.
+    The box is left, top, right, bottom in the pixels of the canvas with the transform `onto`.
     """
     misfit = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_misfit))
     rows, columns = misfit.shape
@@ -146,12 +140,7 @@ def light_over_time(residuals: Residuals) -> str | None:
 
 
 def flicker_over_panorama(light: Light | None, canvas: Canvas) -> str | None:
-    """Draw how deep each place flickers, and at which phase; None if all of the scene has the same light.
-
-    Args:
-        light: of the capture; None if it is steady.
-        canvas: of the panorama.
-    """
+    """Draw how deep each place flickers, and at which phase; None if all of the scene has the same light."""
     if light is None or not light.has_lamps:
         return None
     shape = canvas.shape
@@ -175,10 +164,7 @@ def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     """Return the power spectrum of the shifts of short spans, divided by that of their photon noise.
 
     It is the mean of windows that overlap by half, and of both directions (Welch 1967). The mean shift is left out: it moves
-    the whole panorama.
-
-    Returns:
-        (F,) frequencies in cycles per frame, and (F,) power; 1 is noise. Both are empty for fewer than 16 spans.
+    the whole panorama. Returns (F,) frequencies in cycles per frame, and (F,) power; both empty for fewer than 16 spans.
     """
     found = residuals.steps()
     stds = _noise_px(found.information)

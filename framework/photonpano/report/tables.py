@@ -31,11 +31,9 @@ _CONTENTS = {
 
 @dataclass(frozen=True, slots=True)
 class ListedFile:
-    """A file of a run folder, or a folder in it.
+    """A file of a run folder, or a folder in it, whose name ends in a slash.
 
     Attributes:
-        name: its name; that of a folder ends in a slash.
-        link: the same as a relative URL.
         bytes: its size, with all that a folder holds; None where it is not known yet.
         content: what it holds; empty where only its writer knows.
     """
@@ -49,10 +47,7 @@ class ListedFile:
 def listed_files(files: Mapping[str, FileContent]) -> tuple[list[ListedFile], int]:
     """Return the first files and folders of a run, best known first, and the number of the others.
 
-    A folder is one row: it may hold thousands of pictures.
-
-    Args:
-        files: as `run.json` lists them, which is listed as well.
+    A folder is one row: it may hold thousands of pictures. run.json, which does not list itself, is added.
     """
     sizes: dict[str, list[int]] = defaultdict(list)
     for path, content in files.items():
@@ -85,12 +80,7 @@ class FailedLevel(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class FailureGroup:
-    """Pairs of one level that failed for the same reason, apart from the numbers in it.
-
-    Attributes:
-        level: the level.
-        failures: the pairs, in order.
-    """
+    """Pairs of one level, in order, that failed for the same reason, apart from the numbers in it."""
 
     level: int
     failures: tuple[FailureRecord, ...]

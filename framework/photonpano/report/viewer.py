@@ -42,15 +42,7 @@ _COLOURS = 6  # colours of a legend, between which a browser blends
 def viewer_data(
     record: RunRecord, explained: Explained, panorama: RenderedPanorama, source: Source, levels: Sequence[LevelResult]
 ) -> dict[str, Any]:
-    """Return what the viewer needs, as plain data for JSON. Frames are read, and exposures merged again.
-
-    Args:
-        record: the content of `run.json`.
-        explained: the motion of every frame, and what the panorama does not explain.
-        panorama: the panorama.
-        source: the capture, still open.
-        levels: whose exposures of one instant are shown.
-    """
+    """Return what the viewer needs, as plain data for JSON. Frames are read, and exposures merged again."""
     motion, white = explained.motion, panorama.white_flux
     render = record["spec"].get("render") or {}
     instant = shared_instant(motion, levels)
@@ -77,11 +69,7 @@ def linear_data(flux: FluxImage, white: float) -> dict[str, Any]:
     """Encode flux for a browser: `low * (high / low) ** ((code - 1) / (codes - 1))`, and the code 0 where nothing was seen.
 
     Codes take two bytes; all high bytes come before all low ones, and `zlib` packs them. So a browser needs no decoder of
-    pictures, which may change colours.
-
-    Args:
-        flux: (H, W) or (H, W, 3); NaN where nothing was seen.
-        white: flux that is white at first.
+    pictures, which may change colours. The flux is (H, W) or (H, W, 3), NaN where nothing was seen.
     """
     channels = 1 if flux.ndim == 2 else flux.shape[2]
     seen = np.isfinite(flux)

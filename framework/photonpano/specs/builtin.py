@@ -145,10 +145,9 @@ def ask_sources(catalog: Catalog, path: Location) -> tuple[list[tuple[Entry, Rec
 
 
 def _near_misses(spec: Spec, keys: Written, path: Location) -> Iterator[tuple[str, str]]:
-    """Yield the problems that sources have with a capture whose files end as theirs do, and whose keys they accept.
+    """Yield the problems that sources have with a capture whose files end as theirs do, with the name of each source.
 
-    Returns:
-        The name of the source, and the problem.
+    Only sources count that accept the keys.
     """
     files = [path] if isinstance(path, Url) or path.is_file() else islice(path.rglob("*"), _SEARCHED)
     endings = {path.suffix.lower(), *(each.suffix.lower() for each in files)}

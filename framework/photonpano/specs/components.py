@@ -78,10 +78,7 @@ class ComponentResolver:
     def stage(self, kind: Kind, written: Written, base: Stage | None = None) -> Stage:
         """Resolve a section that chooses a component.
 
-        Args:
-            kind: the kind of the component.
-            written: the section.
-            base: for a section of a level, that of all levels: without `use`, the section updates the keys of this.
+        `base` is, for a section of a level, that of all levels: without `use`, the section updates the keys of this.
         """
         spec = self.spec
         content = spec.mapping(written, " such as {use: NAME}")
@@ -130,10 +127,7 @@ class ComponentResolver:
     def items(self, kind: Kind, written: Written, default: str | None = None) -> list[Written]:
         """Return the sections of a list of components; one alone is a list of it, and a name a section that uses it.
 
-        Args:
-            kind: the kind of the components.
-            written: the list.
-            default: the component that is chosen if it is installed and nothing is written.
+        If nothing is written, the default is chosen, if it is installed.
         """
         items = written.items()
         if written.data is None and default in self.catalog.names(kind.name):
@@ -145,10 +139,7 @@ class ComponentResolver:
     def fallbacks(self, section: Written, written: Written, first: Choice | None) -> tuple[Choice, ...]:
         """Resolve the locators to which the pairs that the first one lost are offered.
 
-        Args:
-            section: the section of the locator, spelled out.
-            written: the section as it was written.
-            first: the locator.
+        `section` is spelled out, `written` as it was written.
         """
         found: list[Choice] = []
         for item in section.at("fallback").items():

@@ -21,14 +21,9 @@ AUTO = "auto"  # the default: the run masks what stands still, and divides by a 
 
 
 def resolved_corrections(written: Written, spec: Spec) -> tuple[Correction, ...] | None:
-    """Resolve the section `corrections`; corrections with problems are left out.
+    """Resolve the section `corrections`: a list, or `auto`, which is the default, and for which it returns None.
 
-    Args:
-        written: a list, `auto`, or nothing, which is `auto` too.
-        spec: problems are added here, each at its place.
-
-    Returns:
-        The corrections of the list; None for `auto`.
+    Corrections with problems are left out; these are added to the spec.
     """
     if written.data is None or written.data == AUTO:
         return None

@@ -15,12 +15,7 @@ if TYPE_CHECKING:
 
 
 def document_of(plan: Plan, stages: Mapping[str, Stage]) -> dict[str, Any]:
-    """Return a plan as plain data, which is a spec itself.
-
-    Args:
-        plan: the plan; its own document is not read.
-        stages: the stages of levels that override nothing.
-    """
+    """Return a plan as plain data, which is a spec itself; `stages` are those of levels that override nothing."""
     chosen = {name: _stage(name, stage.choice, stage.fallbacks) for name, stage in stages.items()}
     document = {
         "version": VERSION,

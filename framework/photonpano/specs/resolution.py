@@ -35,14 +35,7 @@ NOT_SETTINGS = {"render": CHOICE, "output": ("formats",), "run": ("executor",)}
 
 
 def resolve(spec: Spec) -> Plan:
-    """Make the plan of a spec.
-
-    Args:
-        spec: the spec, with the problems that reading it has found.
-
-    Raises:
-        SpecError: with all problems, in the order of the file.
-    """
+    """Make the plan of a spec; `SpecError` with all problems, in the order of the file, also those from reading it."""
     root = spec.mapping(spec.root)
     plan = None if root is None else _Resolver(root, spec).plan()
     if plan is None or spec.problems:
@@ -153,8 +146,7 @@ class _Resolver:
     def level(self, written: Written, stages: dict[str, Stage]) -> tuple[Written, LevelPlan | None]:
         """Resolve one level: the stages, as far as it does not override them.
 
-        Returns:
-            The level with the sections that it overrides spelled out, and its plan; None for a level with problems.
+        Returns the level with the sections that it overrides spelled out, and its plan; None for a level with problems.
         """
         content = self.spec.mapping(written)
         if content is None:

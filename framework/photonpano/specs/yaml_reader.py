@@ -52,13 +52,8 @@ class _Composer(Composer):
 def read_yaml(text: str, place: Place, problems: list[Problem]) -> Written:
     """Read one YAML 1.2 document; aliases and merge keys are followed.
 
-    Args:
-        text: the document.
-        place: where the document stands; lines and columns are filled in unless it is an override.
-        problems: what cannot be read is added here.
-
-    Returns:
-        The document, which is nothing if the text is not YAML or holds no document.
+    Its values get lines and columns, unless the place is an override. What cannot be read is added to the problems; nothing is
+    returned for a text that is not YAML, or without a document.
     """
     yaml = YAML(typ="safe", pure=True)
     yaml.Composer = _Composer
@@ -119,12 +114,7 @@ class _Reader:
         return self.marked(node.start_mark, where)
 
     def value(self, node: Node, place: Place) -> Written:
-        """Read a node.
-
-        Args:
-            node: the node.
-            place: that of its key, or where it begins if it has none.
-        """
+        """Read a node, whose place is that of its key, or where it begins if it has none."""
         self.count += 1
         if self.count > MAX_VALUES:
             raise _TooLongError
