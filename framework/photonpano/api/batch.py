@@ -67,13 +67,7 @@ class BatchResult:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """A batch that can begin: its captures are found, and its spec and settings are right.
-
-    Attributes:
-        common: overrides for all runs.
-        keys: the swept keys.
-        rows: the runs to do.
-    """
+    """A batch that can begin: its captures are found, and its spec and settings are right. `rows` are the runs to do."""
 
     directory: Path
     spec: SpecText

@@ -59,8 +59,7 @@ def opened_run(
     """Open a finished run and its capture, with changes of its spec such as `render.scale=2`.
 
     Raises:
-        InputError: the folder is no run folder, its files are of several runs, its capture cannot be opened, or it is another
-            capture now.
+        InputError: the files are of several runs, or of none, or the capture cannot be opened or is another one now.
         SpecError: a change is wrong.
     """
     require_one_run(folder, ["trajectory.npz", "light.npz", "vignette.npz"])

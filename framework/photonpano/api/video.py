@@ -16,13 +16,14 @@ from photonpano.api.opened_run import OpenedRun, opened_run
 from photonpano.api.render import require_harmless, require_same_plane
 from photonpano.captures.picture_files import counted, require_writable, write_pictures
 from photonpano.context import Progress, usual
-from photonpano.errors import ExtentError, InputError, ProjectionError
+from photonpano.errors import InputError
 from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
 from photonpano.motion.frame_motion import view_of
 from photonpano.pipeline.film import Film, merged
+from photonpano.pipeline.rendering import naming_key_of_canvas
 from photonpano.registry import Catalog
 from photonpano.text import byte_size
 from photonpano.threads import one_thread_inside, thread_count
@@ -205,11 +206,8 @@ def _canvas(opened: OpenedRun) -> Canvas:
     render, motion = opened.plan.render, opened.motion
     shown = motion.trajectory, motion.span, motion.frame_shape
     view = view_of(motion, opened.source, render.projection, level=render.horizon == "level")
-    try:
+    with naming_key_of_canvas(opened.plan):
         return plan_canvas(*shown, render.scale, int(opened.plan.run.memory), extent=render.extent, view=view)
-    except (ExtentError, ProjectionError) as error:
-        key = "render.extent" if isinstance(error, ExtentError) else "render.projection"
-        raise InputError(str(opened.plan.place(key).problem(str(error)))) from error
 
 
 def _view_canvas(opened: OpenedRun) -> Canvas:

@@ -26,10 +26,7 @@ _IN_NOTEBOOK = "JPY_PARENT_PID"  # set for commands of a notebook, whose termina
 
 
 def progress_for_stderr(*, notes: bool = False) -> Progress:
-    """Return bars for a terminal, lines for pipes, files and continuous integration, and nothing with `-q`.
-
-    Notes are printed on a terminal, and elsewhere if `notes` says so.
-    """
+    """Return bars for a terminal, which show notes, nothing with `-q`, and elsewhere lines, with notes if wanted."""
     shown = _progress_for_stderr(notes or is_verbose())
     return Logged(shown) if is_logged() else shown
 

@@ -49,11 +49,7 @@ def with_verbosity(parameters: list[Any]) -> list[Any]:
 
 @contextmanager
 def verbosity_of(ctx: Any) -> Iterator[None]:
-    """Say as much as the options want, until the command ends.
-
-    Raises:
-        typer.BadParameter: both -v and -q are given, or the log cannot be written.
-    """
+    """Say as much as the options want, until the command ends; `typer.BadParameter` if they are wrong."""
     wanted: dict[str, Any] = ctx.meta.get(__name__, {})
     if {_VERBOSE, _QUIET} <= wanted.keys():
         raise typer.BadParameter("give one of them", param_hint="'-v' and '-q'")

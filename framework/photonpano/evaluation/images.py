@@ -29,9 +29,8 @@ class ImageScore:
 
     Attributes:
         psnr_db: peak signal-to-noise ratio, `-10 log10(mean squared difference)`; infinite for equal images.
-        ssim: mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 px) over the pixels whose whole window
-            is compared; NaN if there is none.
-        compared_share: share of the compared pixels, 0 to 1.
+        ssim: mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 px) over the pixels whose whole window is
+            compared; NaN if there is none.
     """
 
     psnr_db: float

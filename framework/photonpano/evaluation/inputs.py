@@ -27,11 +27,9 @@ class Truth:
 
     Attributes:
         homographies: (T, 3, 3), frame pixels to pixels of the scene; exact at the corners of the frame if the lens distorts.
-        frame_shape: (height, width) of a frame.
         scene: (H, W) float32, photons per pixel per frame; (H, W, 3) of red, green and blue pixels; None if only the motion is
             known.
         ideal_homographies: (T, 3, 3), those of a lens without distortion.
-        turn: rotations and camera; None if they are not known.
         around: whether the scene is an equirectangular panorama, 360 degrees wide; homographies then map to pixels of the
             camera that looks at its middle.
     """
@@ -98,13 +96,10 @@ class RunTrajectory:
 
 
 def load_truth(path: Path) -> Truth:
-    """Read the truth of a simulated capture.
+    """Read the truth of a simulated capture; `InputError` if the file is no such archive.
 
     The file is an `.npz` archive of `homographies`, `frame_shape` and, for image scores, `scene`. If the lens distorts,
     `homographies` are those of an ideal lens, and `undistorted_corners` (4, 2) are its pixels of the frame's corners.
-
-    Raises:
-        InputError: the file is missing, is no such archive, lacks an array, or contains one of another shape or type.
     """
     optional = ("scene", "undistorted_corners", "rotations", "camera_matrix", "distortion")
     if set(read_arrays(path, _TRUTH, ("camera_from_world", "homographies"))) == {"camera_from_world"}:

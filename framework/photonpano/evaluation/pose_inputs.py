@@ -23,11 +23,8 @@ _ORTHONORMAL = 1e-3  # largest difference of R R^T from the identity in a pose
 class RunPoses:
     """Content of `poses.npz` in a run folder.
 
-    Attributes:
-        camera_from_world: (T, 3, 4), NaN where a frame is not located.
-        std_position: (T,) expected error of the position, where the path has the length 1.
-        std_rotation_deg: (T,) expected error of the rotation.
-        frame_shape: (height, width) of a frame.
+    Poses are (T, 3, 4), NaN where a frame is not located. The expected errors, (T,), are those in a world where the path has
+    the length 1.
     """
 
     camera: Camera
@@ -75,8 +72,7 @@ def load_run_poses(folder: Path) -> RunPoses:
 def load_true_poses(path: Path) -> TruePoses:
     """Read an `.npz` archive of `camera_from_world` (T, 3, 4) in m, and if it is known `camera_matrix` (3, 3).
 
-    Raises:
-        InputError: the file is missing, is no such archive, or has no poses.
+    Raises `InputError` if the file is no such archive, or has no poses.
     """
     arrays = read_arrays(path, "a truth with poses")
     if "camera_from_world" not in arrays and "homographies" in arrays:

@@ -116,10 +116,7 @@ def pose_errors(
     """Score poses (T, 3, 4), world to camera, of a world of any scale against the true ones in m, at the `located` frames.
 
     The relative error is that of every pair of located frames that are `rpe_frames` apart. `std_position` is (T,), in units of
-    the found world; None or not finite if not known.
-
-    Raises:
-        ValueError: fewer than three located frames, or their true or found positions are all the same.
+    the found world; None or not finite if not known. Raises `ValueError` for positions that cannot be aligned.
     """
     scale, rotation, shift = align_positions(centres(found[located]), centres(true[located]))
     aligned = np.full((len(found), 3, 4), np.nan)
@@ -156,8 +153,7 @@ def pose_errors(
 def align_positions(found: FloatArray, true: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """Return scale, rotation and shift that bring (N, 3) found positions nearest to the true ones (Umeyama 1991).
 
-    Raises:
-        ValueError: there are fewer than three positions, or they are all the same.
+    Raises `ValueError` if there are fewer than three positions, or they are all the same.
     """
     if len(found) < 3:
         raise ValueError(f"{len(found)} located frames; at least 3 are needed to align two worlds")

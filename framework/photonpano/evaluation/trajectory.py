@@ -19,13 +19,8 @@ class TrajectoryScore:
 
     Attributes:
         errors_px: (T,) error of every frame, located or not.
-        located: (T,) true for located frames.
         alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
-        mean_px: mean error.
-        median_px: median error.
         p95_px: 95 % quantile of the errors.
-        max_px: largest error.
-        located_share: share of the located frames, 0 to 1.
     """
 
     errors_px: FloatArray
@@ -87,13 +82,8 @@ class Turn:
 class RotationScore:
     """Errors of rotations after the best common rotation, and of the focal length.
 
-    Statistics are over the located frames.
-
-    Attributes:
-        errors_deg: (T,) angle between the true and the estimated rotation of every frame, located or not.
-        mean_deg: mean error.
-        max_deg: largest error.
-        focal_error: error of the focal length, relative to the true one; above 0 if the estimate is too long.
+    Statistics are over the located frames. `errors_deg`, (T,), is the angle between the true and the estimated rotation of
+    every frame. `focal_error` is relative, above 0 if the estimate is too long.
     """
 
     errors_deg: FloatArray

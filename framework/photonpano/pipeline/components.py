@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
-import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.capture import Capture, capture_of, part_of
 from photonpano.contracts.attribution import attributing
@@ -17,9 +16,7 @@ from photonpano.contracts.loop import require_groups
 from photonpano.contracts.rules import shown
 from photonpano.contributions import (
     ExecutorContext,
-    ExporterContribution,
     PartOfCapture,
-    RendererContribution,
     SourceContext,
     StageContext,
     install_command,
@@ -33,15 +30,8 @@ from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
-from photonpano.threads import InOrder, in_order, thread_count
+from photonpano.threads import in_order, thread_count
 from photonpano.values import CaptureSummary, Decision, FrameSpan, Group, StreamInfo
-
-if TYPE_CHECKING:
-    from photonpano.pipeline.exports import AttributedExporter
-    from photonpano.pipeline.renderers import AttributedRenderer
-    from photonpano.residuals.refinement import NamedRefiner
-
-logger = logging.getLogger(__name__)
 
 HALVED_LEVELS = 2  # with `scale: auto`, the first two levels are located at half size
 LARGE_FRAME_PX = 192  # frames whose shorter side is below this are not halved: the pyramids of locators need pixels
@@ -126,17 +116,14 @@ def _part(plan: Plan, capture: Capture) -> Capture:
 
 
 def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:
-    """Build the components of all levels. Levels that choose the same component with the same config share one.
-
-    `decisions` receives what components choose from the capture while they work, such as a group size.
-    """
+    """Build the components of all levels; those with the same config are shared. `decisions` receives their choices."""
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     light = light_of(source)
     period = 1 / light.frequency if light is not None and light.frequency else None
     capture = _Once(lambda: replace(summarise(source, thread_count(plan.run.threads)), period_frames=period))
     recorder = Recorder(decisions)
-    context = _stage_context(plan, source, recorder, capture)
+    context = stage_context(plan, source, recorder, capture)
     made: list[tuple[Choice, Any]] = []
 
     def component(choice: Choice) -> Any:
@@ -164,53 +151,13 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
     )
 
 
-def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
-    """Build the refiners of a plan, in order; `decisions` receives their choices."""
-    from photonpano.residuals.refinement import NamedRefiner  # imports OpenCV, which is not needed to check a spec
-
-    context = _stage_context(plan, source, Recorder(decisions))
-    return tuple(NamedRefiner(choice.contribution.name, built(choice, context), choice.label) for choice in plan.refine)
-
-
-def build_renderer(
-    plan: Plan, source: Source, decisions: list[Decision], in_order: InOrder | None = None
-) -> AttributedRenderer:
-    """Build the renderer of a plan; `decisions` receives its choices. Without `in_order`, threads share the work."""
-    from photonpano.pipeline.renderers import AttributedRenderer  # imports OpenCV, which is not needed to check a spec
-
-    choice, contribution = plan.renderer, plan.renderer.contribution
-    context = _stage_context(plan, source, Recorder(decisions))
-    if in_order is not None:
-        context = replace(context, in_order=in_order)
-    assert isinstance(contribution, RendererContribution)
-    if light_of(source) is not None and not contribution.divides_by_light:
-        logger.warning(
-            f"{choice.label} does not divide by the light, which changes: the panorama shows each place in the mean light of "
-            "the frames that saw it; render with {use: merge} to divide by it"
-        )
-    any_canvas = contribution.renders_on_any_canvas
-    return AttributedRenderer(built(choice, context), choice.label, contribution.bytes_per_pixel, any_canvas)
-
-
-def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[AttributedExporter, ...]:
-    """Build the exporters of a plan, in order; `decisions` receives their choices."""
-    from photonpano.pipeline.exports import AttributedExporter  # imports tifffile, which is not needed to check a spec
-
-    context = _stage_context(plan, source, Recorder(decisions))
-    exporters = []
-    for choice in plan.formats:
-        assert isinstance(choice.contribution, ExporterContribution)
-        exporters.append(AttributedExporter(built(choice, context), choice.label, choice.contribution.suffix))
-    return tuple(exporters)
-
-
 def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) -> PoseEstimator:
     """Build the pose estimator of a plan that has one; `decisions` receives its choices."""
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     assert plan.pose is not None
     capture = _Once(lambda: summarise(source, thread_count(plan.run.threads)))
-    estimator: PoseEstimator = built(plan.pose, _stage_context(plan, source, Recorder(decisions), capture))
+    estimator: PoseEstimator = built(plan.pose, stage_context(plan, source, Recorder(decisions), capture))
     return estimator
 
 
@@ -244,18 +191,17 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
 def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> list[Decision]:
     """Return the decisions of the first level's resampler, such as its group size, for a capture with this summary.
 
-    Raises:
-        InputError: the capture is too short for the resampler.
+    Raises `InputError` if the capture is too short for the resampler.
     """
     decisions: list[Decision] = []
     choice = plan.levels[0].resample
-    resampler: Resampler = built(choice, _stage_context(plan, source, Recorder(decisions), lambda: capture))
+    resampler: Resampler = built(choice, stage_context(plan, source, Recorder(decisions), lambda: capture))
     with attributing(choice.label, "level 1"):
         require_groups(resampler.groups(source.info.n_frames, 1), source.info.n_frames)
     return decisions
 
 
-def _stage_context(
+def stage_context(
     plan: Plan, source: Source, recorder: Recorder, capture: Callable[[], CaptureSummary] | None = None
 ) -> StageContext:
     """Return what components are built for; without `capture`, they cannot ask for its flux and speed."""

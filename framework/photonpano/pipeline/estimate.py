@@ -74,12 +74,7 @@ def _reference_frame(plan: Plan, source: Source) -> int:
 
 
 def _start(source: Source, reference: int, journal: list[Decision], context: Context) -> ConstantVelocity:
-    """Find the constant velocity with which the first level starts.
-
-    Raises:
-        InputError: the capture has too few frames to find one.
-        LocationError: none was found.
-    """
+    """Find the constant velocity with which the first level starts; `InputError` or `LocationError` if there is none."""
     found = find_velocity(source, context)
     halves = " and ".join(f"{np.degrees(each.turn):.4g}" for each in found.halves)
     reason = (

@@ -15,7 +15,8 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import render
 from photonpano.motion.loop import LevelResult, resample
 from photonpano.motion.timeline import Timeline
-from photonpano.pipeline.components import build_levels, build_renderer
+from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.rendering import build_renderer
 from photonpano.pipeline.state import State, model_of
 from photonpano.protocols import Source, camera_of_motion
 from photonpano.record.environment import peak_memory_bytes

@@ -18,8 +18,8 @@ from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.estimate import require_centre
 from photonpano.pipeline.run_steps import BegunRun
 from photonpano.poses import Poses, centres, colmap, in_standard_world, nerfstudio, ply, tum
-from photonpano.record.pose_record import poses_record, poses_warnings
-from photonpano.record.run_json import started_record
+from photonpano.record.run_json import poses_record, started_record
+from photonpano.record.run_warnings import poses_warnings
 from photonpano.record.schema import RunRecord
 from photonpano.report import render_pose_report
 from photonpano.specs.plan import Plan
@@ -63,10 +63,7 @@ def _estimated(run: BegunRun) -> PoseEstimate:
 def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:
     """Write poses.npz, sparse/, transforms.json, points.ply, poses.tum, and with `exposures` pictures in images/.
 
-    The path of the estimate has the length 1. Returns warnings.
-
-    Raises:
-        OutputError: the disk is full.
+    The path of the estimate has the length 1. Returns warnings; `OutputError` if the disk is full.
     """
     try:
         _write(folder, estimate, stream)

@@ -12,13 +12,23 @@ from photonpano.contracts.attribution import attributing
 from photonpano.contracts.results import REFINED
 from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, nearest_rotations
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.level import Recorder
+from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.passes import Proposal, tried
 from photonpano.pipeline.state import State
+from photonpano.protocols import Source
 from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement
-from photonpano.values import Refined
+from photonpano.specs.plan import Plan
+from photonpano.values import Decision, Refined
 
 # Most corrections by one refiner. A tremor blurs the panorama that it is seen against, so that one is not enough.
 MAX_ROUNDS = 6
+
+
+def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
+    """Build the refiners of a plan, in order; `decisions` receives their choices."""
+    context = stage_context(plan, source, Recorder(decisions))
+    return tuple(NamedRefiner(choice.contribution.name, built(choice, context), choice.label) for choice in plan.refine)
 
 
 def refine(state: State, refiners: Sequence[NamedRefiner]) -> Explained:

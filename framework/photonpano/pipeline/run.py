@@ -9,12 +9,12 @@ from photonpano.captures.obstacles import naming_obstacles
 from photonpano.context import Progress, usual
 from photonpano.errors import InputError
 from photonpano.pipeline.checkpoints.work_folder import Continuation
-from photonpano.pipeline.components import build_refiners
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
 from photonpano.pipeline.following.follow import followed
+from photonpano.pipeline.kept_exposures import write_exposures
 from photonpano.pipeline.pose_run import find_poses
-from photonpano.pipeline.refiners import refine
+from photonpano.pipeline.refiners import build_refiners, refine
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_steps import BegunRun, begun_run
 from photonpano.protocols import light_of
@@ -108,11 +108,11 @@ def make_panorama(run: BegunRun) -> None:
         explained = refine(state, build_refiners(plan, source, journal))
         verdict = judge(explained, state.results, journal)
         merged = explained.canvas, explained.panorama
-        rendering = render_into(folder, plan, source, state.vignette, explained.motion, context, merged)
-        panorama, chosen = rendering.panorama, rendering.decisions
+        panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context, merged)
         run.observers.rendered(panorama.canvas, panorama.seconds)
         if plan.output.keep == "exposures":
-            folder.write_exposures(state.results, panorama.white_flux, context)
+            with folder.writing():
+                write_exposures(folder.staging, state.results, panorama.white_flux, context)
     found = state.results, explained, verdict, panorama, chosen
     record = record_of(plan, source.info, journal, *found, run.seconds, run.capture)
     light, capture = light_of(source), OpenCapture(source, state.results)

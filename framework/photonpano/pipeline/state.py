@@ -58,9 +58,7 @@ class State:
     refined: FrameMotion | None = None
 
     def located(self, levels: Sequence[Level], previous: Trajectory | None) -> State:
-        """Run some levels of the loop from a motion, if one is known.
-
-        Their results replace those of the same and later levels.
+        """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels.
 
         Raises:
             LocationError: too few exposures could be located.
@@ -97,12 +95,7 @@ class State:
 
     @cached_property
     def fit(self) -> MotionFit:
-        """How well the motion explains the photons.
-
-        Raises:
-            CanvasTooLargeError: the panorama is far larger than what fits into the memory.
-            LocationError: frames reach the horizon of the reference plane.
-        """
+        """How well the motion explains the photons; `CanvasTooLargeError` or `LocationError` if the panorama has no canvas."""
         render, memory = self.plan.render, int(self.plan.run.memory)
         return MotionFit(self.view.source, self.motion, render.tolerance_px, memory, self.view.context)
 

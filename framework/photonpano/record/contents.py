@@ -65,8 +65,7 @@ def names_of_results(folder: Path) -> set[str]:
 def finish_run_folder(folder: Path) -> None:
     """Put the files of a run in place that was killed while it did so; while another process does that, let it.
 
-    Raises:
-        InputError: the folder cannot be written to.
+    Raises `InputError` if the folder cannot be written to.
     """
     if not (folder / PENDING).is_dir():
         return
@@ -106,10 +105,7 @@ def require_one_run(folder: Path, names: Iterable[str]) -> None:
 
 
 def require_same_frames(folder: Path, record: Mapping[str, Any], source: Source) -> None:
-    """Raise `InputError` if the sampled frames of a capture are not those that a run has read.
-
-    Runs of older versions did not record them.
-    """
+    """Raise `InputError` if a capture has other frames than a run has read; older versions did not record them."""
     recorded = record.get("capture")
     if isinstance(recorded, dict) and frames_sha256(source) != recorded.get("frames_sha256"):
         raise InputError(f"{folder}: the capture has other frames than when it was run; it is another capture")

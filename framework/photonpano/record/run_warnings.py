@@ -9,11 +9,15 @@ import numpy as np
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.residuals.refinement import Refinement
-from photonpano.values import FloatArray, true_spans
+from photonpano.values import FloatArray, PoseEstimate, true_spans
 
 # A warning names the frames whose expected corner error exceeds this: an error of this size is likely to be visible.
 UNCERTAIN_PX = 0.5
 SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst first
+
+
+DOUBTFUL = "doubtful: "  # begins the warnings that are doubts
+_SHOWN_LOST = 3  # spans of lost frames that a warning names
 
 
 def level_warnings(results: Sequence[LevelResult]) -> list[str]:
@@ -79,3 +83,14 @@ def refinement_warnings(refinements: Sequence[Refinement]) -> list[str]:
         for each in refinements
         if each.kept_out
     ]
+
+
+def poses_warnings(estimate: PoseEstimate) -> list[str]:
+    """Warn of doubts, and of frames without a pose."""
+    warnings = [f"{DOUBTFUL}{doubt}" for doubt in estimate.doubts]
+    if not estimate.located.all():
+        lost, frames = int((~estimate.located).sum()), len(estimate.located)
+        spans = "; ".join(f"{each.span}: {each.reason}" for each in estimate.lost[:_SHOWN_LOST])
+        more = f"; and {len(estimate.lost) - _SHOWN_LOST} more spans" if len(estimate.lost) > _SHOWN_LOST else ""
+        warnings.append(f"{lost} of {frames} frames have no pose ({spans}{more})")
+    return warnings

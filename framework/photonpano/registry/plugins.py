@@ -37,11 +37,7 @@ def contributions_of(plugin: object) -> tuple[Contribution, ...]:
 
 
 def observation_of(plugin: object) -> pluggy.HookRelay | None:
-    """Return the caller of a plugin's observation hooks; None if it has none.
-
-    Raises:
-        PluginError: a hook is unknown, lacks its mark, or takes arguments that it does not have.
-    """
+    """Return the caller of a plugin's observation hooks, None if it has none; errors as in `contributions_of`."""
     manager = _registered(plugin)
     implemented = {caller.name for caller in manager.get_hookcallers(plugin) or ()}
     return manager.hook if implemented.intersection(OBSERVATION_HOOKS) else None

@@ -15,8 +15,7 @@ from photonpano.record.schema import FailureRecord, RunRecord
 from photonpano.report import figures
 from photonpano.report.drawing import jpeg_uri, shrunk
 from photonpano.report.environment import filled
-from photonpano.report.page import head_of
-from photonpano.report.tables import FailureGroup, failure_groups
+from photonpano.report.page import FailureGroup, failure_groups, head_of
 from photonpano.values import NotLocated, VirtualExposure
 
 MAX_PAIRS = 8  # number of pairs whose exposures are shown

@@ -20,7 +20,7 @@ from photonpano.reading import objections, require_there
 from photonpano.specs.checks import complaints
 from photonpano.specs.components import LocatorAlias, SourceAlias
 from photonpano.specs.plan import Choice
-from photonpano.specs.validation import validate
+from photonpano.specs.spec import validate
 from photonpano.specs.written import Written, from_python
 from photonpano.text import listed
 from photonpano.values import Decision

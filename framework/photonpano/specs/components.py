@@ -9,7 +9,7 @@ from photonpano.contributions import KINDS, ExporterContribution, LocatorContrib
 from photonpano.errors import PluginError, described
 from photonpano.interrupts import is_interrupt
 from photonpano.specs.plan import Choice
-from photonpano.specs.validation import validate
+from photonpano.specs.spec import validate
 from photonpano.specs.written import Written, given
 from photonpano.text import listed
 
@@ -35,8 +35,7 @@ def _unbuilt(*_: object) -> NoReturn:
 class Alias:
     """A name that stands for other components, so that nothing is built of it.
 
-    Attributes:
-        expand: rewrites a section into one that uses other components; None if there are problems, which it adds to the spec.
+    `expand` rewrites a section into one that uses these; None if there are problems, which it adds to the spec.
     """
 
     expand: Callable[[Written, Spec], Written | None]
@@ -55,13 +54,7 @@ class LocatorAlias(Alias, LocatorContribution):
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A section that chooses a component.
-
-    Attributes:
-        section: its keys `use`, `with` and `fallback`, with aliases and defaults spelled out; None if they cannot be.
-        choice: the component; None if there are problems.
-        fallbacks: the locators to which lost pairs are offered.
-    """
+    """A section that chooses a component: with aliases and defaults spelled out, None if they cannot be; and the choices."""
 
     section: Written | None = None
     choice: Choice | None = None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from photonpano.corrections import CORRECTIONS
 from photonpano.reading import missing_file
-from photonpano.specs.validation import validate
+from photonpano.specs.spec import validate
 from photonpano.specs.written import Written, given
 from photonpano.text import suggestion
 

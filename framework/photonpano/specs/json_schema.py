@@ -9,7 +9,7 @@ from pydantic.json_schema import models_json_schema
 
 from photonpano.contributions import KINDS
 from photonpano.corrections import CORRECTIONS
-from photonpano.registry.schema_text import TolerantJsonSchema
+from photonpano.registry.description import TolerantJsonSchema
 from photonpano.specs.components import DEFAULT_FALLBACK, LocatorAlias
 from photonpano.specs.corrections import AUTO
 from photonpano.specs.settings import (

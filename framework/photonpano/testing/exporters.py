@@ -11,7 +11,7 @@ import pytest
 from photonpano.contributions import ExporterContribution
 from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.photometry import BinaryResponse
-from photonpano.pipeline.exports import AttributedExporter, StoredPanorama
+from photonpano.pipeline.rendering import AttributedExporter, StoredPanorama
 from photonpano.testing.conformance import passing
 from photonpano.testing.stages import StageConformance
 

@@ -25,10 +25,7 @@ _THUMBNAIL_PIXELS = 240  # longer side
 
 
 def run_job(job: Job, catalog: Catalog | None = None) -> BatchRow:
-    """Do one run, unless it was finished before, and score it if the truth lies beside the capture.
-
-    Errors become the reason of the row; only what ends the process escapes.
-    """
+    """Do one run, unless it was finished, and score it by the truth beside the capture; errors become the reason of the row."""
     with _warnings() as warnings:
         row = _attempted(job, catalog)
     return replace(row, reason="\n".join([row.reason, *warnings]).strip())

@@ -28,11 +28,7 @@ def write_summary(
     common: Sequence[str],
     keys: Sequence[str],
 ) -> None:
-    """Write both files, each whole or not at all; for the arguments, see `render_batch`.
-
-    Raises:
-        OutputError: they cannot be written.
-    """
+    """Write both files, each whole or not at all; for the arguments, see `render_batch`."""
     page = render_batch(directory, rows, spec, common, keys)
     for name, text in ((TABLE, _table(directory, rows, keys)), (PAGE, page)):
         with atomic_path(directory / name, flushed=False) as temporary:

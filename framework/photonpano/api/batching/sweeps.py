@@ -28,10 +28,7 @@ _UNSAFE = re.compile(r"[^\w.,=+\-]")
 class SpecText:
     """A spec as it was when the batch began: a file that is edited meanwhile does not change the runs to come.
 
-    Attributes:
-        content: the text of a file, or plain data.
-        directory: what relative paths in it count from.
-        file: where the text was read; None for plain data.
+    Relative paths count from `directory`; `file` is None for plain data.
     """
 
     content: str | Mapping[str, Any]

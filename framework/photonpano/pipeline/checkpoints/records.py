@@ -28,11 +28,7 @@ _ARRAY, _MAPPING, _DATACLASS = "array", "mapping", "dataclass"
 
 
 def packed(value: Any) -> dict[str, NDArray[np.generic]]:
-    """Return named arrays that hold a value; floats stay the same to the last bit.
-
-    Raises:
-        TypeError: it contains something else than numbers, texts, arrays, sequences, mappings and dataclasses.
-    """
+    """Return named arrays that hold a value; floats stay the same to the last bit. `TypeError` for what cannot be kept."""
     packer = _Packer()
     tree = json.dumps(packer.tree(value), separators=(",", ":"))
     joined = {name: np.concatenate(parts) for name, parts in packer.small.items()}

@@ -15,8 +15,7 @@ from photonpano.atomic import atomic_path
 from photonpano.context import Checkpoints, KeepNothing, Progress
 from photonpano.errors import InputError, OutputError, PhotonpanoError
 from photonpano.pipeline.checkpoints.fingerprint import Fingerprint, differences
-from photonpano.pipeline.checkpoints.kept import Kept, finished
-from photonpano.pipeline.checkpoints.store import SUFFIX, Store
+from photonpano.pipeline.checkpoints.store import SUFFIX, Kept, Store, finished
 from photonpano.text import counted
 from photonpano.values import Decision
 
@@ -87,12 +86,9 @@ def path_of(run_folder: Path) -> Path:
 def work_folder(
     run_folder: Path, now: Fingerprint, decisions: list[Decision], how: Continuation, progress: Progress
 ) -> Iterator[Work]:
-    """Open the work folder of a run, whose lock is held.
+    """Open the work folder of a run, whose lock is held; `InputError` if levels before `how.from_level` cannot be taken.
 
     What it holds stays after an interruption or an error. Where nothing can be kept, a warning says so, and the run goes on.
-
-    Raises:
-        InputError: the levels before `how.from_level` cannot be taken.
     """
     folder = path_of(run_folder)
     _require_levels(folder, now, how.from_level)

@@ -65,11 +65,8 @@ class LocatedSoFar:
     def next_window(self, source: Source, *, last: bool = False) -> Window | None:
         """Locate the next frames of `source`, which is all that are there: a few groups of them.
 
-        None if there are no new groups yet, or they could not be located: see `problem`. With `last`, there will be no more
-        frames, so that it does not wait for more.
-
-        Raises:
-            PhotonpanoError: a component failed.
+        None if there are no new groups yet, or they could not be located: see `problem`. With `last`, it does not wait for
+        more.
         """
         level, available = self._level_for(source, last), source.info.n_frames - self._start
         length = None if level is None else _group_length(level, source.info.n_frames)

@@ -135,10 +135,7 @@ def _upright(placed: FloatArray, shape: tuple[int, int]) -> bool:
 
 
 def rehearse(plan: Plan, context: Context) -> None:
-    """Locate a made-up capture and draw its picture, so that compiling and loading do not delay the first frames.
-
-    Problems are only logged.
-    """
+    """Locate a made-up capture, so that compiling does not delay the first frames; problems are only logged."""
     located, picture = LocatedSoFar(plan, context), PictureSoFar()
     try:
         with _Blocks() as source:

@@ -34,12 +34,7 @@ class Spool:
         self._thread.start()
 
     def require_whole(self) -> None:
-        """Refuse a pipe that could not be copied, or ended within a frame. The whole frames before are in the file.
-
-        Raises:
-            InputError: the pipe cannot be read, or ended within a frame.
-            OutputError: the disk is full.
-        """
+        """Raise the error of a pipe that could not be copied, or ended within a frame. Whole frames are in the file."""
         if self._failure is not None:
             raise self._failure
 
