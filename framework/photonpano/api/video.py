@@ -180,7 +180,11 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
     plan, source, motion, recorded = opened.plan, opened.source, opened.motion, opened.record["panorama"]
     if recorded is None:
         raise InputError(f"{opened.folder}: the run made no panorama, and a video is as bright as that")
-    canvas = _canvas(opened) if view == "panorama" else _view_canvas(opened)
+    if view == "panorama":
+        canvas = _canvas(opened)
+    else:  # as large as a frame, or as a part of it
+        extent = "reference" if plan.render.extent == "panorama" else plan.render.extent
+        canvas = canvas_of_box(box_of(extent, motion.frame_shape), plan.render.scale)
     memory, bytes_per_pixel = int(plan.run.memory), (BYTES_PER_PIXEL + bytes_of_light(source)) * channels_of(source)
     if (needed := canvas.height * canvas.width * bytes_per_pixel) > memory:
         raise InputError(
@@ -208,9 +212,3 @@ def _canvas(opened: OpenedRun) -> Canvas:
     view = view_of(motion, opened.source, render.projection, level=render.horizon == "level")
     with naming_key_of_canvas(opened.plan):
         return plan_canvas(*shown, render.scale, int(opened.plan.run.memory), extent=render.extent, view=view)
-
-
-def _view_canvas(opened: OpenedRun) -> Canvas:
-    """Return the canvas of the view of a frame, or of a part of it."""
-    render, extent = opened.plan.render, opened.plan.render.extent
-    return canvas_of_box(box_of("reference" if extent == "panorama" else extent, opened.motion.frame_shape), render.scale)

@@ -118,7 +118,9 @@ def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography, aroun
     shape = scene.shape
     side = _pixels_along(canvas, alignment, around, shape)
     margin = side if around is not None else 0
-    scene, offset = _averaged(_wrapped(scene, margin), side)
+    if margin:  # the scene goes on all around
+        scene = np.concatenate([scene[:, -margin:], scene, scene[:, :margin]], axis=1)
+    scene, offset = _averaged(scene, side)
     image = np.empty((*canvas.shape, *shape[2:]), dtype=np.float32)
     for top in range(0, canvas.height, _ROWS):
         part = canvas.part(0, top, min(_ROWS, canvas.height - top), canvas.width)
@@ -152,11 +154,6 @@ def _pixels_along(canvas: Canvas, alignment: Homography, around: FloatArray | No
     (a, b), (c, d) = right - here, below - here
     area = abs(a * d - b * c)
     return max(1, round(float(np.sqrt(area)))) if np.isfinite(area) else 1
-
-
-def _wrapped(scene: FluxImage, margin: int) -> FluxImage:
-    """Continue a scene all around by columns at both ends."""
-    return np.concatenate([scene[:, -margin:], scene, scene[:, :margin]], axis=1) if margin else scene
 
 
 def _averaged(scene: FluxImage, side: int) -> tuple[FluxImage, float]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano.errors import InputError
 from photonpano.evaluation.pose_inputs import load_run_poses, load_true_poses
@@ -133,14 +132,16 @@ def pose_errors(
         one, two, three = (float((errors_m[located] <= times * std_m).mean()) for times in (1, 2, 3))
         shares, ratio = (one, two, three), ate_m / _rms(std_m)
     first = np.flatnonzero(located[:-rpe_frames] & located[rpe_frames:])
-    apart = _relative(_relative_of(true, first, rpe_frames), _relative_of(aligned, first, rpe_frames)) if len(first) else None
+    steps = (_relative(poses[first], poses[first + rpe_frames]) for poses in (true, aligned))
+    apart = _relative(*steps) if len(first) else None
+    worlds = np.swapaxes(true[located, :, :3], 1, 2) @ found[located, :, :3]
     return PoseScore(
         errors_m=errors_m,
         errors_deg=errors_deg,
         ate_m=ate_m,
         ate_share=ate_m / path_m,
         rotation_deg=_rms(errors_deg[located]),
-        turns_deg=_turns_deg(found[located, :, :3], true[located, :, :3]),
+        turns_deg=_rms(_angles(worlds @ nearest_rotations(worlds.sum(axis=0)).T)),
         rpe_frames=rpe_frames,
         rpe_m=None if apart is None else _rms(np.linalg.norm(apart[:, :, 3], axis=1)),
         rpe_deg=None if apart is None else _rms(_angles(apart[:, :, :3])),
@@ -166,16 +167,6 @@ def align_positions(found: FloatArray, true: FloatArray) -> tuple[float, FloatAr
     rotation = (left * signs) @ right
     scale = float((strengths * signs).sum() / (here**2).sum())
     return scale, rotation, middles[1] - scale * rotation @ middles[0]
-
-
-def _turns_deg(found: FloatArray, true: FloatArray) -> float:
-    worlds = np.swapaxes(true, 1, 2) @ found
-    return _rms(_angles(worlds @ nearest_rotations(worlds.sum(axis=0)).T))
-
-
-def _relative_of(poses: FloatArray, first: NDArray[np.intp], frames: int) -> FloatArray:
-    """Return the motions from some frames to those that follow by some frames: (N, 3, 4)."""
-    return _relative(poses[first], poses[first + frames])
 
 
 def _relative(one: FloatArray, other: FloatArray) -> FloatArray:

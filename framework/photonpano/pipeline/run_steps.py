@@ -108,11 +108,11 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
     """
     if plan.pose is not None and (how.keep or how.from_level is not None):
         raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")
-    observers = Observers(plan.observers, plan.output.directory)
+    observers, read = Observers(plan.observers, plan.output.directory), [*capture_files(plan), *filter(None, [plan.file])]
     with (
         observers.watching(plan.document) as finished,
         open_source(plan) as source,
-        run_folder(plan.output.directory, overwrite=overwrite, inputs=_read_files(plan)) as folder,
+        run_folder(plan.output.directory, overwrite=overwrite, inputs=read) as folder,
         loading_figures(),
         one_thread_inside(),
         notify_on_first_compile(partial(progress.note, COMPILING)),
@@ -200,11 +200,6 @@ def _with_report(folder: RunFolder, record: RunRecord, draw: Callable[[RunRecord
     except OutputError as error:
         warning = f"the report could not be added ({error}); all other files of the run are written"
         return {**record, "warnings": [*record["warnings"], warning]}
-
-
-def _read_files(plan: Plan) -> list[Path]:
-    """Return the files that a run reads: the capture, and the spec."""
-    return [*capture_files(plan), *([] if plan.file is None else [plan.file])]
 
 
 def _require_photons(plan: Plan, source: Source) -> None:

@@ -125,7 +125,8 @@ def _options(schema: Schema, root: Schema, depth: int = 0) -> list[tuple[str, st
     if depth == _MAX_DEPTH:
         return [("value", "")]
     if union and union == _byte_size():
-        return [("size", _byte_bounds(schema))]
+        least = f"at least {byte_size(schema['ge'])}, " if "ge" in schema else ""
+        return [("size", f"{least}such as 2 GiB")]
     if union:
         return list(dict.fromkeys(option for each in union for option in _options(each, root, depth + 1)))
     if "enum" in schema or "const" in schema:
@@ -182,11 +183,6 @@ def _count(least: int | None, most: int | None, noun: str) -> str:
 def _byte_size() -> list[Any]:
     alternatives: list[Any] = TypeAdapter(ByteSize).json_schema()["anyOf"]
     return alternatives
-
-
-def _byte_bounds(schema: Schema) -> str:
-    least = f"at least {byte_size(schema['ge'])}, " if "ge" in schema else ""
-    return f"{least}such as 2 GiB"
 
 
 def word(value: object) -> str:

@@ -36,7 +36,7 @@ from photonpano.text import duration
 from photonpano.values import FloatArray, FluxImage, Group, true_spans
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
-    from matplotlib.axes import Axes
+    pass
 
 MAX_INSTANTS = 1500  # number of instants at which a long trajectory is drawn, evenly spaced
 
@@ -76,7 +76,8 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
         error.set_xlim(-0.5, len(motion.homographies) - 0.5)
         error.xaxis.set_major_formatter("{x:,.0f}")
         for axes in (position, speed, error):
-            _shade_not_located(axes, motion)
+            for span in true_spans(~motion.located):
+                axes.axvspan(span.start - 0.5, span.stop - 0.5, color=MUTED, alpha=0.18, linewidth=0)
         if frame_rate_hz is not None and len(instants) > 1:
             add_time_axis(position, len(motion.homographies), frame_rate_hz)
         return svg_of(figure, "path-over-time")
@@ -202,8 +203,3 @@ def instants_of(n_frames: int, most: int = MAX_INSTANTS) -> NDArray[np.int64]:
 def centre_of(frame_shape: tuple[int, int]) -> FloatArray:
     """Return the centre of a frame: (1, 2)."""
     return np.asarray(corners(frame_shape).mean(axis=0, keepdims=True))
-
-
-def _shade_not_located(axes: Axes, motion: FrameMotion) -> None:
-    for span in true_spans(~motion.located):
-        axes.axvspan(span.start - 0.5, span.stop - 0.5, color=MUTED, alpha=0.18, linewidth=0)

@@ -61,27 +61,23 @@ def render_report(
         files=files,
         more_files=more_files,
         viewer=None if capture is None else viewer_data(record, explained, panorama, capture.source, capture.levels),
-        **_results(record, explained, panorama, light),
+        flicker_over_panorama=residual_figures.flicker_over_panorama(light, panorama.canvas),
+        **_motion(record, explained.motion, panorama),
+        **_unexplained(record, explained, panorama),
     )
 
 
 def head_of(record: RunRecord) -> dict[str, Any]:
     """Return what the pages of all runs show."""
+    rate, file = record["source"]["frame_rate_hz"], record["spec_file"]
     return {
         "record": record,
         "warnings": record["warnings"],
-        "title": _title(record),
+        "title": Path(file).stem if file else "A run without a spec file",
         "created": datetime.fromisoformat(record["created"]).strftime("%d %B %Y, %H:%M %Z").strip(),
-        "capture_seconds": _capture_seconds(record),
+        "capture_seconds": None if rate is None else record["source"]["n_frames"] / rate,
         "spec_yaml": yaml_of(record["spec"]),
     }
-
-
-def _results(record: RunRecord, explained: Explained, panorama: RenderedPanorama, light: Light | None) -> dict[str, Any]:
-    canvas = panorama.canvas
-    flicker = residual_figures.flicker_over_panorama(light, canvas)
-    motion = _motion(record, explained.motion, panorama)
-    return motion | _unexplained(record, explained, panorama) | {"flicker_over_panorama": flicker}
 
 
 def _unexplained(record: RunRecord, explained: Explained, panorama: RenderedPanorama) -> dict[str, Any]:
@@ -112,15 +108,6 @@ def _motion(record: RunRecord, motion: FrameMotion, panorama: RenderedPanorama) 
         "not_located": not_located[:MAX_SPANS],
         "more_not_located": len(not_located[MAX_SPANS:]),
     }
-
-
-def _title(record: RunRecord) -> str:
-    return Path(record["spec_file"]).stem if record["spec_file"] else "A run without a spec file"
-
-
-def _capture_seconds(record: RunRecord) -> float | None:
-    rate = record["source"]["frame_rate_hz"]
-    return None if rate is None else record["source"]["n_frames"] / rate
 
 
 MAX_FILES = 30  # number of files that are listed

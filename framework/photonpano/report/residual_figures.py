@@ -85,7 +85,7 @@ def over_sensor(residuals: Residuals) -> str:
     height, width = residuals.frame_shape
     shifts = significant_shifts(residuals)
     with maps_figure(height, width, 2 if shifts is None else 3) as (figure, maps):
-        extent = _blocks_extent(residuals)
+        extent = extent_of(*(BLOCK_PX * n_blocks for n_blocks in residuals.block_misfit.shape))
         misfit = np.ma.masked_invalid(residuals.block_misfit)
         image = maps[0].imshow(misfit, **_misfit_colours(residuals), extent=extent, interpolation="nearest")
         _add_colour_bar(maps[0], image, "misfit")
@@ -219,11 +219,6 @@ def _noise_px(information: FloatArray) -> FloatArray:
     """Return the standard deviation of the shifts along x and y that noise and interpolation explain: (S, 2)."""
     with np.errstate(divide="ignore"):
         return np.asarray(np.sqrt(1 / np.diagonal(information, axis1=1, axis2=2)[:, :2].clip(min=0) + SYSTEMATIC_PX**2))
-
-
-def _blocks_extent(residuals: Residuals) -> tuple[float, float, float, float]:
-    rows, columns = residuals.block_misfit.shape
-    return extent_of(rows * BLOCK_PX, columns * BLOCK_PX)
 
 
 def _add_colour_bar(axes: Axes, image: Any, label: str, numbers: str = "{x:.3g}") -> None:

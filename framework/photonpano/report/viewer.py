@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
-from photonpano.photometry import WhiteBalance, balanced, flux_std, tone_mapped
+from photonpano.photometry import balanced, flux_std, tone_mapped
 from photonpano.protocols import Source
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
@@ -45,11 +45,13 @@ def viewer_data(
     """Return what the viewer needs, as plain data for JSON. Frames are read, and exposures merged again."""
     motion, white = explained.motion, panorama.white_flux
     render = record["spec"].get("render") or {}
+    balance: Any = render.get("white_balance", "none")
+    balance = balance if isinstance(balance, str) else tuple(balance)
     instant = shared_instant(motion, levels)
     spans = [len(span) for span in explained.residuals.spans]
     return {
         "size": [panorama.canvas.width, panorama.canvas.height],
-        "linear": linear_data(balanced(panorama.thumbnail.flux, cast(WhiteBalance, _balance(render))), white),
+        "linear": linear_data(balanced(panorama.thumbnail.flux, balance), white),
         "picture": None if (render.get("tone") or "srgb") == "srgb" else jpeg_uri(shrunk(panorama.picture, VIEW_PIXELS)),
         "maps": [*panorama_maps(panorama, source), *_misfit_map(explained, panorama.canvas)],
         "path": path_data(motion, panorama),
@@ -58,11 +60,6 @@ def viewer_data(
         "instant": instant,
         "views": views_of_instant(instant, motion, panorama, source, levels),
     }
-
-
-def _balance(render: Any) -> Any:
-    found = render.get("white_balance", "none")
-    return found if isinstance(found, str) else tuple(found)
 
 
 def linear_data(flux: FluxImage, white: float) -> dict[str, Any]:

@@ -69,7 +69,8 @@ def json_schema(catalog: Catalog) -> Schema:
     sections["source"]["required"] = ["use"]
     definitions[RunSettings.__name__]["properties"]["executor"] = sections.pop("run.executor")
     definitions[OutputSettings.__name__]["properties"]["formats"] = sections.pop("output.formats")
-    rendering = _rendering(sections.pop("render"), definitions[_definition(schemas[RenderSettings])])
+    rendering, settings = sections.pop("render"), definitions[_definition(schemas[RenderSettings])]
+    rendering |= {"description": settings["description"], "properties": rendering["properties"] | settings["properties"]}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "photonpano pipeline spec",
@@ -135,11 +136,6 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
     keys = {"use": use, "with": {"type": SECTION, "description": f"the keys of the {kind.name}"}}
     section: Schema = {"type": SECTION, "additionalProperties": False, "properties": keys}
     return section | {"allOf": bindings} if bindings else section
-
-
-def _rendering(component: Schema, settings: Schema) -> Schema:
-    """Return the schema of the section `render`: the keys that choose the renderer, beside the framework's own."""
-    return component | {"description": settings["description"], "properties": component["properties"] | settings["properties"]}
 
 
 def _item(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Schema]) -> Schema:

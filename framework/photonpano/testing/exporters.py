@@ -31,12 +31,7 @@ def panorama(in_colour: bool = False, nothing_seen: bool = False) -> StoredPanor
 
 
 class ExporterConformance(StageConformance):
-    """Checks of an exporter.
-
-    Attributes:
-        contribution: the contribution under test.
-        config: the keys under `with`.
-    """
+    """Checks of an exporter."""
 
     kind: ClassVar[str] = "exporter"
 

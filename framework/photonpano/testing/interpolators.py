@@ -35,8 +35,6 @@ class InterpolatorConformance(AnswerConformance):
     """Checks of an interpolator.
 
     Attributes:
-        contribution: the contribution under test.
-        config: the keys under `with`.
         tolerance_px: largest distance of the trajectory from its knots, at the corners of a frame of 254x496 px; more for one
             that smooths. The knots have a tremor of 1 px.
         keeps_velocity: whether a constant velocity is kept between knots.

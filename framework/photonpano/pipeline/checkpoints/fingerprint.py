@@ -39,24 +39,23 @@ def run_fingerprint(plan: Plan, capture: CaptureRecord, frame_shape: tuple[int, 
         "memory": int(plan.run.memory),
         "formats": [{**_component(choice), "code": _code([choice])} for choice in plan.formats],
     }
-    found: Fingerprint = _plain(
-        {
-            "versions": {"photonpano": importlib.metadata.version("photonpano"), **library_versions(plan)},
-            "code": _code([plan.source], photonpano),
-            "capture": capture,
-            "common": {
-                "source": _component(plan.source),
-                "corrections": document.get("corrections"),
-                "light": document["light"],
-                "graph": document["graph"],
-                "run.seed": plan.run.seed,
-                "render.reference": document["render"]["reference"],
-            },
-            "levels": [_level(plan, number, frame_shape) for number in range(1, len(plan.levels) + 1)],
-            "rest": rest,
-        }
-    )
-    return found
+    found = {
+        "versions": {"photonpano": importlib.metadata.version("photonpano"), **library_versions(plan)},
+        "code": _code([plan.source], photonpano),
+        "capture": capture,
+        "common": {
+            "source": _component(plan.source),
+            "corrections": document.get("corrections"),
+            "light": document["light"],
+            "graph": document["graph"],
+            "run.seed": plan.run.seed,
+            "render.reference": document["render"]["reference"],
+        },
+        "levels": [_level(plan, number, frame_shape) for number in range(1, len(plan.levels) + 1)],
+        "rest": rest,
+    }
+    as_read: Fingerprint = json.loads(json.dumps(found))
+    return as_read
 
 
 def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None) -> list[str]:
@@ -161,8 +160,3 @@ def _changed(before: Any, now: Any, path: str = "") -> Iterator[tuple[str, Any, 
 def _short(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _plain(value: Any) -> Any:
-    """Return data as it is read back from JSON."""
-    return json.loads(json.dumps(value))

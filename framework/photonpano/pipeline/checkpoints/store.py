@@ -36,7 +36,11 @@ class Store:
         path = self.folder / f"{name}{SUFFIX}"
         try:
             arrays = packed(value)
-            self._require_room(sum(array.nbytes for array in arrays.values()))
+            needed, free = sum(array.nbytes for array in arrays.values()), shutil.disk_usage(self.folder).free
+            if free < (1 + _SPARE) * needed:
+                raise OutputError(
+                    f"{self.folder}: what was found is not kept, as the {byte_size(free)} free are for the results"
+                )
             # A record that a power failure damages is computed again; waiting for the disk would cost more.
             with atomic_path(path, flushed=False) as temporary:
                 np.savez(temporary, allow_pickle=False, **arrays)
@@ -67,11 +71,6 @@ class Store:
     def names(self, start: str) -> list[str]:
         """Return the names of the records that begin with a text, in order."""
         return sorted(path.name.removesuffix(SUFFIX) for path in self.folder.glob(f"{start}*{SUFFIX}"))
-
-    def _require_room(self, n_bytes: int) -> None:
-        free = shutil.disk_usage(self.folder).free
-        if free < (1 + _SPARE) * n_bytes:
-            raise OutputError(f"{self.folder}: what was found is not kept, as the {byte_size(free)} free are for the results")
 
 
 ResultT = TypeVar("ResultT")

@@ -128,7 +128,8 @@ def _prepare(folder: Path, now: Fingerprint, how: Continuation, progress: Progre
         reasons = _why_not(manifest, now)
         if not reasons:
             progress.note(f"going on with the interrupted run, from {folder}")
-            _remove_partial(folder)
+            for file in filter(_is_record, folder.glob(".*")):  # what a killed process was writing
+                file.unlink(missing_ok=True)
             return
         logger.warning("%s: the interrupted run is not continued, but started again: %s", folder, _named(reasons))
         _clear(folder)
@@ -214,13 +215,6 @@ def _clear(folder: Path, from_level: int = 1) -> None:
     files = [each for each in folder.iterdir() if _is_record(each)] if folder.is_dir() else []
     for file in sorted(files, key=lambda each: each.name == MANIFEST):
         if not file.name.startswith(taken):
-            file.unlink(missing_ok=True)
-
-
-def _remove_partial(folder: Path) -> None:
-    """Remove what a killed process was writing."""
-    for file in folder.glob(".*"):
-        if _is_record(file):
             file.unlink(missing_ok=True)
 
 
