@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,19 +79,16 @@ def _capture(
     folder: Path, record: RunRecord, catalog: Catalog | None, changes: Sequence[str], output: Path | None
 ) -> Iterator[tuple[Plan, Source]]:
     """Open the capture of a run by the spec that the run recorded."""
-    try:
-        plan = parse_spec(record["spec"], name=str(folder / "run.json"), catalog=catalog, overrides=changes, output=output)
-        opened = open_source(plan)
-        source = opened.__enter__()
-    except SpecError as error:
-        if any(problem.override for problem in error.problems):
-            raise
-        problems = "; ".join(f"{problem.where}: {problem.message}" for problem in error.problems)
-        raise InputError(f"{folder}: the capture of this run cannot be opened by its recorded spec ({problems})") from error
-    try:
+    with ExitStack() as stack:
+        try:
+            plan = parse_spec(record["spec"], name=str(folder / "run.json"), catalog=catalog, overrides=changes, output=output)
+            source = stack.enter_context(open_source(plan))
+        except SpecError as error:
+            if any(problem.override for problem in error.problems):
+                raise
+            problems = "; ".join(f"{problem.where}: {problem.message}" for problem in error.problems)
+            raise InputError(f"{folder}: the capture of this run cannot be opened by its recorded spec ({problems})") from error
         yield plan, source
-    finally:
-        opened.__exit__(None, None, None)
 
 
 def _require_same_capture(folder: Path, run: RunTrajectory, stream: StreamInfo) -> None:

@@ -1,4 +1,4 @@
-"""Compare runs of one capture: how far their motions differ, and their panoramas on one canvas."""
+"""Compare runs of one capture: the difference of their motions, and their panoramas on one canvas."""
 
 from __future__ import annotations
 

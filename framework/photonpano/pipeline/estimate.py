@@ -1,4 +1,4 @@
-"""Estimate the motion of a capture: the first level of the loop, and one pass after another on what it has found."""
+"""Estimate the motion of a capture: the first level of the loop, then one pass after another on its result."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from photonpano.protocols import Source
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision
 
-START = "start"  # what the decision is called on a motion that is known before the first level
+START = "start"  # name of the decision on the initial motion
 
 
 def estimate(plan: Plan, source: Source, journal: list[Decision], context: Context) -> State:
-    """Estimate the motion of a capture, and correct what its own frames show to be in the way.
+    """Estimate the motion of a capture, and correct the lens, shading, flicker and cuts that its own frames show.
 
     `journal` receives the decisions, in the order in which components and passes take them.
 

@@ -1,4 +1,4 @@
-"""Refine the motion: each refiner corrects it by what short spans of frames show beyond it."""
+"""Refine the motion: refiners correct it by the residual shifts of short spans of frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Refined
 
-# Most corrections by one refiner. A tremor blurs the panorama that it is seen against, so that one is not enough.
+# Maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against.
 MAX_ROUNDS = 6
 
 

@@ -1,4 +1,4 @@
-"""Warn of what is weak in a run: exposures that were not located, outliers, frames whose motion is uncertain."""
+"""Warnings of a run: exposures that were not located, outliers, frames with a large expected error, doubtful poses."""
 
 from __future__ import annotations
 

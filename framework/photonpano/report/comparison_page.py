@@ -15,7 +15,18 @@ from numpy.typing import NDArray
 
 from photonpano.record.schema import RunRecord
 from photonpano.registry.description import flow
-from photonpano.report.drawing import INK, SERIES, WIDTH_IN, Margins, add_axes, jpeg_uri, plain_figure, svg_of
+from photonpano.report.drawing import (
+    INK,
+    SERIES,
+    WIDTH_IN,
+    Margins,
+    add_axes,
+    jpeg_uri,
+    mark_frames,
+    mark_logarithmic,
+    plain_figure,
+    svg_of,
+)
 from photonpano.report.environment import filled
 from photonpano.report.figures import instants_of
 from photonpano.text import byte_size, count, duration, pixels, share
@@ -73,8 +84,6 @@ def render_comparison(runs: Sequence[ComparedRun], output: Path) -> str:
 
 def differences_over_time(runs: Sequence[ComparedRun]) -> str:
     """Draw how far the motion of each run is from that of the first, frame by frame."""
-    from matplotlib.ticker import LogLocator
-
     others = [run for run in runs if run.difference_px is not None]
     with plain_figure(WIDTH_IN, 3.0) as figure:
         [axes] = add_axes(figure, Margins(right=0.3, top=0.4))
@@ -82,14 +91,9 @@ def differences_over_time(runs: Sequence[ComparedRun]) -> str:
             assert run.difference_px is not None
             frames = instants_of(len(run.difference_px))
             axes.plot(frames, run.difference_px[frames], color=colour, label=run.name)
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-        axes.yaxis.set_minor_formatter("{x:g}")
+        mark_logarithmic(axes)
         axes.set_ylabel("difference (px)")
-        axes.set_xlabel("frame")
-        axes.xaxis.set_major_formatter("{x:,.0f}")
-        axes.set_xlim(-0.5, runs[0].record["source"]["n_frames"] - 0.5)
+        mark_frames(axes, 0, runs[0].record["source"]["n_frames"])
         figure.legend(loc="upper left", ncols=5, handlelength=1.2)
         return svg_of(figure, "differences")
 

@@ -202,6 +202,23 @@ def svg_of(figure: Figure, name: str) -> str:
     return svg.strip()
 
 
+def mark_frames(axes: Axes, start: int, stop: int) -> None:
+    """Let the x axis count the frames of a span."""
+    axes.set_xlabel("frame")
+    axes.set_xlim(start - 0.5, stop - 0.5)
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+
+
+def mark_logarithmic(axes: Axes) -> None:
+    """Make the y axis logarithmic, with numbers at 1, 2 and 5."""
+    from matplotlib.ticker import LogLocator
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+    axes.yaxis.set_minor_formatter("{x:g}")
+
+
 def add_time_axis(axes: Axes, n_frames: int, frame_rate_hz: float) -> None:
     """Add the time along the top, in seconds or milliseconds."""
     from matplotlib.transforms import ScaledTranslation

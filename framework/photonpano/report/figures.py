@@ -28,6 +28,8 @@ from photonpano.report.drawing import (
     add_time_axis,
     extent_of,
     map_figure,
+    mark_frames,
+    mark_logarithmic,
     plain_figure,
     shrunk,
     svg_of,
@@ -47,8 +49,6 @@ STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "i
 
 def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
     """Draw the position and the speed of the frame centre, and the expected corner error, over time."""
-    from matplotlib.ticker import LogLocator
-
     instants = instants_of(len(motion.homographies))
     path, unit = _path(motion, instants)
     with plain_figure(WIDTH_IN, 6.0) as figure:
@@ -67,14 +67,9 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
         speed.set_ylabel(f"speed ({unit}/frame)")
         known = np.where(np.isfinite(motion.std_px), motion.std_px, np.nan)
         error.plot(instants, known[instants], color=INK)
-        error.set_yscale("log")
-        error.yaxis.set_major_formatter("{x:g}")
-        error.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-        error.yaxis.set_minor_formatter("{x:g}")
+        mark_logarithmic(error)
         error.set_ylabel("expected error (px)")
-        error.set_xlabel("frame")
-        error.set_xlim(-0.5, len(motion.homographies) - 0.5)
-        error.xaxis.set_major_formatter("{x:,.0f}")
+        mark_frames(error, 0, len(motion.homographies))
         for axes in (position, speed, error):
             for span in true_spans(~motion.located):
                 axes.axvspan(span.start - 0.5, span.stop - 0.5, color=MUTED, alpha=0.18, linewidth=0)
@@ -161,12 +156,10 @@ def tied_parts(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
             axes.broken_barh(spans, (row - 0.32, 0.64), facecolors=colour, edgecolor=PAPER, linewidth=0.6)
         axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
         axes.set_ylim(len(rows) - 0.5, -0.5)
-        axes.set_xlim(groups[0].span.start - 0.5, groups[-1].span.stop - 0.5)
         axes.grid(visible=False, axis="y")
         axes.spines["left"].set_visible(False)
         axes.tick_params(axis="y", colors=INK)
-        axes.xaxis.set_major_formatter("{x:,.0f}")
-        axes.set_xlabel("frame")
+        mark_frames(axes, groups[0].span.start, groups[-1].span.stop)
         return svg_of(figure, "tied-parts")
 
 

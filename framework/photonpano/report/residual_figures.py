@@ -1,4 +1,4 @@
-"""The figures of what the panorama does not explain: maps of the misfit, brightness and shifts over the sensor, spectra."""
+"""Figures of the residuals: maps of the misfit, brightness and shifts over the sensor, spectra."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from photonpano.report.drawing import (
     extent_of,
     map_figure,
     maps_figure,
+    mark_frames,
     plain_figure,
     svg_of,
 )
@@ -113,10 +114,8 @@ def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
             time.plot([], [], "o", color=colour, markersize=4, label=name)
         limit = float(np.nanquantile(np.abs(np.c_[steps[shown], 1.5 * band]), 0.995))
         time.set_ylim(-1.1 * limit, 1.1 * limit)
-        time.set_xlim(-0.5, residuals.spans[-1].stop - 0.5)
+        mark_frames(time, 0, residuals.spans[-1].stop)
         time.set_ylabel("shift (px)")
-        time.set_xlabel("frame")
-        time.xaxis.set_major_formatter("{x:,.0f}")
         time.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, handletextpad=0.2, columnspacing=1.2)
         _draw_spectrum(spectrum, residuals, frame_rate_hz)
         return svg_of(figure, "shifts")
@@ -131,11 +130,9 @@ def light_over_time(residuals: Residuals) -> str | None:
         [axes] = add_axes(figure, Margins())
         axes.axhline(1, color=MUTED, linewidth=1, linestyle="--")
         axes.plot(residuals.instants, gain, color=SERIES[0])
-        axes.set_xlim(-0.5, residuals.spans[-1].stop - 0.5)
+        mark_frames(axes, 0, residuals.spans[-1].stop)
         axes.set_ylim(0, 1.05 * float(gain.max()))
         axes.set_ylabel("light / mean")
-        axes.set_xlabel("frame")
-        axes.xaxis.set_major_formatter("{x:,.0f}")
         return svg_of(figure, "light")
 
 

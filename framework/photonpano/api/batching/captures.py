@@ -69,7 +69,7 @@ def find_captures(
 
 
 def _texts(given: Iterable[str | Path], lists: Iterable[str | Path], problems: list[str]) -> Iterator[tuple[str, Path, str]]:
-    """Yield what stands for captures, the folder that it counts from, and the beginning of a message about it."""
+    """Yield each argument that names captures, its base folder, and the prefix of messages about it."""
     for each in given:
         yield str(each), Path(), ""
     for each in lists:
@@ -89,7 +89,7 @@ def _texts(given: Iterable[str | Path], lists: Iterable[str | Path], problems: l
 
 
 def _lines(path: Path) -> tuple[Sequence[str], Path]:
-    """Return the lines of a list, and what its paths count from."""
+    """Return the lines of a list, and its base folder."""
     if str(path) == "-":
         return sys.stdin.read().splitlines(), Path()
     path = given_path(path)

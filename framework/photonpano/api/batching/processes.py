@@ -166,7 +166,7 @@ def _end(runs: Sequence[_Run]) -> None:
 
 
 def _how_it_ended(code: int, printed: Path) -> str:
-    """Say how a process has ended that gave no answer."""
+    """Describe the exit of a process that sent no row."""
     if code == -signal.SIGKILL:
         return (
             "the run was killed (SIGKILL), as the system does when memory runs out; lower run.memory or the number of jobs, "

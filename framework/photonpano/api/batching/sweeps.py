@@ -61,12 +61,12 @@ class Job:
 
 
 def is_of_capture(where: str) -> bool:
-    """Return whether a problem of a spec, by its path there, is one of the capture that a batch has put in."""
+    """Return whether a problem of a spec, by its path there, concerns the capture."""
     return where in ("source", CAPTURE_KEY)
 
 
 def capture_override(capture: Location) -> str:
-    """Return the override that puts a capture in the place of that of the spec."""
+    """Return the override that replaces the capture of the spec."""
     return override(CAPTURE_KEY, as_written(capture if isinstance(capture, Url) else capture.absolute()))
 
 

@@ -1,4 +1,4 @@
-"""What the results of a run depend on, in parts, so that a change can be named; and whether a run is finished already."""
+"""Fingerprints of what the results of a run depend on, in parts that messages can name; and of runs that are finished."""
 
 from __future__ import annotations
 

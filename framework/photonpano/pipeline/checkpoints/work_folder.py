@@ -117,7 +117,7 @@ def finished_before(folder: Path) -> bool:
 
 
 def _prepare(folder: Path, now: Fingerprint, how: Continuation, progress: Progress) -> None:
-    """Leave in the work folder only what this run may take; `OutputError` if it is the folder of somebody else."""
+    """Clear the work folder of what this run may not reuse; `OutputError` if it is the folder of somebody else."""
     there = os.path.lexists(folder)
     if there and not _is_ours(folder):
         raise OutputError("it is there already, and is not the work folder of a run")

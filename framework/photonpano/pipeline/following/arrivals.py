@@ -1,4 +1,4 @@
-"""Watch a capture that is still being written: how many frames are there, how long they wait, and whether more will come."""
+"""Watch a capture that is still being written: the number of its frames, their delays, and whether more will come."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from photonpano.errors import PhotonpanoError
 from photonpano.protocols import Arrived, Source
 
 _POLL_S = 0.02
-_TOLERATED_S = 1.0  # how long an unreadable capture is tolerated: a file may appear before the one before it is complete
-_MOST_MARKS = 4096  # Times of arrival that are kept. While frames wait for minutes, they get coarser.
+_TOLERATED_S = 1.0  # time for which an unreadable capture is tolerated: files may appear in any order
+_MOST_MARKS = 4096  # Maximum number of arrival times; beyond, neighbours are merged.
 _STEP_S, _STEPS = 0.01, 12_000  # resolution and number of the bins of delays: 10 ms, up to two minutes
 
 
@@ -40,7 +40,7 @@ class Arrivals:
         self._look, self._is_over, self._silence_s = look, is_over, silence_s
         self._source: Source | None = None
         self._failure: PhotonpanoError | None = None
-        self._marks: deque[tuple[int, float]] = deque()  # numbers of frames, and when they were not there yet
+        self._marks: deque[tuple[int, float]] = deque()  # number of frames, and time of the last look without them
         self._forgotten = 0
         self._lock, self._changed, self._stopped = threading.Lock(), threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._watch, name="arrivals", daemon=True)

@@ -107,7 +107,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
 
 
 def _followable(plan: Plan) -> Callable[[Any], Any]:
-    """Return the function that opens the part of the capture that is there: an `Arrived`, or a `Piped`."""
+    """Return the function that opens the part of the capture that has arrived: an `Arrived`, or a `Piped`."""
     contribution, config = plan.source.contribution, plan.source.config
     assert isinstance(contribution, SourceContribution)
     if plan.pose is not None:
@@ -166,7 +166,7 @@ def _free(path: Path, plan: Plan, overwrite: bool) -> Path:
 
 
 def _way_on(plan: Plan) -> str:
-    """Return what makes the panorama of frames that were copied from a pipe."""
+    """Return how to run the frames that were copied from a pipe."""
     path = str(plan.document["source"]["with"]["path"])
     if plan.file is None:
         return f"run them with source.with.path = {path!r}, and without follow"

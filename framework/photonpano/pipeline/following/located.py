@@ -1,4 +1,4 @@
-"""Locate a growing capture: the loop runs its first level on one window of frames after the other."""
+"""Locate a growing capture: the first level of the loop, on one window of frames after the other."""
 
 from __future__ import annotations
 

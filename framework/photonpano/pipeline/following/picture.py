@@ -23,14 +23,14 @@ from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Resp
 
 logger = logging.getLogger(__name__)
 
-_MOST_PIXELS = 2_000_000  # most pixels of the canvas; beyond, its scale is halved
-_LEAST_SCALE = 1 / 8  # least scale; beyond, the picture begins anew
-_MOST_AREA_CHANGE = 4.0  # greatest ratio between the area of a frame on the canvas and that of the first frame, either way
-_MARGIN = 0.25  # how much more than necessary the canvas grows, in longer sides of a frame
+_MOST_PIXELS = 2_000_000  # maximum canvas size; a larger one is halved in scale
+_LEAST_SCALE = 1 / 8  # minimum scale; below, the picture starts again
+_MOST_AREA_CHANGE = 4.0  # maximum ratio of the areas of a frame and the first frame on the canvas, either way
+_MARGIN = 0.25  # extra growth of the canvas, in longer sides of a frame
 _TOLERANCE_PX = 1.0  # motion within which frames are summed before they are warped
 _WHITE = 0.995  # quantile of the flux that is white
 _SAMPLES = 100_000  # pixels from which that quantile is estimated
-# The made-up capture: a frame, a block, how many frames, and how far the camera pans.
+# The simulated capture of `rehearse`: shape, size of blocks, number of frames, length of the pan.
 _SHAPE, _BLOCK_PX, _N_FRAMES, _LENGTH_PX = (64, 96), 8, 2048, 32
 
 
@@ -43,7 +43,7 @@ class PictureSoFar:
 
     def __init__(self) -> None:
         self.scale = 1.0
-        self._sums = np.zeros((2, 0, 0), np.float32)  # counts, and their weights in frames
+        self._sums = np.zeros((2, 0, 0), np.float32)  # counts and weights (frames per pixel)
         self._origin: NDArray[np.integer] = np.zeros(2, int)  # (x, y) of the first pixel
         self._to_plane: Homography = np.eye(3)  # from the frame that the next window has in common with the last one
         self._response: Response | None = None
