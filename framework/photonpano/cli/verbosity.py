@@ -8,6 +8,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -120,32 +121,15 @@ class _LogFile(logging.FileHandler):
             self._failed = True
 
 
+_MORE = "Say more on standard error: each decision with its reason and, without a terminal, each stage with its time."
+_TO_FILE = "Append stages, decisions, warnings and errors to a file, each with its time."
+_option = partial(typer.Option, callback=_keep, expose_value=False)
+
+
 def _options(
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose",
-            "-v",
-            callback=_keep,
-            expose_value=False,
-            help="Say more on standard error: each decision with its reason and, without a terminal, each stage with its time.",
-        ),
-    ] = False,
-    quiet: Annotated[
-        bool,
-        typer.Option("--quiet", "-q", callback=_keep, expose_value=False, help="Say only results, warnings and errors."),
-    ] = False,
-    log: Annotated[
-        Path | None,
-        typer.Option(
-            "--log",
-            metavar="FILE",
-            callback=_keep,
-            expose_value=False,
-            help="Append stages, decisions, warnings and errors to a file, each with its time.",
-            show_default=False,
-        ),
-    ] = None,
+    verbose: Annotated[bool, _option("--verbose", "-v", help=_MORE)] = False,
+    quiet: Annotated[bool, _option("--quiet", "-q", help="Say only results, warnings and errors.")] = False,
+    log: Annotated[Path | None, _option("--log", metavar="FILE", help=_TO_FILE, show_default=False)] = None,
 ) -> None:
     """Carry the options."""
 

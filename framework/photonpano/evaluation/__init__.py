@@ -3,8 +3,16 @@
 from photonpano.evaluation.bounds import exposure_bound_px, pair_bound_px
 from photonpano.evaluation.images import ImageScore, covered, image_score, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
-from photonpano.evaluation.pose_inputs import RunPoses, has_poses, load_run_poses, load_true_poses
-from photonpano.evaluation.poses import PoseScore, align_positions, evaluate_poses, pose_errors
+from photonpano.evaluation.poses import (
+    PoseScore,
+    RunPoses,
+    align_positions,
+    evaluate_poses,
+    has_poses,
+    load_run_poses,
+    load_true_poses,
+    pose_errors,
+)
 from photonpano.evaluation.run_scores import Evaluation, Renderer, evaluate
 from photonpano.evaluation.trajectory import RotationScore, TrajectoryScore, Turn, corner_errors, rotation_errors
 

@@ -110,12 +110,6 @@ def work_folder(
     work.close()
 
 
-def finished_before(folder: Path) -> bool:
-    """Return whether a work folder is kept of a run that was finished."""
-    manifest = _manifest(folder)
-    return manifest is not None and bool(manifest["finished"])
-
-
 def _prepare(folder: Path, now: Fingerprint, how: Continuation, progress: Progress) -> None:
     """Clear the work folder of what this run may not reuse; `OutputError` if it is the folder of somebody else."""
     there = os.path.lexists(folder)

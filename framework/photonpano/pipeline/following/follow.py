@@ -24,11 +24,9 @@ from photonpano.errors import InputError, OutputError, PhotonpanoError, describe
 from photonpano.folders import lock_path
 from photonpano.interrupts import is_interrupt
 from photonpano.locks import locked
-from photonpano.pipeline.following.arrivals import Arrivals
+from photonpano.pipeline.following.arrivals import Arrivals, Spool
 from photonpano.pipeline.following.live_run import Every, LiveRun
-from photonpano.pipeline.following.page import PAGE, LivePage
-from photonpano.pipeline.following.picture import PictureSoFar, rehearse
-from photonpano.pipeline.following.spool import Spool
+from photonpano.pipeline.following.picture import PAGE, LivePage, PictureSoFar, rehearse
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.pipeline.run_steps import COMPILING
 from photonpano.protocols import Piped
