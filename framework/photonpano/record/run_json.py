@@ -219,7 +219,8 @@ def motion_record(std_px: FloatArray) -> MotionRecord | None:
 
 def verdict_record(verdict: Verdict) -> VerdictRecord:
     """Describe a verdict."""
-    return _fields(verdict) | {"reasons": [_fields(reason) for reason in verdict.reasons]}
+    found: VerdictRecord = _fields(verdict) | {"reasons": [_fields(reason) for reason in verdict.reasons]}
+    return found
 
 
 def verdict_of(found: VerdictRecord) -> Verdict:
