@@ -9,7 +9,6 @@ import numpy as np
 
 from photonpano.captures.repeats import timeline_of
 from photonpano.context import Context
-from photonpano.errors import InputError
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
@@ -57,13 +56,10 @@ def require_centre(plan: Plan, source: Source) -> None:
         return
     (x, y), (height, width) = plan.camera.centre_px, source.info.frame_shape
     if not (0 <= x < width and 0 <= y < height):
-        raise InputError(
-            str(
-                plan.place("camera.centre_px").problem(
-                    f"({x:g}, {y:g}) does not lie in the frames of {height}x{width} px; a camera that was calibrated with "
-                    "other frames has another principal point and focal length here: scale and shift both"
-                )
-            )
+        raise plan.error(
+            "camera.centre_px",
+            f"({x:g}, {y:g}) does not lie in the frames of {height}x{width} px; a camera that was calibrated with "
+            "other frames has another principal point and focal length here: scale and shift both",
         )
 
 

@@ -94,7 +94,7 @@ def naming_key_of_canvas(plan: Plan) -> Iterator[None]:
         yield
     except (ExtentError, ProjectionError) as error:
         key = "render.extent" if isinstance(error, ExtentError) else "render.projection"
-        raise InputError(str(plan.place(key).problem(str(error)))) from error
+        raise plan.error(key, str(error)) from error
 
 
 @dataclass(frozen=True, slots=True)

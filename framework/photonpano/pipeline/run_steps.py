@@ -207,4 +207,4 @@ def _require_photons(plan: Plan, source: Source) -> None:
     try:
         require_photons(source)
     except InputError as error:
-        raise InputError(str(plan.place("source").problem(str(error)))) from error
+        raise plan.error("source", str(error)) from error

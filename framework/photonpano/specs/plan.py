@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from photonpano.errors import InputError
 from photonpano.specs.written import Place, Written
 
 if TYPE_CHECKING:
@@ -118,3 +119,7 @@ class Plan:
     def place(self, where: str) -> Place:
         """Return where a value was written, by its path in `document`; for a default, where it would stand."""
         return self.written.at(*where.split(".")).place
+
+    def error(self, where: str, message: str) -> InputError:
+        """Return the error of a value, by its path in `document`, that does not suit the capture."""
+        return InputError(str(self.place(where).problem(message)))

@@ -116,9 +116,7 @@ def _followable(plan: Plan) -> Callable[[Any], Any]:
             "complete, or have frames written one after the other, for the source packed-raw"
         )
     if isinstance(config, PartOfCapture) and config.frames is not None:
-        raise InputError(
-            str(plan.place("source.with.frames").problem("a part of a capture cannot be followed; remove this key"))
-        )
+        raise plan.error("source.with.frames", "a part of a capture cannot be followed; remove this key")
     return contribution.arrived
 
 
