@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
-from photonpano.contributions import KINDS, Contribution, install_command
+import pluggy
+
+from photonpano.contributions import KINDS, Contribution, Requirement, install_command
 from photonpano.errors import PluginError
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of, require_same_contract
 from photonpano.text import listed, suggestion
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    import pluggy
-
-    from photonpano.contributions import Requirement
 
 
 @dataclass(frozen=True, slots=True, order=True)

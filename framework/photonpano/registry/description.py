@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from pydantic import BaseModel, ByteSize, TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema
+from pydantic_core import core_schema
 
-from photonpano.contributions import KINDS
+from photonpano.contributions import KINDS, Contribution
 from photonpano.text import byte_size, listed
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pydantic import BaseModel
-    from pydantic_core import core_schema
-
-    from photonpano.contributions import Contribution
-
 
 Schema: TypeAlias = "Mapping[str, Any]"  # A JSON Schema, or a part of one
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pluggy
 
@@ -13,9 +13,6 @@ from photonpano.errors import PluginError, described
 from photonpano.hookspecs import observation
 from photonpano.interrupts import is_interrupt
 from photonpano.text import listed
-
-if TYPE_CHECKING:
-    from photonpano.contributions import Contribution
 
 PREFIX = f"{hookspecs.PROJECT}_"
 # The hooks that offer nothing: a run calls them, so that a plugin can watch it.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +35,6 @@ from photonpano.report.drawing import (
 )
 from photonpano.text import duration
 from photonpano.values import FloatArray, FluxImage, Group, true_spans
-
-if TYPE_CHECKING:  # importing matplotlib takes a second
-    pass
 
 MAX_INSTANTS = 1500  # number of instants at which a long trajectory is drawn, evenly spaced
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from heapq import nsmallest
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import ConfigDict, Field
 
@@ -17,19 +17,14 @@ from photonpano.hookspecs import hookimpl
 from photonpano.interrupts import is_interrupt
 from photonpano.paths import Location, Url
 from photonpano.reading import objections, require_there
+from photonpano.registry import Catalog, Entry
 from photonpano.specs.checks import complaints
 from photonpano.specs.components import LocatorAlias, SourceAlias
 from photonpano.specs.plan import Choice
-from photonpano.specs.spec import validate
+from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, from_python
 from photonpano.text import listed
 from photonpano.values import Decision
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from photonpano.registry import Catalog, Entry
-    from photonpano.specs.spec import Spec
 
 logger = logging.getLogger(__name__)
 

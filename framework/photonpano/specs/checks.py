@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.contributions import MergerContribution
-from photonpano.corrections import FlatField
-from photonpano.errors import described
+from photonpano.corrections import Correction, FlatField
+from photonpano.errors import Problem, described
 from photonpano.interrupts import is_interrupt
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from photonpano.corrections import Correction
-    from photonpano.errors import Problem
-    from photonpano.specs.plan import Choice, LevelPlan, Plan
-    from photonpano.specs.settings import CameraSettings, MotionSettings
-    from photonpano.specs.spec import Spec
-    from photonpano.values import StreamInfo
+from photonpano.specs.plan import Choice, LevelPlan, Plan
+from photonpano.specs.settings import CameraSettings, MotionSettings
+from photonpano.specs.spec import Spec
+from photonpano.values import StreamInfo
 
 MAX_COMPLAINTS = 100  # of one component that are reported
 

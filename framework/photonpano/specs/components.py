@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
-from photonpano.contributions import KINDS, ExporterContribution, LocatorContribution, SourceContribution
+from photonpano.contributions import KINDS, ExporterContribution, Kind, LocatorContribution, SourceContribution
 from photonpano.errors import PluginError, described
 from photonpano.interrupts import is_interrupt
+from photonpano.registry import Entry
 from photonpano.specs.plan import Choice
-from photonpano.specs.spec import validate
+from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, given
 from photonpano.text import listed
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano.contributions import Kind
-    from photonpano.registry import Entry
-    from photonpano.specs.spec import Spec
 
 # The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks.
 DEFAULT_FALLBACK = "opencv-sift"

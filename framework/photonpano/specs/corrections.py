@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from photonpano.corrections import CORRECTIONS
+from photonpano.corrections import CORRECTIONS, Correction
 from photonpano.reading import missing_file
-from photonpano.specs.spec import validate
+from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, given
 from photonpano.text import suggestion
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from photonpano.corrections import Correction
-    from photonpano.specs.spec import Spec
 
 AUTO = "auto"  # the default: the run masks what stands still, and divides by a vignette
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
+from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from photonpano.contributions import KINDS
+from photonpano.contributions import KINDS, Kind
 from photonpano.corrections import CORRECTIONS
+from photonpano.registry import Catalog, Entry
 from photonpano.registry.description import TolerantJsonSchema
 from photonpano.specs.components import DEFAULT_FALLBACK, LocatorAlias
 from photonpano.specs.corrections import AUTO
@@ -25,12 +27,6 @@ from photonpano.specs.settings import (
     RenderSettings,
     RunSettings,
 )
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
-
-    from photonpano.contributions import Kind
-    from photonpano.registry import Catalog, Entry
 
 Schema: TypeAlias = dict[str, Any]
 MODES = ["auto", "steady", "changing"]  # words that may stand for the section `light`

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.errors import Problem, SpecError
 from photonpano.paths import Location, location, refusal
 from photonpano.registry import Catalog, discover
 from photonpano.specs.builtin import ask_sources
+from photonpano.specs.plan import Plan
 from photonpano.specs.resolution import resolve
 from photonpano.specs.spec import Spec
 from photonpano.specs.written import Place, Written, from_python, given, joined
 from photonpano.specs.yaml_reader import MAX_LENGTH, read_yaml
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from photonpano.specs.plan import Plan
 
 SPEC_SUFFIXES = {".yaml", ".yml"}
 

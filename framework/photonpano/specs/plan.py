@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import Any, Literal
 
+from photonpano.contributions import Config, Contribution
+from photonpano.corrections import Correction
 from photonpano.errors import InputError
+from photonpano.registry import Observer, Origin
+from photonpano.specs.settings import (
+    CameraSettings,
+    GraphSettings,
+    LightSettings,
+    MotionSettings,
+    OutputSettings,
+    RenderSettings,
+    RunSettings,
+)
 from photonpano.specs.written import Place, Written
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from photonpano.contributions import Config, Contribution
-    from photonpano.corrections import Correction
-    from photonpano.registry import Observer, Origin
-    from photonpano.specs.settings import (
-        CameraSettings,
-        GraphSettings,
-        LightSettings,
-        MotionSettings,
-        OutputSettings,
-        RenderSettings,
-        RunSettings,
-    )
-    from photonpano.values import Decision
+from photonpano.values import Decision
 
 
 @dataclass(frozen=True, slots=True)

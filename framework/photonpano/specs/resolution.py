@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.contributions import KINDS
-from photonpano.errors import SpecError
+from photonpano.errors import Problem, SpecError
 from photonpano.specs.checks import check_flat_field, check_settings, complaints
 from photonpano.specs.components import CHOICE, ComponentResolver, Stage
 from photonpano.specs.corrections import AUTO, resolved_corrections, written_corrections
@@ -22,17 +23,8 @@ from photonpano.specs.settings import (
     VERSION,
     LevelSettings,
 )
-from photonpano.specs.spec import validate
+from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, given
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from photonpano.errors import Problem
-    from photonpano.specs.components import Stage
-    from photonpano.specs.plan import Choice, LevelPlan, Plan
-    from photonpano.specs.spec import Spec
-
 
 # The keys of the framework's own sections that choose components.
 NOT_SETTINGS = {"render": CHOICE, "output": ("formats",), "run": ("executor",)}

@@ -4,27 +4,30 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from photonpano.contributions import KINDS
+from photonpano.errors import Problem
 from photonpano.registry import Catalog
-from photonpano.registry.description import alternative, alternatives, config_schema, discriminator, expectation, subschema
+from photonpano.registry.description import (
+    Schema,
+    alternative,
+    alternatives,
+    config_schema,
+    discriminator,
+    expectation,
+    subschema,
+)
 from photonpano.specs.settings import SECTIONS, SETTINGS
 from photonpano.specs.written import Written, given
 from photonpano.text import listed, suggestion
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from pydantic_core import ErrorDetails
-
-    from photonpano.errors import Problem
-    from photonpano.registry.description import Schema
-    from photonpano.values import Decision
+from photonpano.values import Decision
 
 
 @dataclass

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.nodes import MappingNode, ScalarNode
+from ruamel.yaml.error import MarkedYAMLError, StringMark, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 from ruamel.yaml.reader import ReaderError
 
+from photonpano.errors import Problem
 from photonpano.specs.written import Place, Written, given, joined
-
-if TYPE_CHECKING:
-    from ruamel.yaml.error import StringMark
-    from ruamel.yaml.nodes import Node
-
-    from photonpano.errors import Problem
 
 TAG = "tag:yaml.org,2002:"
 WHOLE = re.compile(r"[-+]?\d+[eE]\+?\d{1,2}")
