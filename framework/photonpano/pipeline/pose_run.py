@@ -18,7 +18,7 @@ from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.estimate import require_centre
 from photonpano.pipeline.run_steps import BegunRun
 from photonpano.poses import Poses, centres, colmap, in_standard_world, nerfstudio, ply, tum
-from photonpano.record.run_json import poses_record, started_record
+from photonpano.record.run_json import poses_record
 from photonpano.record.run_warnings import poses_warnings
 from photonpano.record.schema import RunRecord
 from photonpano.report import render_pose_report
@@ -36,7 +36,7 @@ def find_poses(run: BegunRun) -> None:
     run.observers.posed(estimate, time.perf_counter() - start)
     files = write_pose_files(run.folder.staging, estimate, source.info, plan.output.exposures)
     record: RunRecord = {
-        **started_record(plan, source.info, run.journal, run.seconds, run.capture),
+        **run.started_record(),
         "poses": poses_record(estimate),
         "warnings": [*poses_warnings(estimate), *files],
     }

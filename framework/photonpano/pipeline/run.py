@@ -113,7 +113,6 @@ def make_panorama(run: BegunRun) -> None:
         if plan.output.keep == "exposures":
             with folder.writing():
                 write_exposures(folder.staging, state.results, panorama.white_flux, context)
-    found = state.results, explained, verdict, panorama, chosen
-    record = record_of(plan, source.info, journal, *found, run.seconds, run.capture)
+    record = record_of(run.started_record(), plan, state.results, explained, verdict, panorama, chosen)
     light, capture = light_of(source), OpenCapture(source, state.results)
     run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)

@@ -81,10 +81,9 @@ class BegunRun:
         context = Context(progress=self.progress, on_level=on_level)
         return context if self.work is None else replace(context, checkpoints=self.work.checkpoints)
 
-    @property
-    def seconds(self) -> float:
-        """Seconds since the capture was open."""
-        return time.perf_counter() - self.start
+    def started_record(self) -> RunRecord:
+        """Return the record of the run as far as it is known without its results."""
+        return started_record(self.plan, self.source.info, self.journal, time.perf_counter() - self.start, self.capture)
 
     def end(self, record: RunRecord, draw: Callable[[RunRecord], str], verdict: Verdict | None = None) -> None:
         """Put the files of the run into its folder, and then the report that `draw` makes of the record."""
@@ -166,7 +165,7 @@ def _reporting_failure(run: BegunRun) -> Iterator[None]:
     except (LocationError, CanvasTooLargeError, PluginError) as error:
         levels = {result.level.number: level_record(result) for result in run.levels}
         record: RunRecord = {
-            **started_record(run.plan, run.source.info, run.journal, run.seconds, run.capture),
+            **run.started_record(),
             "status": "failed",
             "levels": [levels[number] for number in sorted(levels)],
         }

@@ -40,23 +40,20 @@ from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLoc
 
 
 def record_of(
+    started: RunRecord,
     plan: Plan,
-    stream: StreamInfo,
-    decisions: Sequence[Decision],
     levels: Sequence[LevelResult],
     explained: Explained,
     verdict: Verdict,
     panorama: RenderedPanorama,
     rendered: Sequence[Decision],
-    seconds: float,
-    capture: CaptureRecord,
 ) -> RunRecord:
     """Return the record of a finished run; `rendered` are the decisions of renderer and exporters."""
     motion = explained.motion
-    if plan.until_converged:
-        decisions = [*decisions, levels_decision(levels)]
+    decisions = [levels_decision(levels), *rendered] if plan.until_converged else rendered
     return {
-        **started_record(plan, stream, [*decisions, *rendered], seconds, capture),
+        **started,
+        "decisions": [*started["decisions"], *decision_records(decisions)],
         "levels": [level_record(result) for result in levels],
         "panorama": panorama_record(plan, panorama, rendered),
         "motion": motion_record(motion.std_px),
