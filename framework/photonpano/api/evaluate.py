@@ -24,7 +24,7 @@ from photonpano.text import columns
 from photonpano.threads import thread_count
 from photonpano.values import Panorama
 
-_FEW = 0.1  # if a smaller share of the positions lies within 3 expected errors, poses and truth hardly belong together
+_FEW = 0.1  # if fewer positions lie within 3 expected errors, the truth is probably of another capture
 
 
 def _score(run_folder: Path, truth: Path, **how: Any) -> Evaluation | PoseScore:

@@ -21,9 +21,9 @@ from photonpano.atomic import discard_unfinished
 from photonpano.cli.errors import INTERRUPTED, SIGNALLED
 from photonpano.interrupts import interrupt
 
-GRACE_S = 1.2  # how long the main thread may take to clean up after a signal
-KILL_S = 1.7  # how long after a signal the guard kills the program
-_LEFT_S = 0.2  # how long threads that a plugin has left may go on once the work is done
+GRACE_S = 1.2  # time for the main thread to clean up after a signal
+KILL_S = 1.7  # time after a signal until the guard kills the program
+_LEFT_S = 0.2  # time for threads that a plugin has left running
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
 INTERVAL_S = 10.0  # time between two lines of progress
-_LEAST_S = 1.0  # how long a stage has gone on before it has a line
-_IN_NOTEBOOK = "JPY_PARENT_PID"  # set for commands of a notebook, whose terminal shows what moves a cursor as it is
+_LEAST_S = 1.0  # minimum age of a stage that is printed
+_IN_NOTEBOOK = "JPY_PARENT_PID"  # set in notebooks, whose terminal prints control characters
 
 
 def progress_for_stderr(*, notes: bool = False) -> Progress:

@@ -22,8 +22,8 @@ from photonpano.cli.plans import PLANS, plan_of
 from photonpano.cli.verbosity import verbosity_of, with_verbosity
 
 SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
-_GIVEN = {"plan", "progress", "catalog", "resumed"}  # parameters that no option gives
-# How parameters are given that several commands have
+_GIVEN = {"plan", "progress", "catalog", "resumed"}  # parameters without an option
+# Options and arguments that several commands have
 _USUAL: dict[str, Any] = {
     "run_folder": typer.Argument(metavar="RUN", help="A run folder."),
     "output": typer.Option("--output", "-o", metavar="DIR"),

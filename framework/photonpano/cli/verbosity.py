@@ -17,7 +17,7 @@ import typer
 from photonpano import __version__
 
 logger = logging.getLogger("photonpano")
-SHOWN = f"{__name__}.shown"  # the logger of what is on the screen already, such as progress: for the log file alone
+SHOWN = f"{__name__}.shown"  # logger of messages that are on the screen already, for the log file alone
 _VERBOSE, _QUIET, _LOG = "verbose", "quiet", "log"
 _chosen: set[str] = set()
 

@@ -14,7 +14,7 @@ from photonpano.geometry import Canvas, inverse, rescaling
 from photonpano.photometry import srgb_to_linear, tone_mapped
 from photonpano.values import FloatArray, Homography
 
-_ROUNDING_PX = 1e-6  # smaller differences come from rounding: motions that are the same differ by 1e-14 px
+_ROUNDING_PX = 1e-6  # smaller differences are rounding errors: equal motions differ by 1e-14 px
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,15 +12,14 @@ from photonpano.geometry import Canvas
 from photonpano.photometry import linear_to_srgb
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
-# Quantile of the true scene that becomes white. The maximum may be a lamp, which would darken everything else.
+# Quantile of the true scene that is white: the maximum may be a lamp, which would darken everything else.
 WHITE_QUANTILE = 0.999
 
-# Pixels are compared if their coverage is at least this share of the median coverage of the seen pixels.
-MIN_COVERAGE = 0.05
+MIN_COVERAGE = 0.05  # minimum coverage of compared pixels, relative to the median coverage of the seen pixels
 
 _SSIM_SIGMA = 1.5
 _SSIM_RADIUS = 5
-_ROWS = 256  # rows of the true scene that are sampled at a time, which bounds the memory of the coordinates
+_ROWS = 256  # rows of the true scene sampled at a time, to bound the memory
 
 
 @dataclass(frozen=True, slots=True)

@@ -270,7 +270,7 @@ def _frame_shape(path: Path, arrays: Mapping[str, NDArray[Any]]) -> tuple[int, i
 
 
 _MAX_POINTS = 500
-_MAX_SIDE = 100  # longer side of a drawing, in sides of a frame; of a camera that turns further, the plane shows no path
+_MAX_SIDE = 100  # maximum longer side of a drawing, in sides of a frame; a camera that rotates further leaves the plane
 
 
 def drawn_path(homographies: FloatArray, frame_shape: tuple[int, int]) -> str:

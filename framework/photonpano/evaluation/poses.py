@@ -23,7 +23,7 @@ from photonpano.record.contents import require_one_run
 from photonpano.values import BoolArray, FloatArray
 
 POSES = "poses.npz"
-_ORTHONORMAL = 1e-3  # largest difference of R R^T from the identity in a pose
+_ORTHONORMAL = 1e-3  # maximum deviation of R R^T from the identity in a pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +111,7 @@ def _require_rigid(path: Path, poses: FloatArray) -> None:
         raise InputError(f"{path}: camera_from_world must be finite rotations and translations")
 
 
-_RPE_SHARE = 0.01  # the relative error is that over this share of the frames
+_RPE_SHARE = 0.01  # step of the relative error, as a fraction of the frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,7 +34,7 @@ from photonpano.threads import in_order, thread_count
 from photonpano.values import CaptureSummary, Decision, FrameSpan, Group, StreamInfo
 
 HALVED_LEVELS = 2  # with `scale: auto`, the first two levels are located at half size
-LARGE_FRAME_PX = 192  # frames whose shorter side is below this are not halved: the pyramids of locators need pixels
+LARGE_FRAME_PX = 192  # minimum shorter side of frames located at half size: the pyramids of locators need pixels
 
 
 @contextmanager

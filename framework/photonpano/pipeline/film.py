@@ -22,7 +22,7 @@ from photonpano.protocols import Source, camera_of
 from photonpano.threads import in_order
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
 
-# Pictures from which the white balance "grey-world" is taken, all over the video, so that it does not flicker.
+# The white balance "grey-world" is averaged over this many pictures of the video, so that it does not flicker.
 _BALANCED_ON = 16
 _DIMMED = 0.4  # brightness of the panorama outside the frame, relative to a still
 _LINES_PER_PX = 1 / 300  # width of the outline, as a fraction of the longer side

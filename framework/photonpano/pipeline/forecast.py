@@ -25,8 +25,8 @@ from photonpano.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
 TRIAL_GROUPS = 12  # length of the trial in the middle of the capture, in groups of the first level
-_WARM_UP_GROUPS = 3  # length of an untimed trial before it, in groups, for what is done once, such as compiling
-BYTES_PER_FRAME = 1200  # memory for the motion of one frame, as measured in the benchmarks
+_WARM_UP_GROUPS = 3  # length of an untimed trial before it, in groups, so that compiling is not timed
+BYTES_PER_FRAME = 1200  # memory of the motion of a frame, measured in benchmarks
 
 
 @dataclass(frozen=True, slots=True)

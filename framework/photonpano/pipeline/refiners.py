@@ -21,8 +21,7 @@ from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Refined
 
-# Maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against.
-MAX_ROUNDS = 6
+MAX_ROUNDS = 6  # maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against
 
 
 def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:

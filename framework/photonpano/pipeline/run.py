@@ -25,7 +25,7 @@ from photonpano.report.notebook import run_html
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 
-END_AFTER_S = 5.0  # seconds without a new frame after which a capture that is followed is complete, by default
+END_AFTER_S = 5.0  # default time without a new frame after which a followed capture is complete
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from photonpano.motion.loop import LevelResult
 from photonpano.residuals.refinement import Refinement
 from photonpano.values import FloatArray, PoseEstimate, true_spans
 
-# A warning names the frames whose expected corner error exceeds this: an error of this size is likely to be visible.
+# Expected corner error above which a warning names the frames: it is likely to be visible.
 UNCERTAIN_PX = 0.5
 SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst first
 

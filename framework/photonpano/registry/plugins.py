@@ -19,7 +19,7 @@ PREFIX = f"{hookspecs.PROJECT}_"
 OBSERVATION_HOOKS = tuple(name for name in vars(observation) if name.startswith(PREFIX))
 # All hooks: those that offer components, in the order in which a run needs these, and those that watch.
 HOOKS = (*(kind.hook for kind in KINDS.values()), *OBSERVATION_HOOKS)
-MAX_OFFERED = 1000  # most components that a hook may offer
+MAX_OFFERED = 1000  # maximum number of components of a hook
 
 
 def contributions_of(plugin: object) -> tuple[Contribution, ...]:

@@ -36,9 +36,9 @@ from photonpano.report.drawing import (
 from photonpano.text import duration
 from photonpano.values import FloatArray, FluxImage, Group, true_spans
 
-MAX_INSTANTS = 1500  # number of instants at which a long trajectory is drawn, evenly spaced
+MAX_INSTANTS = 1500  # maximum number of instants at which a trajectory is drawn
 
-MAX_PARTS = 5  # number of parts of a motion graph that have a row of their own
+MAX_PARTS = 5  # maximum number of parts of a motion graph with a row of their own
 
 STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "interpolate": "interpolate"}
 

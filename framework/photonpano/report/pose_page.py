@@ -68,17 +68,17 @@ MAX_POINTS = 20_000  # points that are drawn; of more, every nth
 MAX_FRAMES = 500  # frames of the path that are drawn; of more, every nth
 FRUSTUMS = 14
 _SIZE_IN = 5.0, 4.4
-_DOTS_PER_INCH = 150  # of the points, which are drawn as pixels: as shapes they would make the page ten times as large
+_DOTS_PER_INCH = 150  # resolution of the points, which are drawn as pixels: shapes would make the page ten times as large
 # Colours of the path from its start to its end, which show on light and on dark paper.
 _TIME = "#3d7ec6", "#9a5fb8", "#d9662a"
-# Points are shown as bright as they are, before a dark ground, and what is written there.
+# Background and text of the views of points, which are shown with their own brightness.
 _NIGHT, _ON_NIGHT = "#101316", "#c9d0d6"
-_DARKEST = 0.25  # level of a point without light, so that it shows before the ground
-_NEAR_QUANTILES = 0.02, 0.98  # quantiles of the points that are in the picture: few points lie very far
-_TILT = 0.4  # how far a viewpoint is moved from a principal axis, up and back: depth shows better from aslant
-_STEEP = 0.8  # cosine of the angle between the vertical and a direction of view that counts as from above
+_DARKEST = 0.25  # grey level of a dark point, brighter than the background
+_NEAR_QUANTILES = 0.02, 0.98  # quantiles of the points that the view is fitted to: a few points lie very far away
+_TILT = 0.4  # tilt of a viewpoint from its principal axis, up and back, which makes depth visible
+_STEEP = 0.8  # minimum cosine of the angle to the vertical of a view from above
 _AWAY = 3.5  # distance of the viewer from the middle, relative to the radius of what is shown
-_CLOSEST = 0.2  # points nearer to the viewer than this share of the distance of the middle are left out
+_CLOSEST = 0.2  # minimum distance of a point from the viewer, relative to that of the middle
 _MARGIN = 0.12
 _FRUSTUM = 0.14  # depth of a camera's frustum, relative to the radius of what is shown
 

@@ -34,16 +34,16 @@ from photonpano.values import FloatArray, Light
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
 
-MAX_DOTS = 500  # number of spans whose shifts are drawn, evenly spaced
+MAX_DOTS = 500  # maximum number of spans whose shifts are drawn
 SMALLEST_SHIFT_PX = 0.06  # shifts of blocks are drawn if their root mean square exceeds this, and three times their noise
-_FEWEST_BLOCKS = 16  # blocks that must have fallen on a square of the panorama
-_FEWEST_SPANS = 16  # fewer spans than this have no spectrum
-_WINDOW_SPANS = 512  # longest window of the spectrum
-_MISFIT_RANGE = (0.5, 2.0)  # the smallest range of colours of the misfit; the largest misfit that is drawn may widen it
+_FEWEST_BLOCKS = 16  # minimum number of blocks per square of the panorama
+_FEWEST_SPANS = 16  # minimum number of spans for a spectrum
+_WINDOW_SPANS = 512  # maximum window of the spectrum
+_MISFIT_RANGE = (0.5, 2.0)  # minimum colour range of the misfit, widened by larger values
 _MISFIT_TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-_FLICKER_PIXELS = 200  # longer side of the maps of the flicker, about
-_FLICKERS = 0.2  # places flicker if they do so by this share of the deepest flicker
-_GAIN_RANGE_PERCENT = 5.0  # the smallest range of colours of the brightness, to both sides
+_FLICKER_PIXELS = 200  # approximate longer side of flicker maps
+_FLICKERS = 0.2  # minimum amplitude with a phase, relative to the largest amplitude
+_GAIN_RANGE_PERCENT = 5.0  # minimum colour range of the brightness, to both sides
 
 
 def misfit_over_panorama(residuals: Residuals, measured: Canvas, canvas: Canvas) -> str:

@@ -26,16 +26,16 @@ from photonpano.residuals.refinement import Explained
 from photonpano.residuals.unexplained import distance_to_nearest
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
-# Most values of linear data on a page, which keeps it below some megabytes; a larger panorama is reduced.
+# Maximum number of values of linear data, some megabytes; a larger panorama is reduced.
 LINEAR_VALUES = 1_200_000
 CODES = 4095  # codes of 12 bits, logarithmic in the flux
 DECADES = 5.0  # range of the codes, in powers of ten below the highest flux: a step is 0.28 %
 MAP_PIXELS = 500  # longer side of a map
-# Instants of which the page shows what the camera saw; fewer in colour, where a sum takes a hundred times as long.
+# Number of short sums of frames on the page; fewer in colour, where a sum takes a hundred times as long.
 GLIMPSES, COLOURED_GLIMPSES = 40, 12
 GLIMPSE_PIXELS = 240
 VIEW_PIXELS = 1000  # longer side of the pictures of one instant
-_INSTANTS = 600  # frames whose outline is on the page
+_INSTANTS = 600  # number of frames whose outline is on the page
 _COLOURS = 6  # colours of a legend, between which a browser blends
 
 

@@ -29,7 +29,7 @@ from photonpano.values import Decision
 logger = logging.getLogger(__name__)
 
 _SHOWN = 3  # names of a folder in a message
-_SEARCHED = 1000  # files of a folder whose endings are compared with those of sources
+_SEARCHED = 1000  # maximum number of files of a folder whose endings are compared with those of sources
 _MOST_BACKENDS = 16  # locators of a chain
 
 

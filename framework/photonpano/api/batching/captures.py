@@ -16,7 +16,7 @@ from photonpano.registry import Catalog
 
 _TRUTH = ".truth.npz"
 _COMPRESSED = (".gz",)
-_LONGEST_LIST = 2**24  # bytes above which a list is no list: a capture that is given by mistake
+_LONGEST_LIST = 2**24  # maximum size of a list, in bytes; a larger file is probably a capture
 
 
 def find_captures(

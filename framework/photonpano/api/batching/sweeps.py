@@ -20,7 +20,7 @@ from photonpano.specs.written import Place
 from photonpano.specs.yaml_reader import read_yaml
 
 CAPTURE_KEY, OUTPUT_KEY = "source.with.path", "output.directory"
-_LONGEST_NAME = 120  # characters of the settings in the name of a folder; file systems allow 255 bytes
+_LONGEST_NAME = 120  # maximum length of the settings in the name of a folder; file systems allow 255 bytes
 _UNSAFE = re.compile(r"[^\w.,=+\-]")
 
 

@@ -20,7 +20,7 @@ from photonpano.values import Decision
 logger = logging.getLogger(__name__)
 
 SUFFIX = ".npz"
-_SPARE = 8  # free space that a record needs, in multiples of its own size: results come first
+_SPARE = 8  # free space, in sizes of a record, that must remain for the results
 
 
 class Store:
@@ -75,8 +75,7 @@ class Store:
 
 ResultT = TypeVar("ResultT")
 
-# Seconds between writes of a log: a kill costs this much of its results, at most.
-FLUSH_S = 5.0
+FLUSH_S = 5.0  # time between writes of a log: a kill loses at most this much work
 _END = "end"
 
 

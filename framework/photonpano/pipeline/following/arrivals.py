@@ -166,7 +166,7 @@ class Delays:
 
 
 _BUFFER_BYTES = 1024**2
-_WAIT_S = 0.2  # how long a spool that is stopped may wait for the writer
+_WAIT_S = 0.2  # time until a spool notices that it is stopped
 
 
 class Spool:

@@ -37,13 +37,12 @@ from photonpano.threads import one_thread_inside, thread_count
 
 logger = logging.getLogger(__name__)
 
-# The file to which frames of a pipe are copied.
-SPOOL = "frames.raw"
+SPOOL = "frames.raw"  # the copy of the frames of a pipe
 _REFRESH_S = 1.0
 _NOTE_S = 10.0
-# Least time between windows. Long windows take less time for a frame: each repeats the last exposure of the one before.
+# Minimum time between windows: each locates the last exposure of the one before again, so that long ones are faster.
 _WINDOW_S = 0.2
-_IDLE_S = 0.1  # longest wait for frames between two looks at the page
+_IDLE_S = 0.1  # maximum wait for frames between two updates of the page
 
 
 def live_folder(run_directory: Path) -> Path:

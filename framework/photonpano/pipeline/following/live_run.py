@@ -19,7 +19,7 @@ from photonpano.report import LiveFigures
 from photonpano.specs.plan import Plan
 from photonpano.values import BoolArray
 
-_LONG = 1_000_000  # frames of a capture whose length is not known yet, for checks of the stages
+_LONG = 1_000_000  # assumed length of a capture that does not promise one, for checks of the stages
 
 
 class ArrivedFrames:
@@ -46,7 +46,7 @@ class ArrivedFrames:
 logger = logging.getLogger(__name__)
 
 _RATE_S = 3.0  # time over which the rate of arrival is measured
-# Frames come too fast if they wait for longer than the first, once the second has passed since the first were located.
+# Locating is too slow if frames wait longer than `_FAR_BEHIND_S`, `_STARTED_S` after the first were located.
 _FAR_BEHIND_S, _STARTED_S = 2.0, 10.0
 
 

@@ -19,9 +19,8 @@ from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch
 from photonpano.values import FrameSpan, Homography
 
-LEAST_FRAMES = {"binary": 256, "intensity": 16}  # frames from which the first group size is chosen
-# Groups of the longest window: as many are located in one call if frames come faster than they are located.
-_MOST_GROUPS = 8
+LEAST_FRAMES = {"binary": 256, "intensity": 16}  # minimum number of frames for the first group size
+_MOST_GROUPS = 8  # maximum number of groups in a window, reached if frames come faster than they are located
 
 
 @dataclass(frozen=True, slots=True, eq=False)
