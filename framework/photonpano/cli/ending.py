@@ -100,7 +100,7 @@ def _clean_up() -> None:
 
 
 def _with_guard(numbers: int, to_write: int) -> int:
-    """Start the guard, and return the pipe on which it passes signals on: that of the numbers if no process can be started."""
+    """Start the guard, and return the pipe of signals that it passes on; `numbers` if no process can be started."""
     passed_on, to_pass = os.pipe()
     program = os.getpid()
     try:

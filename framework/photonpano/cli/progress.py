@@ -26,7 +26,7 @@ _IN_NOTEBOOK = "JPY_PARENT_PID"  # set in notebooks, whose terminal prints contr
 
 
 def progress_for_stderr(*, notes: bool = False) -> Progress:
-    """Return bars for a terminal, which show notes, nothing with `-q`, and elsewhere lines, with notes if wanted."""
+    """Return bars for a terminal, nothing with `-q`, and lines elsewhere, which show notes only on request."""
     shown = _progress_for_stderr(notes or is_verbose())
     return Logged(shown) if is_logged() else shown
 
@@ -62,7 +62,7 @@ class Bars:
 
 
 class Lines:
-    """Prints a line every `INTERVAL_S`, with what is done and the time left, and on request notes, and stages when done."""
+    """Prints a line every `INTERVAL_S` with progress and the time left; on request also notes, and stages when done."""
 
     def __init__(self, *, notes: bool = False, stages: bool = False) -> None:
         self._notes, self._stages = notes, stages

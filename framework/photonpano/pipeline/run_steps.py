@@ -82,7 +82,7 @@ class BegunRun:
         return context if self.work is None else replace(context, checkpoints=self.work.checkpoints)
 
     def started_record(self) -> RunRecord:
-        """Return the record of the run as far as it is known without its results."""
+        """Return the record of the run, without its results."""
         return started_record(self.plan, self.source.info, self.journal, time.perf_counter() - self.start, self.capture)
 
     def end(self, record: RunRecord, draw: Callable[[RunRecord], str], verdict: Verdict | None = None) -> None:

@@ -80,7 +80,7 @@ def finish_run_folder(folder: Path) -> None:
 
 
 def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str] | None:
-    """Return the files, of those with the names or of all, that are not what run.json lists; None if it lists none."""
+    """Return which of the named files, by default all, differ from what run.json lists; None if it lists none."""
     recorded = recorded_contents(folder)
     if recorded is None:
         return None

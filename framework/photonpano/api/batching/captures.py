@@ -22,7 +22,7 @@ _LONGEST_LIST = 2**24  # maximum size of a list, in bytes; a larger file is prob
 def find_captures(
     given: Iterable[str | Path], lists: Iterable[str | Path], catalog: Catalog, is_capture: Callable[[Path], bool]
 ) -> dict[str, Location]:
-    """Find captures, and name them: the captures by their names, each once, in the order in which they were given.
+    """Return captures by their names, each once, in the order in which they were given.
 
     A missing file counts as a capture: its run fails and says so, and the others go on.
 

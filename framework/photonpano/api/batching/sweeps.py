@@ -78,7 +78,7 @@ def override(key: str, value: Any) -> str:
 def read_changes(
     changes: Iterable[str], swept: Iterable[str], takes_list: Callable[[str, str], bool]
 ) -> tuple[list[str], dict[str, list[Any]]]:
-    """Sort what is set for all runs from what is swept: the overrides for all runs, and the values of each swept key.
+    """Separate the overrides for all runs from the values of each swept key.
 
     Args:
         changes: overrides such as `run.seed=1`. A list sweeps, as in `levels.0.scale=[0.5, 1]`, where the key takes no list.

@@ -59,7 +59,7 @@ def run_fingerprint(plan: Plan, capture: CaptureRecord, frame_shape: tuple[int, 
 
 
 def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None) -> list[str]:
-    """Return what differs between two fingerprints, a clause each; with `levels`, on which that many levels depend."""
+    """Return what differs between two fingerprints, a clause each; with `levels`, only what these levels depend on."""
     found = [
         f"the version of {path} was {old} and is {new}" for path, old, new in _changed(before["versions"], now["versions"])
     ]

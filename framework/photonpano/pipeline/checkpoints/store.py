@@ -24,7 +24,7 @@ _SPARE = 8  # free space, in sizes of a record, that must remain for the results
 
 
 class Store:
-    """Named records in a folder that exists. One that cannot be written, or is damaged, is a warning and computed again."""
+    """Named records in an existing folder. One that is damaged or cannot be written gives a warning, and is computed again."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -150,7 +150,7 @@ def _made(folder: Path) -> Iterator[None]:
 
 
 def _free(path: Path, plan: Plan, overwrite: bool) -> Path:
-    """Return the path, at which no file is; `OutputError` if it holds the frames of an earlier capture."""
+    """Remove the file, and return its path; `OutputError` if it holds the frames of an earlier capture."""
     if path.exists() and path.stat().st_size and not overwrite:
         raise OutputError(
             f"{path} holds the frames of an earlier capture: {_way_on(plan)}. To follow another capture, choose another folder "

@@ -62,7 +62,7 @@ class LocatedSoFar:
         self._joins = False
 
     def next_window(self, source: Source, *, last: bool = False) -> Window | None:
-        """Locate the next frames of `source`, which is all that are there: a few groups of them.
+        """Locate the next frames of `source`, which holds all that have arrived: a few groups of them.
 
         None if there are no new groups yet, or they could not be located: see `problem`. With `last`, it does not wait for
         more.
