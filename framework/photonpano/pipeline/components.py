@@ -41,11 +41,8 @@ LARGE_FRAME_PX = 192  # minimum shorter side of frames located at half size: the
 def open_source(plan: Plan, look: bool = True) -> Iterator[Capture]:
     """Open the capture of a plan, and check the stages against it. With `corrections: auto`, what stands still is masked.
 
-    Without `look`, no frame is read, and corrections that depend on frames are left out.
-
-    Raises:
-        InputError: the capture cannot be used as it is.
-        SpecError: a stage does not suit it, or it is grey and the spec balances its colours.
+    Without `look`, no frame is read, and corrections that depend on frames are left out. Errors are those of `build_source`,
+    and `SpecError` if a stage does not suit the capture.
     """
     with build_source(plan, look) as opened:
         capture = without_still_pixels(opened, look) if plan.corrects_itself else opened
@@ -189,10 +186,7 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
 
 
 def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> list[Decision]:
-    """Return the decisions of the first level's resampler, such as its group size, for a capture with this summary.
-
-    Raises `InputError` if the capture is too short for the resampler.
-    """
+    """Return the decisions of the first level's resampler, such as its group size, for a capture with this summary."""
     decisions: list[Decision] = []
     choice = plan.levels[0].resample
     resampler: Resampler = built(choice, stage_context(plan, source, Recorder(decisions), lambda: capture))

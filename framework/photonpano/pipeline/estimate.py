@@ -24,13 +24,7 @@ START = "start"  # name of the decision on the initial motion
 def estimate(plan: Plan, source: Source, journal: list[Decision], context: Context) -> State:
     """Estimate the motion of a capture, and correct the lens, shading, flicker and cuts that its own frames show.
 
-    `journal` receives the decisions, in the order in which components and passes take them.
-
-    Raises:
-        InputError: all frames are copies of the first one, or too few for the start, or the camera has other frames.
-        LocationError: the motion could not be estimated.
-        CanvasTooLargeError: the panorama would be far larger than the memory.
-        PluginError: a component failed in its own way, or broke its contract.
+    `journal` receives the decisions, in the order in which components and passes take them. For errors, see `run`.
     """
     require_centre(plan, source)
     reference, levels = _reference_frame(plan, source), build_levels(plan, source, journal)

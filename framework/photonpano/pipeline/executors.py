@@ -27,10 +27,7 @@ from photonpano.values import FrameSpan
 
 @contextmanager
 def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
-    """Build the executor of a plan, and close it at the end of the block.
-
-    Raises `InputError` if there are no workers, or they do not have what the run needs.
-    """
+    """Build the executor of a plan, and close it at the end of the block; `InputError` if workers lack what the run needs."""
     if plan.executor is None:
         yield LocalExecutor(thread_count(plan.run.threads))
         return

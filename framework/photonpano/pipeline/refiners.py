@@ -31,13 +31,7 @@ def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tup
 
 
 def refine(state: State, refiners: Sequence[NamedRefiner]) -> Explained:
-    """Correct the motion by refiners, each until it finds nothing, and measure what is left.
-
-    Raises:
-        CanvasTooLargeError: the panorama is far larger than what fits into the memory.
-        LocationError: frames reach the horizon of the reference plane.
-        PluginError: a refiner failed, or broke its contract.
-    """
+    """Correct the motion by refiners, each until it finds nothing, and measure what is left. For errors, see `run`."""
     refinements = []
     for place, refiner in enumerate(refiners):
         before, rounds, kept_out = state.motion, list[str](), ""

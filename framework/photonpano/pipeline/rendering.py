@@ -46,17 +46,10 @@ def render_into(
     context: Context,
     ready: tuple[Canvas, Panorama] | None = None,
 ) -> tuple[RenderedPanorama, list[Decision]]:
-    """Render the panorama, and write it, its motion, and what its capture was divided by.
+    """Render the panorama, and write it, its motion, and what its capture was divided by. For errors, see `run`.
 
     `source` is divided by the vignette and in its light. `ready` is the merge of all frames along this motion, where it is
     known. Returns the panorama, and the decisions of renderer and exporters.
-
-    Raises:
-        CanvasTooLargeError: the panorama would exceed the memory of the spec.
-        InputError: no frame shows the extent, or the motion does not suit the projection.
-        LocationError: frames reach the horizon of the reference plane.
-        OutputError: a file cannot be written.
-        PluginError: the renderer or an exporter failed, or broke its contract.
     """
     decisions: list[Decision] = []
     renderer = build_renderer(plan, source, decisions, context.in_order)
@@ -123,12 +116,7 @@ class AttributedRenderer:
         tolerance_px: float,
         advance: Callable[[int], None],
     ) -> Panorama:
-        """Render the frames of a span on a canvas.
-
-        Raises:
-            InputError: it renders no such canvas, or not through a lens.
-            PluginError: the renderer failed, or broke its contract.
-        """
+        """Render the frames of a span on a canvas; `InputError` if it renders no such canvas, or not through a lens."""
         self._require_renderable(source, trajectory, span, canvas)
         with attributing(self.origin, "the panorama"):
             return require_panorama(self.component.render(source, trajectory, span, canvas, tolerance_px, advance), canvas)
@@ -223,12 +211,7 @@ class AttributedExporter:
     suffix: str
 
     def export(self, panorama: StoredPanorama, folder: Path) -> None:
-        """Write the panorama into a folder.
-
-        Raises:
-            OutputError: the file cannot be written, as on a full disk.
-            PluginError: the exporter failed, or broke its contract.
-        """
+        """Write the panorama into a folder; `OutputError` if the file cannot be written, as on a full disk."""
         path = folder / f"panorama{self.suffix}"
         before = {each.name for each in folder.iterdir()}
         with attributing(self.origin, path.name):

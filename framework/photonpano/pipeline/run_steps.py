@@ -99,11 +99,6 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
 
     The block ends the run, unless it was finished before. If the block fails, a report of that lies beside the run folder,
     which stays as it was.
-
-    Raises:
-        InputError: the capture cannot be used, or shows nothing, or there is nothing to go on with.
-        OutputError: the run folder cannot be written, or another process writes it.
-        SpecError: a stage does not suit the capture.
     """
     if plan.pose is not None and (how.keep or how.from_level is not None):
         raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")

@@ -58,12 +58,7 @@ class State:
     refined: FrameMotion | None = None
 
     def located(self, levels: Sequence[Level], previous: Trajectory | None) -> State:
-        """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels.
-
-        Raises:
-            LocationError: too few exposures could be located.
-            PluginError: a component failed, or broke its contract.
-        """
+        """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels."""
         if not levels:
             return self
         before = [each for each in self.results if each.level.number < levels[0].number]

@@ -20,7 +20,6 @@ class Origin:
 
     Attributes:
         plugin: its distribution, such as "photonpano".
-        version: the version of the distribution.
         entry_point: how the distribution names the plugin, such as "core = photonpano_core.hooks".
     """
 
@@ -38,13 +37,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One component on offer.
-
-    Attributes:
-        contribution: the record of the component.
-        origin: the plugin that offers it.
-        missing: libraries that the component needs and that are not installed.
-    """
+    """One component on offer, with the libraries that it needs and that are missing."""
 
     contribution: Contribution
     origin: Origin

@@ -26,14 +26,7 @@ from photonpano.values import Decision
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A component chosen by name, with its validated config.
-
-    Attributes:
-        contribution: what the plugin offers under that name.
-        config: an instance of `contribution.config`.
-        origin: the plugin.
-        place: where the spec chooses it.
-    """
+    """A component chosen by name, with its validated config, at a place of the spec."""
 
     contribution: Contribution
     config: Config
@@ -48,10 +41,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class LevelPlan:
-    """The components of one level, and the scale of its exposures (pixels per pixel of a frame, or auto).
-
-    Pairs that `locate` loses are offered to the `fallbacks`, in order.
-    """
+    """The components of one level, and its scale; pairs that `locate` loses are offered to the `fallbacks`, in order."""
 
     resample: Choice
     merge: Choice

@@ -55,12 +55,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
     """Follow a capture until it is complete; the block then runs the whole of it, and the page says how that ended.
 
     A capture on standard input is copied to a file in the `live_folder`, as it comes. Yields the plan that runs the capture,
-    which is now in a file, and how far behind its frames were located. For `overwrite` and `end_after`, see `run`.
-
-    Raises:
-        InputError: the source cannot be followed; or what arrives is no capture, or is incomplete. What arrived is kept.
-        OutputError: a file cannot be written, or another process follows a capture into the same folder.
-        SpecError: a stage does not suit the capture.
+    which is now in a file, and how far behind its frames were located. For `overwrite`, `end_after` and errors, see `run`.
     """
     directory = plan.output.directory.absolute()
     folder = live_folder(directory)

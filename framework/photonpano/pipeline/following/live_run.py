@@ -63,12 +63,8 @@ class LiveRun:
     def next_window(self, *, last: bool) -> Window | None:
         """Locate the next frames; None if too few have come, or they cannot be located. `last` says that no more frames come.
 
-        If locating fails, a warning says so, and no more frames are located; the run goes on, as the frames still come.
-
-        Raises:
-            InputError: what arrives is no capture.
-            PluginError: the source broke its contract.
-            SpecError: a stage does not suit the capture.
+        If locating fails, a warning says so, and no more frames are located; the run goes on, as the frames still come. What is
+        wrong with the capture itself is raised.
         """
         arrived = self._arrivals.source()
         if arrived is None or self._failure:
