@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -15,46 +14,15 @@ from urllib.parse import quote
 
 import numpy as np
 
-from photonpano.record.batch_row import BatchRow, written
+from photonpano.record.batch_row import FIGURES, BatchRow, written
 from photonpano.report.drawing import INK, MUTED, SERIES, WIDTH_IN, Margins, add_axes, plain_figure, svg_of
 from photonpano.report.environment import filled, yaml_of
-from photonpano.text import byte_size, count, duration, pixels
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
 
 
 _COLOURS = {"trusted": "good", "done": "good", "doubtful": "bad", "failed": "bad", "interrupted": "bad"}
-
-
-@dataclass(frozen=True, slots=True)
-class _Column:
-    """A column of figures, which is shown where a run has one."""
-
-    title: str
-    figure: str
-    write: Callable[[Any], str]
-
-    def written(self, row: BatchRow) -> str:
-        """Return the figure of a run; a dash if it has none."""
-        value = getattr(row, self.figure)
-        return "\N{EN DASH}" if value is None else self.write(value)
-
-
-def _percent(share: float) -> str:
-    return f"{pixels(100 * share)} %"
-
-
-_COLUMNS = (
-    _Column("expected error", "expected_error_px", lambda value: f"{pixels(value)} px"),
-    _Column("true error", "true_error_px", lambda value: f"{pixels(value)} px"),
-    _Column("PSNR", "psnr_db", lambda value: f"{value:.1f} dB"),
-    _Column("expected error", "expected_position_error", _percent),
-    _Column("true error", "true_position_error", _percent),
-    _Column("frames", "n_frames", count),
-    _Column("time", "seconds", duration),
-    _Column("peak memory", "peak_memory_bytes", byte_size),
-)
 
 
 def render_batch(
@@ -80,7 +48,7 @@ def render_batch(
         numbers=Counter(row.verdict or row.status for row in rows),
         colours=_COLOURS,
         link_of=partial(_link, directory),
-        columns=[each for each in _COLUMNS if any(getattr(row, each.figure) is not None for row in rows)],
+        columns={name: title for name, (title, _) in FIGURES.items() if any(getattr(row, name) is not None for row in rows)},
         pictures=any(row.thumbnail for row in rows),
         has_truth=any(row.true_error_px is not None or row.true_position_error is not None for row in rows),
         of_positions=any(row.expected_position_error is not None for row in rows),

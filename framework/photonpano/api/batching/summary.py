@@ -10,15 +10,11 @@ from typing import Any
 
 from photonpano.atomic import atomic_path
 from photonpano.errors import OutputError
-from photonpano.record.batch_row import BatchRow, written
+from photonpano.record.batch_row import FIGURES, BatchRow, written
 from photonpano.report import render_batch
 
 TABLE, PAGE = "summary.csv", "summary.html"
 _FIRST = ("name", "capture", "run", "status", "verdict")
-_FIGURES = (
-    *("expected_error_px", "true_error_px", "psnr_db", "expected_position_error", "true_position_error"),
-    *("n_frames", "seconds", "peak_memory_bytes"),
-)
 
 
 def write_summary(
@@ -53,9 +49,9 @@ def _table(directory: Path, rows: Sequence[BatchRow], keys: Sequence[str]) -> st
     """Return the table in CSV: empty where a run has no such figure."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_FIRST, *keys, *_FIGURES, "reason"])
+    writer.writerow([*_FIRST, *keys, *FIGURES, "reason"])
     for row in rows:
         first = [row.name, str(row.capture), row.directory.relative_to(directory).as_posix(), row.status, row.verdict]
         settings = [written(row.settings[key]) for key in keys]
-        writer.writerow([*first, *settings, *(getattr(row, name) for name in _FIGURES), row.reason])
+        writer.writerow([*first, *settings, *(getattr(row, name) for name in FIGURES), row.reason])
     return text.getvalue()
