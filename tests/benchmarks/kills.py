@@ -87,7 +87,7 @@ class Kills:
         plan = parse_spec(spec, output=self._folder / "runs" / name)
         with (
             mock.patch("photonpano.pipeline.run.render_report", return_value=""),
-            mock.patch("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0),
+            mock.patch("photonpano.pipeline.checkpoints.store.FLUSH_S", 0.0),
         ):
             run(plan, resume=resume)
 

@@ -25,8 +25,7 @@ import numpy as np
 from pages import write_tables
 
 from photonpano import CameraGuess, evaluate_poses
-from photonpano.evaluation.pose_inputs import load_true_poses
-from photonpano.evaluation.poses import PoseScore, pose_errors
+from photonpano.evaluation.poses import PoseScore, load_true_poses, pose_errors
 from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.reconstruction import reconstruct
 

@@ -32,7 +32,7 @@ COSTS = {
     "checkpoints": (
         "photonpano.pipeline.checkpoints.store.Store.save",
         "photonpano.pipeline.checkpoints.store.Store.load",
-        "photonpano.pipeline.checkpoints.kept.Kept._name",
+        "photonpano.pipeline.checkpoints.store.Kept._name",
     ),
     "hashes of results": ("photonpano.pipeline.run_folder.contents_of",),
     "flushes, and the step": (

@@ -170,7 +170,7 @@ def large(scene: Path, frames: int, seed: int) -> str:
             capture = pool.submit(simulated, folder, scene, 0.5, frames, seed, 2200, **keys).result()
         truth = load_truth(capture.with_name("capture.truth.npz"))
         plan = parse_spec(spec_of(capture), output=folder / "run")
-        from photonpano.pipeline.components import build_renderer
+        from photonpano.pipeline.rendering import build_renderer
 
         with open_source(plan) as source:
             middle = len(truth.homographies) // 2

@@ -67,15 +67,7 @@ class BatchResult:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """A batch that can begin: its captures are found, and its spec and settings are right.
-
-    Attributes:
-        directory: the folder of the batch.
-        spec: the spec.
-        common: what is set for all runs.
-        keys: the swept keys.
-        rows: what is to be run.
-    """
+    """A batch that can begin: its captures are found, and its spec and settings are right. `rows` are the runs to do."""
 
     directory: Path
     spec: SpecText
@@ -129,15 +121,9 @@ def prepare_batch(
     changes: Sequence[str] = (),
     swept: Sequence[str] = (),
 ) -> Batch:
-    """Find the captures of a batch, and check its spec with all settings.
+    """Find the captures of a batch, and check its spec with all settings; arguments as in `batch`.
 
-    Args:
-        spec: as in `batch`.
-        captures: as in `batch`.
-        output: as in `batch`.
-        lists: text files with one capture a line.
-        changes: overrides such as `run.seed=1`.
-        swept: keys with their values, such as `resample.with.group_size=50,100`.
+    `lists` are text files with one capture a line, `swept` keys with their values, such as `resample.with.group_size=50,100`.
 
     Raises:
         SpecError: the spec or a setting is wrong; carries all problems.
@@ -277,11 +263,7 @@ def _overrides(batch: Batch, row: BatchRow) -> tuple[str, ...]:
 def _require_right(
     problems_of: Callable[[Sequence[str]], tuple[Problem, ...]], common: Sequence[str], settings: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Refuse a spec that is wrong whatever the capture is, with any of the settings.
-
-    Raises:
-        SpecError: with all problems, each once.
-    """
+    """Raise `SpecError` with all problems of any of the settings, each once, that do not depend on the capture."""
     found: dict[tuple[str, str], Problem] = {}
     for setting in settings:
         for each in problems_of([*common, *(override(key, value) for key, value in setting.items())]):
@@ -294,11 +276,7 @@ def _require_right(
 
 
 def _make(directory: Path) -> None:
-    """Make the folder of a batch.
-
-    Raises:
-        OutputError: it is a file, or cannot be made.
-    """
+    """Make the folder of a batch; `OutputError` if it is a file, or cannot be made."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         reason = "" if os.access(directory, os.W_OK | os.X_OK) else "it may not be written to"

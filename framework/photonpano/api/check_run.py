@@ -76,7 +76,7 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
 
 
 def _pairs(record: RunRecord) -> tuple[int, int] | None:
-    """Return the contradicting pairs of the last level and all of its pairs; None if the record does not list them."""
+    """Return the numbers of contradicting pairs and of all pairs of the last level; None if the record does not list them."""
     try:
         last = record["levels"][-1]
         return len(last["contradictions"]), int(last["pairs"])

@@ -20,7 +20,7 @@ from photonpano.text import counted
 
 _PARTIAL = re.compile(r"\.(.+\.)?[0-9a-f]{8}\.partial(\.\w+)?")
 _OLDER = re.compile(r"\.part-[a-z0-9_]{8}")
-_OLDER_S = 24 * 3600  # older versions lock nothing: what they began counts as left behind after a day
+_OLDER_S = 24 * 3600  # older versions lock nothing: their unfinished files are leftovers after a day
 _UNPACKED = ".unpacked.npy"
 
 

@@ -33,7 +33,7 @@ class DoubtfulError(PhotonpanoError):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command.
+    """A command of the program.
 
     Attributes:
         function: does the work; its signature and docstring give the options.
@@ -64,13 +64,7 @@ COMMANDS: dict[str, Command] = {}  # the commands whose modules are imported, by
 
 
 def command(example: str, prints: Callable[..., Iterable[str]], **declared: Any) -> Callable[[FunctionT], FunctionT]:
-    """Make a function a command.
-
-    Args:
-        example: see `Command`.
-        prints: see `Command`.
-        declared: other attributes of `Command`; what is none of them is an item of `options`.
-    """
+    """Make a function a command; attributes that `Command` does not have are items of its `options`."""
     own = {name: declared.pop(name) for name in ("plan", "settings", "notes", "calls") if name in declared}
 
     def declare(function: FunctionT) -> FunctionT:
@@ -81,11 +75,7 @@ def command(example: str, prints: Callable[..., Iterable[str]], **declared: Any)
 
 
 def component_names(*kinds: str) -> Callable[[str], list[str]]:
-    """Return what completes the name of a component.
-
-    Args:
-        kinds: of the components; by default all.
-    """
+    """Return a function that completes the name of a component of these kinds; of any kind if none is given."""
 
     def complete(incomplete: str) -> list[str]:
         from photonpano.registry import discover
@@ -114,14 +104,6 @@ def verdict_line(verdict: Verdict) -> str:
 
 
 def require_trust(verdict: Verdict, files: str) -> None:
-    """Fail with --strict.
-
-    Args:
-        verdict: of the run.
-        files: what became of the files, as a clause.
-
-    Raises:
-        DoubtfulError: the verdict is doubtful.
-    """
+    """Raise `DoubtfulError` if a verdict is doubtful; `files` is a clause about what became of the files."""
     if verdict.status != "trusted":
         raise DoubtfulError(f"the verdict is doubtful, and --strict accepts only a trusted one; {files}")

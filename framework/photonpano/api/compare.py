@@ -20,7 +20,7 @@ from photonpano.evaluation.comparison import motion_difference, on_canvas, reduc
 from photonpano.evaluation.inputs import RunTrajectory
 from photonpano.record.contents import require_one_run
 from photonpano.record.run_json import read_record
-from photonpano.record.schema import RunRecord
+from photonpano.record.schema import PanoramaRecord, RunRecord
 from photonpano.report import ComparedRun, render_comparison
 from photonpano.text import columns
 
@@ -78,47 +78,54 @@ def compare(runs: Sequence[Path | str], output: Path | str = "compare.html", tru
         raise OutputError(f"cannot write {output}: the page is HTML; choose a name that ends in .html")
     if len({folder.absolute().resolve() for folder in folders}) < max(2, len(folders)):
         raise InputError("a comparison needs at least two different run folders")
-    records = [_record(folder) for folder in folders]
-    motions = [load_run_trajectory(folder) for folder in folders]
-    for folder, record, motion in zip(folders[1:], records[1:], motions[1:], strict=True):
-        _require_same_capture((folders[0], records[0], motions[0]), (folder, record, motion))
+    runs_read = [_read(folder) for folder in folders]
+    for other in runs_read[1:]:
+        _require_same_capture(runs_read[0], other)
     names = _names(folders)
-    compared = _compared(folders, records, motions, names, _truth(truth, records[0]))
+    compared = _compared(runs_read, names, _truth(truth, runs_read[0]))
     with atomic_path(page) as temporary:
         temporary.write_text(render_comparison(compared, page), encoding="utf-8")
     return Comparison(page, tuple(names), tuple(run.mean_difference_px for run in compared))
 
 
-def _record(folder: Path) -> RunRecord:
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """What is read of a run folder."""
+
+    folder: Path
+    record: RunRecord
+    motion: RunTrajectory
+
+    @property
+    def files(self) -> list[Path]:
+        """The files of the capture."""
+        return [Path(file["path"]) for file in (self.record.get("capture") or {}).get("files") or ()]
+
+
+def _read(folder: Path) -> _Run:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; give the run folders that `photonpano run` wrote")
     require_one_run(folder, list(_FILES))
-    return read_record(folder)
+    return _Run(folder, read_record(folder), load_run_trajectory(folder))
 
 
-def _require_same_capture(first: tuple[Path, RunRecord, RunTrajectory], other: tuple[Path, RunRecord, RunTrajectory]) -> None:
+def _require_same_capture(first: _Run, other: _Run) -> None:
     """Refuse runs whose frames are not the same."""
-    one, another = ((record.get("capture") or {}).get("frames_sha256") for _, record, _ in (first, other))
-    same = len(first[2].homographies) == len(other[2].homographies) and (one == another or None in (one, another))
-    if not same:
-        described = [f"{folder} is a run of {_capture(record)}" for folder, record, _ in (first, other)]
-        raise InputError(f"{' and '.join(described)}: these are different captures; compare runs of one capture")
-    if first[2].frame_shape != other[2].frame_shape:
+    one, another = ((run.record.get("capture") or {}).get("frames_sha256") for run in (first, other))
+    if len(first.motion.homographies) != len(other.motion.homographies) or (one != another and None not in (one, another)):
+        names = [run.files[0].name if run.files else "a capture without a file" for run in (first, other)]
         described = [
-            f"{folder} has frames of {motion.frame_shape[0]}x{motion.frame_shape[1]}" for folder, _, motion in (first, other)
+            f"{run.folder} is a run of {name} ({run.record['source']['n_frames']:,} frames)"
+            for run, name in zip((first, other), names, strict=True)
         ]
+        raise InputError(f"{' and '.join(described)}: these are different captures; compare runs of one capture")
+    if first.motion.frame_shape != other.motion.frame_shape:
+        described = ["{} has frames of {}x{}".format(run.folder, *run.motion.frame_shape) for run in (first, other)]
         raise InputError(f"{' and '.join(described)}, after other corrections; compare runs with the same frames")
 
 
-def _capture(record: RunRecord) -> str:
-    """Name the capture of a run: its file, and the number of its frames."""
-    files = (record.get("capture") or {}).get("files") or ()
-    name = Path(files[0]["path"]).name if files else "a capture without a file"
-    return f"{name} ({record['source']['n_frames']:,} frames)"
-
-
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the shortest ends of the paths that are different."""
+    """Return the shortest path suffixes that differ from each other."""
     parts = [folder.absolute().resolve().parts for folder in folders]
     for length in range(1, max(map(len, parts)) + 1):
         names = ["/".join(each[-length:]) for each in parts]
@@ -127,44 +134,36 @@ def _names(folders: Sequence[Path]) -> list[str]:
     return names
 
 
-def _truth(given: Path | str | None, record: RunRecord) -> Path | None:
+def _truth(given: Path | str | None, run: _Run) -> Path | None:
     """Return the truth that was given, or that lies beside the capture."""
     if given is not None:
         return Path(given)
-    files = (record.get("capture") or {}).get("files") or ()
-    beside = truth_path(Path(files[0]["path"])) if len(files) else None
-    return beside if beside is not None and beside.is_file() else None
+    return next((beside for file in run.files[:1] if (beside := truth_path(file)).is_file()), None)
 
 
-def _compared(
-    folders: Sequence[Path],
-    records: Sequence[RunRecord],
-    motions: Sequence[RunTrajectory],
-    names: Sequence[str],
-    truth: Path | None,
-) -> list[ComparedRun]:
+def _compared(runs: Sequence[_Run], names: Sequence[str], truth: Path | None) -> list[ComparedRun]:
     """Align each run with the first, and score it."""
-    shapes = [_shape(record, folder) for record, folder in zip(records, folders, strict=True)]
-    canvases = [motion.canvas_of(shape) for motion, shape in zip(motions, shapes, strict=True)]
+    panoramas = [_panorama(run) for run in runs]
+    shapes = [(panorama["height"], panorama["width"]) for panorama in panoramas]
+    canvases = [run.motion.canvas_of(shape) for run, shape in zip(runs, shapes, strict=True)]
     common = reduced(canvases[0], _PICTURE_PIXELS)
-    in_srgb = all(((record["spec"].get("render") or {}).get("tone") or "srgb") == "srgb" for record in records)
-    white = _white(records[0])
+    in_srgb = all(((run.record["spec"].get("render") or {}).get("tone") or "srgb") == "srgb" for run in runs)
     found = []
-    for folder, record, motion, name, canvas in zip(folders, records, motions, names, canvases, strict=True):
-        difference = motion_difference(motion, motions[0])
+    for run, name, panorama, canvas in zip(runs, names, panoramas, canvases, strict=True):
+        difference = motion_difference(run.motion, runs[0].motion)
         if difference is None:
-            raise InputError(f"{folder} and {folders[0]} located no frame in common, so that they cannot be compared")
-        whites = (_white(record), white) if in_srgb else None
-        picture = on_canvas(_picture(folder), canvas, difference.alignment, common, whites)
-        scored = None if truth is None else evaluate(folder, truth)
+            raise InputError(f"{run.folder} and {runs[0].folder} located no frame in common, so that they cannot be compared")
+        whites = (panorama["white_flux"], panoramas[0]["white_flux"]) if in_srgb else None
+        picture = on_canvas(_picture(run.folder), canvas, difference.alignment, common, whites)
+        scored = None if truth is None else evaluate(run.folder, truth)
         image = None if scored is None else scored.panorama
         found.append(
             ComparedRun(
                 name,
-                folder,
-                record,
+                run.folder,
+                run.record,
                 picture,
-                None if folder is folders[0] else difference.corners_px,
+                None if run is runs[0] else difference.corners_px,
                 None if scored is None else scored.trajectory.mean_px,
                 None if image is None else image.psnr_db,
                 None if image is None else image.ssim,
@@ -173,17 +172,10 @@ def _compared(
     return found
 
 
-def _shape(record: RunRecord, folder: Path) -> tuple[int, int]:
-    panorama = record["panorama"]
-    if panorama is None:
-        raise InputError(f"{folder} has no panorama; give runs with one")
-    return panorama["height"], panorama["width"]
-
-
-def _white(record: RunRecord) -> float:
-    panorama = record["panorama"]
-    assert panorama is not None
-    return panorama["white_flux"]
+def _panorama(run: _Run) -> PanoramaRecord:
+    if (panorama := run.record["panorama"]) is None:
+        raise InputError(f"{run.folder} has no panorama; give runs with one")
+    return panorama
 
 
 def _picture(folder: Path) -> NDArray[np.uint8]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +12,19 @@ import typer
 from photonpano.api.command import command, json_lines, warn
 from photonpano.api.opened_run import opened_run
 from photonpano.context import Context, Progress, usual
-from photonpano.evaluation import Evaluation, ImageScore, PoseScore, evaluate_poses, has_poses
+from photonpano.evaluation import Evaluation, ImageScore, PoseScore, RotationScore, evaluate_poses, has_poses
 from photonpano.evaluation import evaluate as evaluate_folder
 from photonpano.geometry import Canvas
 from photonpano.merging.colour import composed
 from photonpano.merging.panorama import render
-from photonpano.pipeline.components import build_renderer
+from photonpano.pipeline.rendering import build_renderer
 from photonpano.protocols import Trajectory
 from photonpano.registry import Catalog
 from photonpano.text import columns
 from photonpano.threads import thread_count
 from photonpano.values import Panorama
 
-_FEW = 0.1  # if a smaller share of the positions lies within 3 expected errors, poses and truth hardly belong together
+_FEW = 0.1  # if fewer positions lie within 3 expected errors, the truth is probably of another capture
 
 
 def _score(run_folder: Path, truth: Path, **how: Any) -> Evaluation | PoseScore:
@@ -90,45 +91,22 @@ def evaluate(
 
 
 def _pose_data(score: PoseScore) -> dict[str, Any]:
-    return {
-        "ate_m": score.ate_m,
-        "ate_share": score.ate_share,
-        "rotation_deg": score.rotation_deg,
-        "turns_deg": score.turns_deg,
-        "rpe_frames": score.rpe_frames,
-        "rpe_m": score.rpe_m,
-        "rpe_deg": score.rpe_deg,
-        "located_share": score.located_share,
-        "within_std_shares": score.honest_shares,
-        "std_ratio": score.std_ratio,
-        "focal_error": score.focal_error,
-    }
+    found = {each.name: getattr(score, each.name) for each in fields(score) if each.name not in ("errors_m", "errors_deg")}
+    return {("within_std_shares" if name == "honest_shares" else name): value for name, value in found.items()}
 
 
 def _data(evaluation: Evaluation) -> dict[str, Any]:
     motion = evaluation.trajectory
     return {
-        "corner_error_px": {
-            "mean": motion.mean_px,
-            "median": motion.median_px,
-            "p95": motion.p95_px,
-            "max": motion.max_px,
-        },
+        "corner_error_px": {name: getattr(motion, f"{name}_px") for name in ("mean", "median", "p95", "max")},
         "located_share": motion.located_share,
         "within_three_std_share": evaluation.honest_share,
-        "rotation": _rotation(evaluation),
-        "panorama": _scores(evaluation.panorama),
-        "oracle": _scores(evaluation.oracle),
+        "rotation": _given(evaluation.rotation, "mean_deg", "max_deg", "focal_error"),
+        "panorama": _given(evaluation.panorama, "psnr_db", "ssim", "compared_share"),
+        "oracle": _given(evaluation.oracle, "psnr_db", "ssim", "compared_share"),
         "below_oracle_db": evaluation.below_oracle_db,
     }
 
 
-def _rotation(evaluation: Evaluation) -> dict[str, float] | None:
-    score = evaluation.rotation
-    if score is None:
-        return None
-    return {"mean_deg": score.mean_deg, "max_deg": score.max_deg, "focal_error": score.focal_error}
-
-
-def _scores(score: ImageScore | None) -> dict[str, float] | None:
-    return None if score is None else {"psnr_db": score.psnr_db, "ssim": score.ssim, "compared_share": score.compared_share}
+def _given(score: ImageScore | RotationScore | None, *names: str) -> dict[str, float] | None:
+    return None if score is None else {name: getattr(score, name) for name in names}

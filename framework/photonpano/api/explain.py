@@ -22,7 +22,7 @@ from photonpano.text import byte_size, counted, duration
 if TYPE_CHECKING:
     from photonpano.pipeline.forecast import Forecast  # imports numba, which only a forecast needs
 
-_DESCRIBED_LEVELS = 3  # how many levels are described when the number of levels is open
+_DESCRIBED_LEVELS = 3  # maximum number of levels described under `levels: until-converged`
 
 
 def forecast(plan: Plan) -> Forecast:

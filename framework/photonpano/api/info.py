@@ -23,9 +23,9 @@ from photonpano.text import columns, duration
 from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import CaptureSummary, StreamInfo
 
-HOT_SHARE = 0.001  # share of hot pixels above which the warnings recommend a mask
+HOT_SHARE = 0.001  # fraction of hot pixels above which a mask is recommended
 STANDING_SHARE = 0.5  # if more of the frame is static than this, `corrections: auto` masks nothing
-SATURATED_SHARE = 0.01  # share of pixels saturated in every frame above which the warnings recommend less light
+SATURATED_SHARE = 0.01  # fraction of pixels saturated in every frame above which less light is recommended
 
 
 @dataclass(frozen=True, slots=True)

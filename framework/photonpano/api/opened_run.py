@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,14 +34,9 @@ class OpenedRun:
     """A finished run, with its capture.
 
     Attributes:
-        folder: the run folder.
-        record: its run.json.
-        plan: of its spec.
-        capture: the capture, as its source and the corrections of the spec give it.
-        source: the same, divided by the vignette that the run found, in the light that it found, and through its lens.
-        vignette: by which it is divided.
+        capture: the capture, with the corrections of the spec.
+        source: the same, divided by the vignette, in the light and through the lens that the run found.
         motion: of every frame; where the run did not record `std_px`, it is 0.
-        has_std_px: whether the run recorded `std_px`.
     """
 
     folder: Path
@@ -61,17 +56,10 @@ def opened_run(
     changes: Sequence[str] = (),
     output: Path | None = None,
 ) -> Iterator[OpenedRun]:
-    """Open a finished run and its capture.
-
-    Args:
-        folder: the run folder.
-        catalog: what can be chosen; by default what the installed plugins offer.
-        changes: values of the recorded spec to change, such as `render.scale=2`.
-        output: the run folder of the changed spec.
+    """Open a finished run and its capture, with changes of its spec such as `render.scale=2`.
 
     Raises:
-        InputError: the folder is no run folder, its files are of several runs, its capture cannot be opened, or it is another
-            capture now.
+        InputError: the files are of several runs, or of none, or the capture cannot be opened or is another one now.
         SpecError: a change is wrong.
     """
     require_one_run(folder, ["trajectory.npz", "light.npz", "vignette.npz"])
@@ -91,19 +79,16 @@ def _capture(
     folder: Path, record: RunRecord, catalog: Catalog | None, changes: Sequence[str], output: Path | None
 ) -> Iterator[tuple[Plan, Source]]:
     """Open the capture of a run by the spec that the run recorded."""
-    try:
-        plan = parse_spec(record["spec"], name=str(folder / "run.json"), catalog=catalog, overrides=changes, output=output)
-        opened = open_source(plan)
-        source = opened.__enter__()
-    except SpecError as error:
-        if any(problem.override for problem in error.problems):
-            raise
-        problems = "; ".join(f"{problem.where}: {problem.message}" for problem in error.problems)
-        raise InputError(f"{folder}: the capture of this run cannot be opened by its recorded spec ({problems})") from error
-    try:
+    with ExitStack() as stack:
+        try:
+            plan = parse_spec(record["spec"], name=str(folder / "run.json"), catalog=catalog, overrides=changes, output=output)
+            source = stack.enter_context(open_source(plan))
+        except SpecError as error:
+            if any(problem.override for problem in error.problems):
+                raise
+            problems = "; ".join(f"{problem.where}: {problem.message}" for problem in error.problems)
+            raise InputError(f"{folder}: the capture of this run cannot be opened by its recorded spec ({problems})") from error
         yield plan, source
-    finally:
-        opened.__exit__(None, None, None)
 
 
 def _require_same_capture(folder: Path, run: RunTrajectory, stream: StreamInfo) -> None:

@@ -15,7 +15,8 @@ from photonpano.api.opened_run import OpenedRun, opened_run
 from photonpano.captures.fingerprint import capture_files, fingerprint
 from photonpano.context import Context, Progress, usual
 from photonpano.errors import InputError
-from photonpano.pipeline.rendering import Rendering, render_into
+from photonpano.merging.panorama import RenderedPanorama
+from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_folder import run_folder as writing_run_folder
 from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
 from photonpano.record.run_json import decision_records, panorama_record
@@ -23,6 +24,7 @@ from photonpano.record.schema import RunRecord
 from photonpano.registry import Catalog
 from photonpano.report.notebook import run_html
 from photonpano.threads import one_thread_inside, thread_count
+from photonpano.values import Decision
 
 # Sections of a spec that may differ from those of the run. That of the source tells where the capture is now.
 _SECTIONS = ("render", "output", "run", "source")
@@ -106,8 +108,8 @@ def render(
     ):
         require_same_plane(opened)
         context = Context(thread_count(opened.plan.run.threads), usual(progress))
-        rendering = render_into(written, opened.plan, opened.source, opened.vignette, opened.motion, context)
-        record = written.commit(_record(opened, rendering, time.perf_counter() - start))
+        rendered = render_into(written, opened.plan, opened.source, opened.vignette, opened.motion, context)
+        record = written.commit(_record(opened, *rendered, time.perf_counter() - start))
     return RenderResult(opened.plan.output.directory, record)
 
 
@@ -134,7 +136,7 @@ def require_same_plane(opened: OpenedRun) -> None:
         )
 
 
-def _record(opened: OpenedRun, rendering: Rendering, seconds: float) -> RunRecord:
+def _record(opened: OpenedRun, panorama: RenderedPanorama, chosen: Sequence[Decision], seconds: float) -> RunRecord:
     """Return the record of the run, with what was rendered again."""
     plan, old = opened.plan, opened.record
     before = [] if old["panorama"] is None else old["panorama"].get("decisions", [])
@@ -145,8 +147,8 @@ def _record(opened: OpenedRun, rendering: Rendering, seconds: float) -> RunRecor
         "spec": plan.document,
         "plugins": plugin_records(plan),
         "libraries": library_versions(plan),
-        "decisions": [*kept, *decision_records(rendering.decisions)],
-        "panorama": panorama_record(plan, rendering.panorama, rendering.decisions),
+        "decisions": [*kept, *decision_records(chosen)],
+        "panorama": panorama_record(plan, panorama, chosen),
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_memory_bytes(),
         "capture": fingerprint(plan, opened.capture),

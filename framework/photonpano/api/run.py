@@ -23,7 +23,7 @@ from photonpano.context import Progress
 from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
 from photonpano.pipeline.estimate import START
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
-from photonpano.record.schema import PanoramaRecord, RefinementRecord, RunRecord
+from photonpano.record.schema import PanoramaRecord, RunRecord
 from photonpano.report import LiveFigures
 from photonpano.specs import load_spec
 from photonpano.text import byte_size, counted, duration
@@ -45,8 +45,8 @@ def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
         if decision["what"] in (START, CUT, DARK_JUMP, REPEATED):
             yield f"{decision['what']:<9} {decision['value']}: {decision['reason']}"
     for refinement in record["refinements"]:
-        if refinement["rounds"]:
-            yield f"refined   {_correction(refinement)}"
+        if refinement["rounds"]:  # the first of them is the largest
+            yield f"refined   {refinement['change_px']:.2g} px on average by {refinement['use']}: {refinement['rounds'][0]}"
     if line := _range(record.get("panorama")):
         yield f"range     {line}"
     poses = record.get("poses")
@@ -154,8 +154,3 @@ def _range(panorama: PanoramaRecord | None) -> str:
     share = panorama.get("saturated_share", 0.0)
     saturated = f"; {100 * share:.2g} % of the pixels are saturated" if share else ""
     return f"{decibels:.0f} dB, of {measurable:.0f} dB that the frames over a pixel can measure{saturated}"
-
-
-def _correction(refinement: RefinementRecord) -> str:
-    """Describe a correction by its first round, which is the largest."""
-    return f"{refinement['change_px']:.2g} px on average by {refinement['use']}: {refinement['rounds'][0]}"

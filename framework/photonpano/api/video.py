@@ -16,13 +16,14 @@ from photonpano.api.opened_run import OpenedRun, opened_run
 from photonpano.api.render import require_harmless, require_same_plane
 from photonpano.captures.picture_files import counted, require_writable, write_pictures
 from photonpano.context import Progress, usual
-from photonpano.errors import ExtentError, InputError, ProjectionError
+from photonpano.errors import InputError
 from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
 from photonpano.motion.frame_motion import view_of
 from photonpano.pipeline.film import Film, merged
+from photonpano.pipeline.rendering import naming_key_of_canvas
 from photonpano.registry import Catalog
 from photonpano.text import byte_size
 from photonpano.threads import one_thread_inside, thread_count
@@ -179,7 +180,11 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
     plan, source, motion, recorded = opened.plan, opened.source, opened.motion, opened.record["panorama"]
     if recorded is None:
         raise InputError(f"{opened.folder}: the run made no panorama, and a video is as bright as that")
-    canvas = _canvas(opened) if view == "panorama" else _view_canvas(opened)
+    if view == "panorama":
+        canvas = _canvas(opened)
+    else:  # as large as a frame, or as a part of it
+        extent = "reference" if plan.render.extent == "panorama" else plan.render.extent
+        canvas = canvas_of_box(box_of(extent, motion.frame_shape), plan.render.scale)
     memory, bytes_per_pixel = int(plan.run.memory), (BYTES_PER_PIXEL + bytes_of_light(source)) * channels_of(source)
     if (needed := canvas.height * canvas.width * bytes_per_pixel) > memory:
         raise InputError(
@@ -205,14 +210,5 @@ def _canvas(opened: OpenedRun) -> Canvas:
     render, motion = opened.plan.render, opened.motion
     shown = motion.trajectory, motion.span, motion.frame_shape
     view = view_of(motion, opened.source, render.projection, level=render.horizon == "level")
-    try:
+    with naming_key_of_canvas(opened.plan):
         return plan_canvas(*shown, render.scale, int(opened.plan.run.memory), extent=render.extent, view=view)
-    except (ExtentError, ProjectionError) as error:
-        key = "render.extent" if isinstance(error, ExtentError) else "render.projection"
-        raise InputError(str(opened.plan.place(key).problem(str(error)))) from error
-
-
-def _view_canvas(opened: OpenedRun) -> Canvas:
-    """Return the canvas of the view of a frame, or of a part of it."""
-    render, extent = opened.plan.render, opened.plan.render.extent
-    return canvas_of_box(box_of("reference" if extent == "panorama" else extent, opened.motion.frame_shape), render.scale)

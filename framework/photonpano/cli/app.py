@@ -47,7 +47,8 @@ class _Commands(TyperGroup):
     def __init__(self, *, package: str = "photonpano.api", **options: Any) -> None:
         super().__init__(**options)
         folder = Path(api.__path__[0], *package.split(".")[2:])
-        for file in sorted(folder.glob("*.py"), key=lambda file: (_place(file.stem), file.stem)):
+        places = {name: place for place, name in enumerate(_FIRST)}
+        for file in sorted(folder.glob("*.py"), key=lambda file: (places.get(file.stem, len(places)), file.stem)):
             if "\n@command(" in file.read_text(encoding="utf-8"):
                 words = " ".join([*package.split(".")[2:], file.stem.replace("_", "-")])
                 self.add_command(_Command(words, f"{package}.{file.stem}", _first_line(file)))
@@ -61,10 +62,6 @@ class _Commands(TyperGroup):
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the parameters."""
         return with_verbosity(super().get_params(ctx))
-
-
-def _place(name: str) -> int:
-    return _FIRST.index(name) if name in _FIRST else len(_FIRST)
 
 
 def _first_line(file: Path) -> str:

@@ -21,9 +21,9 @@ from photonpano.atomic import discard_unfinished
 from photonpano.cli.errors import INTERRUPTED, SIGNALLED
 from photonpano.interrupts import interrupt
 
-GRACE_S = 1.2  # how long the main thread may take to clean up after a signal
-KILL_S = 1.7  # how long after a signal the guard kills the program
-_LEFT_S = 0.2  # how long threads that a plugin has left may go on once the work is done
+GRACE_S = 1.2  # time for the main thread to clean up after a signal
+KILL_S = 1.7  # time after a signal until the guard kills the program
+_LEFT_S = 0.2  # time for threads that a plugin has left running
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -100,12 +100,7 @@ def _clean_up() -> None:
 
 
 def _with_guard(numbers: int, to_write: int) -> int:
-    """Start the guard, and return the pipe on which it passes signals on.
-
-    Args:
-        numbers: the pipe of the numbers of signals; returned if no process can be started.
-        to_write: its other end.
-    """
+    """Start the guard, and return the pipe of signals that it passes on; `numbers` if no process can be started."""
     passed_on, to_pass = os.pipe()
     program = os.getpid()
     try:

@@ -21,15 +21,10 @@ INTERRUPTED = "\ninterrupted; no file is left half-written under its final name"
 
 @contextmanager
 def reported(*, debug: bool = False) -> Iterator[None]:
-    """Report the errors of a command; errors other than `PhotonpanoError` are defects and keep their traceback.
+    """Report the errors of a command as `typer.Exit`; others than `PhotonpanoError` are defects and keep their traceback.
 
-    Logged warnings, such as the exception of a plugin that watches runs, are printed.
-
-    Args:
-        debug: whether reported errors and warnings show their traceback as well.
-
-    Raises:
-        typer.Exit: with the exit code of the error.
+    Logged warnings, such as the exception of a plugin that watches runs, are printed. With `debug`, reported errors and
+    warnings show their traceback as well.
     """
     logger, handler = logging.getLogger("photonpano"), _Warnings(debug)
     logger.addHandler(handler)

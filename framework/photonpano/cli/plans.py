@@ -60,16 +60,9 @@ def capture_plan(
     corrections: Sequence[str] | None = None,
     catalog: Catalog | None = None,
 ) -> Iterator[Plan]:
-    """Make the plan of a capture that is given by its path, or by a spec.
+    """Make the plan of a capture that is given by its path or URL, or by a spec, whose corrections are replaced.
 
     Errors of the options, in making the plan and in the block, name the option instead of a key of a spec that nobody wrote.
-
-    Args:
-        path: the capture, which may be a URL, or a spec.
-        source: the source that reads it.
-        keys: its keys, such as `frame_rate_hz=96800`.
-        corrections: items of the spec's list of corrections, in YAML; they replace those of a spec.
-        catalog: what can be chosen; by default what the installed plugins offer.
 
     Raises:
         SpecError: the spec is wrong.

@@ -21,16 +21,12 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
 INTERVAL_S = 10.0  # time between two lines of progress
-_LEAST_S = 1.0  # how long a stage has gone on before it has a line
-_IN_NOTEBOOK = "JPY_PARENT_PID"  # set for commands of a notebook, whose terminal shows what moves a cursor as it is
+_LEAST_S = 1.0  # minimum age of a stage that is printed
+_IN_NOTEBOOK = "JPY_PARENT_PID"  # set in notebooks, whose terminal prints control characters
 
 
 def progress_for_stderr(*, notes: bool = False) -> Progress:
-    """Return bars for a terminal, lines for pipes, files and continuous integration, and nothing with `-q`.
-
-    Args:
-        notes: whether notes are printed without a terminal, too.
-    """
+    """Return bars for a terminal, nothing with `-q`, and lines elsewhere, which show notes only on request."""
     shown = _progress_for_stderr(notes or is_verbose())
     return Logged(shown) if is_logged() else shown
 
@@ -66,12 +62,7 @@ class Bars:
 
 
 class Lines:
-    """Prints a line every `INTERVAL_S`, with what is done and the time left. Short commands print none.
-
-    Args:
-        notes: whether notes are printed.
-        stages: whether each stage has a line when it is done.
-    """
+    """Prints a line every `INTERVAL_S` with progress and the time left; on request also notes, and stages when done."""
 
     def __init__(self, *, notes: bool = False, stages: bool = False) -> None:
         self._notes, self._stages = notes, stages

@@ -22,8 +22,8 @@ from photonpano.cli.plans import PLANS, plan_of
 from photonpano.cli.verbosity import verbosity_of, with_verbosity
 
 SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
-_GIVEN = {"plan", "progress", "catalog", "resumed"}  # parameters that no option gives
-# How parameters are given that several commands have
+_GIVEN = {"plan", "progress", "catalog", "resumed"}  # parameters without an option
+# Options and arguments that several commands have
 _USUAL: dict[str, Any] = {
     "run_folder": typer.Argument(metavar="RUN", help="A run folder."),
     "output": typer.Option("--output", "-o", metavar="DIR"),
@@ -48,12 +48,7 @@ class LoadedCommand(TyperCommand):
 
 
 def loaded(words: str, module: str) -> Any:
-    """Import the module of a command, and return the command.
-
-    Args:
-        words: its name, such as `plugins list`.
-        module: that declares it.
-    """
+    """Import the module of a command such as `plugins list`, and return the command."""
     importlib.import_module(module)
     declared = COMMANDS[module]
     text, _ = _documented(declared.function)

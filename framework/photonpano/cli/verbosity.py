@@ -8,6 +8,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +17,7 @@ import typer
 from photonpano import __version__
 
 logger = logging.getLogger("photonpano")
-SHOWN = f"{__name__}.shown"  # the logger of what is on the screen already, such as progress: for the log file alone
+SHOWN = f"{__name__}.shown"  # logger of messages that are on the screen already, for the log file alone
 _VERBOSE, _QUIET, _LOG = "verbose", "quiet", "log"
 _chosen: set[str] = set()
 
@@ -49,11 +50,7 @@ def with_verbosity(parameters: list[Any]) -> list[Any]:
 
 @contextmanager
 def verbosity_of(ctx: Any) -> Iterator[None]:
-    """Say as much as the options want, until the command ends.
-
-    Raises:
-        typer.BadParameter: both -v and -q are given, or the log cannot be written.
-    """
+    """Say as much as the options want, until the command ends; `typer.BadParameter` if they are wrong."""
     wanted: dict[str, Any] = ctx.meta.get(__name__, {})
     if {_VERBOSE, _QUIET} <= wanted.keys():
         raise typer.BadParameter("give one of them", param_hint="'-v' and '-q'")
@@ -124,32 +121,15 @@ class _LogFile(logging.FileHandler):
             self._failed = True
 
 
+_MORE = "Say more on standard error: each decision with its reason and, without a terminal, each stage with its time."
+_TO_FILE = "Append stages, decisions, warnings and errors to a file, each with its time."
+_option = partial(typer.Option, callback=_keep, expose_value=False)
+
+
 def _options(
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose",
-            "-v",
-            callback=_keep,
-            expose_value=False,
-            help="Say more on standard error: each decision with its reason and, without a terminal, each stage with its time.",
-        ),
-    ] = False,
-    quiet: Annotated[
-        bool,
-        typer.Option("--quiet", "-q", callback=_keep, expose_value=False, help="Say only results, warnings and errors."),
-    ] = False,
-    log: Annotated[
-        Path | None,
-        typer.Option(
-            "--log",
-            metavar="FILE",
-            callback=_keep,
-            expose_value=False,
-            help="Append stages, decisions, warnings and errors to a file, each with its time.",
-            show_default=False,
-        ),
-    ] = None,
+    verbose: Annotated[bool, _option("--verbose", "-v", help=_MORE)] = False,
+    quiet: Annotated[bool, _option("--quiet", "-q", help="Say only results, warnings and errors.")] = False,
+    log: Annotated[Path | None, _option("--log", metavar="FILE", help=_TO_FILE, show_default=False)] = None,
 ) -> None:
     """Carry the options."""
 

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 from photonpano.geometry import corners, jacobian
 from photonpano.values import FluxImage, Homography, Response
 
-_NOISELESS = 1e9
-"""Number of frames for which photon noise is negligible."""
+_NOISELESS = 1e9  # number of frames for which photon noise is negligible
 
 
 def pair_bound_px(flux: FluxImage, response: Response, first_frames: ArrayLike, second_frames: ArrayLike) -> float:
@@ -33,13 +32,7 @@ def pair_bound_px(flux: FluxImage, response: Response, first_frames: ArrayLike, 
 
 
 def exposure_bound_px(flux: FluxImage, response: Response, frames: ArrayLike) -> float:
-    """Return the Cramer-Rao bound of registration of one exposure with a known scene, in px: see `pair_bound_px`.
-
-    Args:
-        flux: (H, W) true flux in the exposure, photons per pixel per frame.
-        response: the camera's response.
-        frames: number of frames in which the exposure saw a pixel: one for all, or (H, W).
-    """
+    """Return the Cramer-Rao bound of registration of one exposure with a known scene, in px: see `pair_bound_px`."""
     return _corner_std_px(flux, response, _variance(frames, response))
 
 

@@ -1,4 +1,4 @@
-"""Compare runs of one capture: how far their motions differ, and their panoramas on one canvas."""
+"""Compare runs of one capture: the difference of their motions, and their panoramas on one canvas."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from photonpano.geometry import Canvas, inverse, rescaling
 from photonpano.photometry import srgb_to_linear, tone_mapped
 from photonpano.values import FloatArray, Homography
 
-_ROUNDING_PX = 1e-6
-"""Smaller differences come from rounding: motions that are the same differ by 1e-14 px."""
+_ROUNDING_PX = 1e-6  # smaller differences are rounding errors: equal motions differ by 1e-14 px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,8 +22,8 @@ class MotionDifference:
     """How far a motion is from another one of the same frames.
 
     Attributes:
-        corners_px: (T,) mean distance of the corners of a frame, in px of a frame; 0 for the same motion, NaN where either
-            has not located it.
+        corners_px: (T,) mean distance of the corners of a frame, in px of a frame; 0 for the same motion, NaN where either has
+            not located it.
         alignment: (3, 3), pixels of the reference plane to pixels of that of the other motion.
     """
 
@@ -33,12 +32,7 @@ class MotionDifference:
 
 
 def motion_difference(run: RunTrajectory, other: RunTrajectory) -> MotionDifference | None:
-    """Compare two motions after the best alignment of their planes; None if no frame is located in both.
-
-    Args:
-        run: the motion.
-        other: the one that it is compared with; of the same frames.
-    """
+    """Compare two motions of the same frames after the best alignment of their planes; None if no frame is located in both."""
     both = run.located & other.located
     if not both.any():
         return None
@@ -53,14 +47,10 @@ def motion_difference(run: RunTrajectory, other: RunTrajectory) -> MotionDiffere
 def on_canvas(
     picture: NDArray[np.uint8], canvas: Canvas, alignment: Homography, common: Canvas, whites: tuple[float, float] | None
 ) -> NDArray[np.uint8]:
-    """Return a panorama's picture on the canvas of another one.
+    """Return a panorama's picture, (h, w) or (h, w, 3), on the `common` canvas.
 
-    Args:
-        picture: (h, w) or (h, w, 3), the panorama, which may be smaller than its canvas.
-        canvas: of the panorama.
-        alignment: (3, 3), pixels of its reference plane to pixels of that of the common canvas.
-        common: the canvas.
-        whites: flux that is white in the picture, and in the result; None keeps the levels.
+    The picture may be smaller than its canvas. The alignment is (3, 3), pixels of its reference plane to pixels of that of the
+    common canvas. `whites` are the flux that is white in the picture, and in the result; None keeps the levels.
     """
     (p, s), (q, r) = common.columns(), common.rows()
     rays = np.stack([np.outer(r, p), np.broadcast_to(q[:, None], common.shape), np.outer(r, s)], axis=-1)

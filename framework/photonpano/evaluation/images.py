@@ -12,16 +12,14 @@ from photonpano.geometry import Canvas
 from photonpano.photometry import linear_to_srgb
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
+# Quantile of the true scene that is white: the maximum may be a lamp, which would darken everything else.
 WHITE_QUANTILE = 0.999
-"""Quantile of the true scene that becomes white. The maximum may be a lamp, which would darken everything else."""
 
-MIN_COVERAGE = 0.05
-"""Pixels are compared if their coverage is at least this share of the median coverage of the seen pixels."""
+MIN_COVERAGE = 0.05  # minimum coverage of compared pixels, relative to the median coverage of the seen pixels
 
 _SSIM_SIGMA = 1.5
 _SSIM_RADIUS = 5
-_ROWS = 256
-"""Rows of the true scene that are sampled at a time, which bounds the memory of the coordinates."""
+_ROWS = 256  # rows of the true scene sampled at a time, to bound the memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +28,8 @@ class ImageScore:
 
     Attributes:
         psnr_db: peak signal-to-noise ratio, `-10 log10(mean squared difference)`; infinite for equal images.
-        ssim: mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 px) over the pixels whose whole window
-            is compared; NaN if there is none.
-        compared_share: share of the compared pixels, 0 to 1.
+        ssim: mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 px) over the pixels whose whole window is
+            compared; NaN if there is none.
     """
 
     psnr_db: float
@@ -43,8 +40,7 @@ class ImageScore:
 def covered(weight: FluxImage) -> BoolArray:
     """Return which pixels were seen in enough frames to be compared, (H, W): see `MIN_COVERAGE`.
 
-    Args:
-        weight: (H, W), number of frames in which each pixel was seen; of (H, W, 3), the sum over the colours counts.
+    The weight is the number of frames in which each pixel was seen; of (H, W, 3), the sum over the colours counts.
     """
     weight = weight if weight.ndim == 2 else weight.sum(axis=-1)
     seen = weight > 0
@@ -60,22 +56,15 @@ def known(image: FluxImage) -> BoolArray:
 
 
 def white_flux(scene: FluxImage) -> float:
-    """Return the flux that becomes white in a comparison: see `WHITE_QUANTILE`.
-
-    Args:
-        scene: (H, W) or (H, W, 3), true flux; NaN where unknown.
-    """
+    """Return the flux that becomes white in a comparison, of a scene that is NaN where unknown: see `WHITE_QUANTILE`."""
     return float(np.nanquantile(scene, WHITE_QUANTILE))
 
 
 def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, white: float) -> ImageScore:
-    """Compare a panorama with the truth.
+    """Compare a panorama with the truth on the same pixels: flux, (H, W), or (H, W, 3), of which all colours count alike.
 
-    Args:
-        panorama: (H, W), flux; or (H, W, 3), of which all colours count alike.
-        truth: true flux on the same pixels, of the same shape.
-        compared: (H, W), the pixels to compare; those where either image is not finite, in any colour, are left out.
-        white: the flux that becomes 1 in sRGB, such as `white_flux` of the true scene. Brighter pixels are clipped to it.
+    Pixels of `compared`, (H, W), where either image is not finite in any colour are left out. Flux brighter than `white`, such
+    as the `white_flux` of the true scene, is clipped to it.
 
     Raises:
         ValueError: no pixel is compared, or white is not positive.
@@ -119,19 +108,18 @@ def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography, aroun
 
     A scene that is finer than the canvas is averaged over the areas of its pixels, rounded to whole pixels of the scene.
 
-    Args:
-        scene: (H, W), true flux on the true plane; or (H, W, 3).
-        canvas: the pixel grid of the panorama, which shows the estimated reference plane.
-        alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
-        around: (3, 3), the matrix of the camera to whose pixels the alignment maps, if the scene is an equirectangular
-            panorama, 360 degrees wide, whose middle that camera looks at.
+    The alignment is (3, 3), pixels of the estimated reference plane to pixels of the true plane. `around` is (3, 3), the matrix
+    of the camera to whose pixels the alignment maps, if the scene is an equirectangular panorama, 360 degrees wide, whose
+    middle that camera looks at.
     """
     from scipy.ndimage import map_coordinates
 
     shape = scene.shape
     side = _pixels_along(canvas, alignment, around, shape)
     margin = side if around is not None else 0
-    scene, offset = _averaged(_wrapped(scene, margin), side)
+    if margin:  # the scene goes on all around
+        scene = np.concatenate([scene[:, -margin:], scene, scene[:, :margin]], axis=1)
+    scene, offset = _averaged(scene, side)
     image = np.empty((*canvas.shape, *shape[2:]), dtype=np.float32)
     for top in range(0, canvas.height, _ROWS):
         part = canvas.part(0, top, min(_ROWS, canvas.height - top), canvas.width)
@@ -165,11 +153,6 @@ def _pixels_along(canvas: Canvas, alignment: Homography, around: FloatArray | No
     (a, b), (c, d) = right - here, below - here
     area = abs(a * d - b * c)
     return max(1, round(float(np.sqrt(area)))) if np.isfinite(area) else 1
-
-
-def _wrapped(scene: FluxImage, margin: int) -> FluxImage:
-    """Continue a scene all around by columns at both ends."""
-    return np.concatenate([scene[:, -margin:], scene, scene[:, :margin]], axis=1) if margin else scene
 
 
 def _averaged(scene: FluxImage, side: int) -> tuple[FluxImage, float]:

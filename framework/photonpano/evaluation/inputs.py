@@ -27,11 +27,9 @@ class Truth:
 
     Attributes:
         homographies: (T, 3, 3), frame pixels to pixels of the scene; exact at the corners of the frame if the lens distorts.
-        frame_shape: (height, width) of a frame.
         scene: (H, W) float32, photons per pixel per frame; (H, W, 3) of red, green and blue pixels; None if only the motion is
             known.
         ideal_homographies: (T, 3, 3), those of a lens without distortion.
-        turn: rotations and camera; None if they are not known.
         around: whether the scene is an equirectangular panorama, 360 degrees wide; homographies then map to pixels of the
             camera that looks at its middle.
     """
@@ -98,14 +96,10 @@ class RunTrajectory:
 
 
 def load_truth(path: Path) -> Truth:
-    """Read the truth of a simulated capture.
+    """Read the truth of a simulated capture; `InputError` if the file is no such archive.
 
-    Args:
-        path: an `.npz` archive of `homographies`, `frame_shape` and, for image scores, `scene`. If the lens distorts,
-            `homographies` are those of an ideal lens, and `undistorted_corners` (4, 2) are its pixels of the frame's corners.
-
-    Raises:
-        InputError: the file is missing, is no such archive, lacks an array, or contains one of another shape or type.
+    The file is an `.npz` archive of `homographies`, `frame_shape` and, for image scores, `scene`. If the lens distorts,
+    `homographies` are those of an ideal lens, and `undistorted_corners` (4, 2) are its pixels of the frame's corners.
     """
     optional = ("scene", "undistorted_corners", "rotations", "camera_matrix", "distortion")
     if set(read_arrays(path, _TRUTH, ("camera_from_world", "homographies"))) == {"camera_from_world"}:
@@ -126,14 +120,9 @@ def load_truth(path: Path) -> Truth:
 
 
 def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajectory:
-    """Read the trajectory of a run folder.
+    """Read the trajectory of a run folder; `InputError` if the file is missing or damaged.
 
-    Args:
-        folder: the run folder.
-        needs_std_px: whether the expected error must be there; runs of older versions lack it, and it is NaN then.
-
-    Raises:
-        InputError: the file is missing or damaged.
+    Runs of older versions lack the expected error: it is NaN then, unless it is needed.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; give the run folder that `photonpano run` wrote")
@@ -281,19 +270,14 @@ def _frame_shape(path: Path, arrays: Mapping[str, NDArray[Any]]) -> tuple[int, i
 
 
 _MAX_POINTS = 500
-_MAX_SIDE = 100
-"""Longer side of a drawing, in sides of a frame; of a camera that turns further, the plane shows no path."""
+_MAX_SIDE = 100  # maximum longer side of a drawing, in sides of a frame; a camera that rotates further leaves the plane
 
 
 def drawn_path(homographies: FloatArray, frame_shape: tuple[int, int]) -> str:
     """Return the path of the middle of the frame over the reference plane, with the outlines of the first and last frame.
 
-    Args:
-        homographies: (N, 3, 3) of the located frames, frame pixels to reference pixels.
-        frame_shape: (height, width) of a frame.
-
-    Returns:
-        An SVG element, which takes the colour of the text around it; empty where the path goes out of the plane.
+    The homographies are (N, 3, 3) of the located frames. The SVG element takes the colour of the text around it; it is empty
+    where the path goes out of the plane.
     """
     if not len(homographies):
         return ""

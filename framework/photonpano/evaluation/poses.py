@@ -6,22 +6,112 @@ trajectory error (ATE) after the best similarity (Umeyama 1991), and the relativ
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.evaluation.pose_inputs import load_run_poses, load_true_poses
-from photonpano.geometry import nearest_rotations, rotation_vectors
+from photonpano.geometry import Camera, nearest_rotations, rotation_vectors
 from photonpano.notebooks import facts
 from photonpano.poses import centres
+from photonpano.reading import read_arrays
 from photonpano.record.contents import require_one_run
 from photonpano.values import BoolArray, FloatArray
 
-_RPE_SHARE = 0.01
-"""The relative error is that over this share of the frames."""
+POSES = "poses.npz"
+_ORTHONORMAL = 1e-3  # maximum deviation of R R^T from the identity in a pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunPoses:
+    """Content of `poses.npz` in a run folder.
+
+    Poses are (T, 3, 4), NaN where a frame is not located. The expected errors, (T,), are those in a world where the path has
+    the length 1.
+    """
+
+    camera: Camera
+    camera_from_world: FloatArray
+    located: BoolArray
+    std_position: FloatArray
+    std_rotation_deg: FloatArray
+    frame_shape: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruePoses:
+    """True poses of a capture, (T, 3, 4) in m, and its focal length; None if it is not known."""
+
+    camera_from_world: FloatArray
+    focal_px: float | None = None
+
+
+def has_poses(folder: Path) -> bool:
+    """Return whether a run folder is that of a run with `pose`."""
+    return (folder / POSES).exists()
+
+
+def load_run_poses(folder: Path) -> RunPoses:
+    """Read the poses of a run folder; `InputError` if the file is missing or damaged."""
+    path = folder / POSES
+    if not path.exists():
+        raise InputError(f"{folder} has no {POSES}; give the folder of a finished run with `pose`")
+    arrays = read_arrays(path, "the poses of a run")
+    per_frame = ("located", "std_position", "std_rotation_deg")
+    poses = _poses(path, arrays, ("camera_matrix", "distortion", "frame_shape", *per_frame))
+    for name in per_frame:
+        if arrays[name].shape != (len(poses),):
+            raise InputError(f"{path}: {name} must have a number for each of {len(poses)} frames, got {arrays[name].shape}")
+    located = arrays["located"].astype(bool)
+    _require_rigid(path, poses[located])
+    matrix, distortion = (arrays[name].astype(np.float64) for name in ("camera_matrix", "distortion"))
+    if matrix.shape != (3, 3) or distortion.shape != (4,) or arrays["frame_shape"].shape != (2,):
+        raise InputError(f"{path}: camera_matrix must be (3, 3), distortion (4,) and frame_shape (2,); run the spec again")
+    height, width = (int(side) for side in arrays["frame_shape"])
+    std_position, std_rotation_deg = (arrays[name].astype(np.float64) for name in per_frame[1:])
+    return RunPoses(Camera(matrix, distortion), poses, located, std_position, std_rotation_deg, (height, width))
+
+
+def load_true_poses(path: Path) -> TruePoses:
+    """Read an `.npz` archive of `camera_from_world` (T, 3, 4) in m, and if it is known `camera_matrix` (3, 3).
+
+    Raises `InputError` if the file is no such archive, or has no poses.
+    """
+    arrays = read_arrays(path, "a truth with poses")
+    if "camera_from_world" not in arrays and "homographies" in arrays:
+        raise InputError(
+            f"{path} has homographies and no poses (camera_from_world): it is the truth of a flat scene, or of a camera that "
+            "turns, and scores runs without `pose`"
+        )
+    poses = _poses(path, arrays)
+    _require_rigid(path, poses)
+    matrix = arrays.get("camera_matrix")
+    return TruePoses(poses, None if matrix is None or matrix.shape != (3, 3) else float(matrix[0, 0]))
+
+
+def _poses(path: Path, arrays: Mapping[str, NDArray[Any]], others: tuple[str, ...] = ()) -> FloatArray:
+    missing = [name for name in ("camera_from_world", *others) if name not in arrays]
+    if missing:
+        held = ", ".join(name or "an array without a name" for name in arrays) or "nothing"
+        raise InputError(f"{path} lacks {' and '.join(missing)}; it contains {held}")
+    poses = arrays["camera_from_world"]
+    if poses.ndim != 3 or poses.shape[1:] != (3, 4) or not len(poses) or poses.dtype.kind not in "fiu":
+        raise InputError(f"{path}: camera_from_world must be numbers of the shape (frames, 3, 4), got {poses.shape}")
+    return poses.astype(np.float64)
+
+
+def _require_rigid(path: Path, poses: FloatArray) -> None:
+    rotations = poses[:, :, :3]
+    off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(initial=0)
+    if not np.isfinite(poses).all() or not off < _ORTHONORMAL or not (np.linalg.det(rotations) > 0).all():
+        raise InputError(f"{path}: camera_from_world must be finite rotations and translations")
+
+
+_RPE_SHARE = 0.01  # step of the relative error, as a fraction of the frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,17 +204,10 @@ def evaluate_poses(run_folder: Path | str, truth: Path | str, rpe_frames: int | 
 def pose_errors(
     found: FloatArray, true: FloatArray, located: BoolArray, rpe_frames: int, std_position: FloatArray | None = None
 ) -> PoseScore:
-    """Score poses against the true ones.
+    """Score poses (T, 3, 4), world to camera, of a world of any scale against the true ones in m, at the `located` frames.
 
-    Args:
-        found: (T, 3, 4), world to camera, in a world of any scale.
-        true: (T, 3, 4), in m.
-        located: (T,) the frames to compare.
-        rpe_frames: frames over which the relative error is taken, for every pair of located frames that are so far apart.
-        std_position: (T,) expected errors of the positions, in units of the found world; None or not finite if not known.
-
-    Raises:
-        ValueError: fewer than three located frames, or their true or found positions are all the same.
+    The relative error is that of every pair of located frames that are `rpe_frames` apart. `std_position` is (T,), in units of
+    the found world; None or not finite if not known. Raises `ValueError` for positions that cannot be aligned.
     """
     scale, rotation, shift = align_positions(centres(found[located]), centres(true[located]))
     aligned = np.full((len(found), 3, 4), np.nan)
@@ -141,14 +224,16 @@ def pose_errors(
         one, two, three = (float((errors_m[located] <= times * std_m).mean()) for times in (1, 2, 3))
         shares, ratio = (one, two, three), ate_m / _rms(std_m)
     first = np.flatnonzero(located[:-rpe_frames] & located[rpe_frames:])
-    apart = _relative(_relative_of(true, first, rpe_frames), _relative_of(aligned, first, rpe_frames)) if len(first) else None
+    steps = (_relative(poses[first], poses[first + rpe_frames]) for poses in (true, aligned))
+    apart = _relative(*steps) if len(first) else None
+    worlds = np.swapaxes(true[located, :, :3], 1, 2) @ found[located, :, :3]
     return PoseScore(
         errors_m=errors_m,
         errors_deg=errors_deg,
         ate_m=ate_m,
         ate_share=ate_m / path_m,
         rotation_deg=_rms(errors_deg[located]),
-        turns_deg=_turns_deg(found[located, :, :3], true[located, :, :3]),
+        turns_deg=_rms(_angles(worlds @ nearest_rotations(worlds.sum(axis=0)).T)),
         rpe_frames=rpe_frames,
         rpe_m=None if apart is None else _rms(np.linalg.norm(apart[:, :, 3], axis=1)),
         rpe_deg=None if apart is None else _rms(_angles(apart[:, :, :3])),
@@ -161,8 +246,7 @@ def pose_errors(
 def align_positions(found: FloatArray, true: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """Return scale, rotation and shift that bring (N, 3) found positions nearest to the true ones (Umeyama 1991).
 
-    Raises:
-        ValueError: there are fewer than three positions, or they are all the same.
+    Raises `ValueError` if there are fewer than three positions, or they are all the same.
     """
     if len(found) < 3:
         raise ValueError(f"{len(found)} located frames; at least 3 are needed to align two worlds")
@@ -175,16 +259,6 @@ def align_positions(found: FloatArray, true: FloatArray) -> tuple[float, FloatAr
     rotation = (left * signs) @ right
     scale = float((strengths * signs).sum() / (here**2).sum())
     return scale, rotation, middles[1] - scale * rotation @ middles[0]
-
-
-def _turns_deg(found: FloatArray, true: FloatArray) -> float:
-    worlds = np.swapaxes(true, 1, 2) @ found
-    return _rms(_angles(worlds @ nearest_rotations(worlds.sum(axis=0)).T))
-
-
-def _relative_of(poses: FloatArray, first: NDArray[np.intp], frames: int) -> FloatArray:
-    """Return the motions from some frames to those that follow by some frames: (N, 3, 4)."""
-    return _relative(poses[first], poses[first + frames])
 
 
 def _relative(one: FloatArray, other: FloatArray) -> FloatArray:

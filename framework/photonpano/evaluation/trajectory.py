@@ -19,13 +19,8 @@ class TrajectoryScore:
 
     Attributes:
         errors_px: (T,) error of every frame, located or not.
-        located: (T,) true for located frames.
         alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
-        mean_px: mean error.
-        median_px: median error.
         p95_px: 95 % quantile of the errors.
-        max_px: largest error.
-        located_share: share of the located frames, 0 to 1.
     """
 
     errors_px: FloatArray
@@ -47,15 +42,11 @@ def corner_errors(
 ) -> TrajectoryScore:
     """Score a trajectory against the true one.
 
-    Convention:
-        Homographies map pixels of a frame to pixels of a plane; points are (x, y), integers are pixel centres.
+    Convention: Homographies, (T, 3, 3), map pixels of a frame to pixels of a plane; points are (x, y), integers are pixel
+    centres.
 
-    Args:
-        estimated: (T, 3, 3), frame pixels to pixels of the estimated reference plane.
-        true: (T, 3, 3), frame pixels to pixels of the true plane.
-        frame_shape: (height, width) of a frame.
-        located: (T,) the frames to compare, and to which the planes are aligned; all by default.
-        start: (3, 3) near the alignment; needed where a camera turns too far for one plane.
+    Only `located` frames, (T,), are compared, and the planes aligned to them; by default all. Where a camera turns too far for
+    one plane, the alignment needs a `start` near it.
 
     Raises:
         ValueError: the trajectories differ in length, or no frame is located.
@@ -81,12 +72,7 @@ def corner_errors(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turn:
-    """The motion of a camera that only turns.
-
-    Attributes:
-        rotations: (T, 3, 3), directions of each frame's camera to those of one camera.
-        camera: of all frames.
-    """
+    """The motion of a camera that only rotates: (T, 3, 3) rotations from the directions of frames to those of one camera."""
 
     rotations: FloatArray
     camera: Camera
@@ -96,13 +82,8 @@ class Turn:
 class RotationScore:
     """Errors of rotations after the best common rotation, and of the focal length.
 
-    Statistics are over the located frames.
-
-    Attributes:
-        errors_deg: (T,) angle between the true and the estimated rotation of every frame, located or not.
-        mean_deg: mean error.
-        max_deg: largest error.
-        focal_error: error of the focal length, relative to the true one; above 0 if the estimate is too long.
+    Statistics are over the located frames. `errors_deg`, (T,), is the angle between the true and the estimated rotation of
+    every frame. `focal_error` is relative, above 0 if the estimate is too long.
     """
 
     errors_deg: FloatArray
@@ -112,13 +93,7 @@ class RotationScore:
 
 
 def rotation_errors(estimated: Turn, true: Turn, located: BoolArray) -> RotationScore:
-    """Score the rotations of a run and its camera.
-
-    Args:
-        estimated: found by the run, T frames.
-        true: of the same frames.
-        located: (T,) the frames to compare.
-    """
+    """Score the rotations of a run and its camera at the located frames, (T,)."""
     common = align_rotations(estimated.rotations[located], true.rotations[located])
     between = np.swapaxes(true.rotations, -1, -2) @ common @ estimated.rotations
     errors_deg = np.rad2deg(np.linalg.norm(rotation_vectors(between), axis=-1))
@@ -133,11 +108,7 @@ def rotation_errors(estimated: Turn, true: Turn, located: BoolArray) -> Rotation
 def turned_alignment(estimated: Turn, true: Turn, true_homographies: FloatArray, located: BoolArray) -> FloatArray:
     """Return about which homography maps the reference plane of a run to the true plane: (3, 3), of positive determinant.
 
-    Args:
-        estimated: found by the run, T frames.
-        true: of the same frames.
-        true_homographies: (T, 3, 3), ideal pixels of a frame to the true plane: P R K^-1 with the same P for all frames.
-        located: (T,) the frames to compare.
+    The true homographies are (T, 3, 3), ideal pixels of a frame to the true plane: P R K^-1 with the same P for all frames.
     """
     common = align_rotations(estimated.rotations[located], true.rotations[located])
     to_plane = true_homographies[0] @ true.camera.matrix @ true.rotations[0].T

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import importlib.util
-import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.capture import Capture, capture_of, part_of
 from photonpano.contracts.loop import require_groups
 from photonpano.contracts.rules import attributing, shown
 from photonpano.contributions import (
     ExecutorContext,
-    ExporterContribution,
     PartOfCapture,
-    RendererContribution,
     SourceContext,
     StageContext,
     install_command,
@@ -32,31 +29,19 @@ from photonpano.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
-from photonpano.threads import InOrder, in_order, thread_count
+from photonpano.threads import in_order, thread_count
 from photonpano.values import CaptureSummary, Decision, FrameSpan, Group, StreamInfo
 
-if TYPE_CHECKING:
-    from photonpano.pipeline.exports import AttributedExporter
-    from photonpano.pipeline.renderers import AttributedRenderer
-    from photonpano.residuals.refinement import NamedRefiner
-
-logger = logging.getLogger(__name__)
-
 HALVED_LEVELS = 2  # with `scale: auto`, the first two levels are located at half size
-LARGE_FRAME_PX = 192  # frames whose shorter side is below this are not halved: the pyramids of locators need pixels
+LARGE_FRAME_PX = 192  # minimum shorter side of frames located at half size: the pyramids of locators need pixels
 
 
 @contextmanager
 def open_source(plan: Plan, look: bool = True) -> Iterator[Capture]:
     """Open the capture of a plan, and check the stages against it. With `corrections: auto`, what stands still is masked.
 
-    Args:
-        plan: the plan.
-        look: whether corrections may read frames. If not, what depends on frames is left out.
-
-    Raises:
-        InputError: the capture cannot be used as it is.
-        SpecError: a stage does not suit it, or it is grey and the spec balances its colours.
+    Without `look`, no frame is read, and corrections that depend on frames are left out. Errors are those of `build_source`,
+    and `SpecError` if a stage does not suit the capture.
     """
     with build_source(plan, look) as opened:
         capture = without_still_pixels(opened, look) if plan.corrects_itself else opened
@@ -65,15 +50,9 @@ def open_source(plan: Plan, look: bool = True) -> Iterator[Capture]:
 
 
 def require_suitable(plan: Plan, capture: Capture, info: StreamInfo) -> None:
-    """Check the stages of a plan against its capture.
+    """Raise `SpecError` if a stage does not suit a capture, or it is grey and the spec balances its colours.
 
-    Args:
-        plan: the plan.
-        capture: the capture.
-        info: its frames, which may be more than those that are there.
-
-    Raises:
-        SpecError: a stage does not suit it, or it is grey and the spec balances its colours.
+    `info` describes the frames that the capture will have, which may be more than those that are there.
     """
     problems = check_stream(plan, info)
     if plan.render.white_balance != "none" and capture.colour is None:
@@ -104,11 +83,7 @@ def build_source(plan: Plan, look: bool = True) -> Capture:
 
 
 def with_corrections(plan: Plan, capture: Capture, look: bool = True) -> Capture:
-    """Return a capture with the corrections of a plan.
-
-    Raises:
-        SpecError: a correction does not suit the capture, or its file is not what it should be; the capture is closed.
-    """
+    """Return a capture with the corrections of a plan; it is closed if one of them raises `SpecError`."""
     if not plan.corrections:
         return capture
 
@@ -137,20 +112,14 @@ def _part(plan: Plan, capture: Capture) -> Capture:
 
 
 def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:
-    """Build the components of all levels. Levels that choose the same component with the same config share one.
-
-    Args:
-        plan: which components.
-        source: the capture.
-        decisions: receives the decisions that components take from the capture while they work, such as a group size.
-    """
+    """Build the components of all levels; those with the same config are shared. `decisions` receives their choices."""
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     light = light_of(source)
     period = 1 / light.frequency if light is not None and light.frequency else None
     capture = _Once(lambda: replace(summarise(source, thread_count(plan.run.threads)), period_frames=period))
     recorder = Recorder(decisions)
-    context = _stage_context(plan, source, recorder, capture)
+    context = stage_context(plan, source, recorder, capture)
     made: list[tuple[Choice, Any]] = []
 
     def component(choice: Choice) -> Any:
@@ -178,91 +147,21 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
     )
 
 
-def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
-    """Build the refiners of a plan, in order.
-
-    Args:
-        plan: which refiners.
-        source: the capture.
-        decisions: receives the decisions that they take.
-    """
-    from photonpano.residuals.refinement import NamedRefiner  # imports OpenCV, which is not needed to check a spec
-
-    context = _stage_context(plan, source, Recorder(decisions))
-    return tuple(NamedRefiner(choice.contribution.name, built(choice, context), choice.label) for choice in plan.refine)
-
-
-def build_renderer(
-    plan: Plan, source: Source, decisions: list[Decision], in_order: InOrder | None = None
-) -> AttributedRenderer:
-    """Build the renderer of a plan.
-
-    Args:
-        plan: which renderer.
-        source: the capture.
-        decisions: receives the decisions that it takes.
-        in_order: works on parts of the panorama at once; by default, threads do.
-    """
-    from photonpano.pipeline.renderers import AttributedRenderer  # imports OpenCV, which is not needed to check a spec
-
-    choice, contribution = plan.renderer, plan.renderer.contribution
-    context = _stage_context(plan, source, Recorder(decisions))
-    if in_order is not None:
-        context = replace(context, in_order=in_order)
-    assert isinstance(contribution, RendererContribution)
-    if light_of(source) is not None and not contribution.divides_by_light:
-        logger.warning(
-            f"{choice.label} does not divide by the light, which changes: the panorama shows each place in the mean light of "
-            "the frames that saw it; render with {use: merge} to divide by it"
-        )
-    any_canvas = contribution.renders_on_any_canvas
-    return AttributedRenderer(built(choice, context), choice.label, contribution.bytes_per_pixel, any_canvas)
-
-
-def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[AttributedExporter, ...]:
-    """Build the exporters of a plan, in order.
-
-    Args:
-        plan: which exporters.
-        source: the capture.
-        decisions: receives the decisions that they take.
-    """
-    from photonpano.pipeline.exports import AttributedExporter  # imports tifffile, which is not needed to check a spec
-
-    context = _stage_context(plan, source, Recorder(decisions))
-    exporters = []
-    for choice in plan.formats:
-        assert isinstance(choice.contribution, ExporterContribution)
-        exporters.append(AttributedExporter(built(choice, context), choice.label, choice.contribution.suffix))
-    return tuple(exporters)
-
-
 def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) -> PoseEstimator:
-    """Build the pose estimator of a plan that has one.
-
-    Args:
-        plan: which pose estimator.
-        source: the capture.
-        decisions: receives the decisions that it takes.
-    """
+    """Build the pose estimator of a plan that has one; `decisions` receives its choices."""
     from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     assert plan.pose is not None
     capture = _Once(lambda: summarise(source, thread_count(plan.run.threads)))
-    estimator: PoseEstimator = built(plan.pose, _stage_context(plan, source, Recorder(decisions), capture))
+    estimator: PoseEstimator = built(plan.pose, stage_context(plan, source, Recorder(decisions), capture))
     return estimator
 
 
 def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:
-    """Return the scale of a level's exposures.
+    """Return the scale of a level's exposures; `number` counts from 1.
 
     With `scale: auto`, the first two levels are located at half size if frames are large and a later level refines the motion.
     While the motion is known to about a pixel only, a quarter of the pixels locates it nearly as well.
-
-    Args:
-        plan: the levels.
-        number: the number of the level, from 1.
-        frame_shape: (height, width) of a frame.
     """
     scale = plan.levels[number - 1].scale
     if scale != "auto":
@@ -286,30 +185,19 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
 
 
 def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> list[Decision]:
-    """Return the decisions of the first level's resampler, such as its group size, for a capture with this summary.
-
-    Raises:
-        InputError: the capture is too short for the resampler.
-    """
+    """Return the decisions of the first level's resampler, such as its group size, for a capture with this summary."""
     decisions: list[Decision] = []
     choice = plan.levels[0].resample
-    resampler: Resampler = built(choice, _stage_context(plan, source, Recorder(decisions), lambda: capture))
+    resampler: Resampler = built(choice, stage_context(plan, source, Recorder(decisions), lambda: capture))
     with attributing(choice.label, "level 1"):
         require_groups(resampler.groups(source.info.n_frames, 1), source.info.n_frames)
     return decisions
 
 
-def _stage_context(
+def stage_context(
     plan: Plan, source: Source, recorder: Recorder, capture: Callable[[], CaptureSummary] | None = None
 ) -> StageContext:
-    """Return the run for which components are built.
-
-    Args:
-        plan: has seed and threads.
-        source: the capture.
-        recorder: records the decisions that components take.
-        capture: returns the flux and the speed of the capture; None for components that cannot ask for them.
-    """
+    """Return what components are built for; without `capture`, they cannot ask for its flux and speed."""
     threads = thread_count(plan.run.threads)
     at_once = partial(in_order, threads=threads)
     context = StageContext(source.info, source.response, plan.run.seed, threads, decide=recorder, in_order=at_once)
@@ -348,11 +236,7 @@ def _named(choices: Iterable[Choice]) -> Iterator[tuple[str, Choice]]:
 
 
 def built(choice: Choice, context: SourceContext | StageContext | ExecutorContext) -> Any:
-    """Build a component.
-
-    Raises:
-        PluginError: a library is missing, or the plugin failed in its own way.
-    """
+    """Build a component; `PluginError` if a library is missing, or the plugin failed in its own way."""
     contribution = choice.contribution
     who = choice.label
     for requirement in contribution.requires:

@@ -1,4 +1,4 @@
-"""Estimate the motion of a capture: the first level of the loop, and one pass after another on what it has found."""
+"""Estimate the motion of a capture: the first level of the loop, then one pass after another on its result."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from photonpano.captures.obstacles import timeline_of
 from photonpano.context import Context
-from photonpano.errors import InputError
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
@@ -19,24 +18,13 @@ from photonpano.protocols import Source
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision
 
-# What the decision is called on a motion that is known before the first level.
-START = "start"
+START = "start"  # name of the decision on the initial motion
 
 
 def estimate(plan: Plan, source: Source, journal: list[Decision], context: Context) -> State:
-    """Estimate the motion of a capture, and correct what its own frames show to be in the way.
+    """Estimate the motion of a capture, and correct the lens, shading, flicker and cuts that its own frames show.
 
-    Args:
-        plan: what to do.
-        source: the capture.
-        journal: receives the decisions, in the order in which components and passes take them.
-        context: threads, progress and checkpoints.
-
-    Raises:
-        InputError: all frames are copies of the first one, or too few for the start, or the camera has other frames.
-        LocationError: the motion could not be estimated.
-        CanvasTooLargeError: the panorama would be far larger than the memory.
-        PluginError: a component failed in its own way, or broke its contract.
+    `journal` receives the decisions, in the order in which components and passes take them. For errors, see `run`.
     """
     require_centre(plan, source)
     reference, levels = _reference_frame(plan, source), build_levels(plan, source, journal)
@@ -62,13 +50,10 @@ def require_centre(plan: Plan, source: Source) -> None:
         return
     (x, y), (height, width) = plan.camera.centre_px, source.info.frame_shape
     if not (0 <= x < width and 0 <= y < height):
-        raise InputError(
-            str(
-                plan.place("camera.centre_px").problem(
-                    f"({x:g}, {y:g}) does not lie in the frames of {height}x{width} px; a camera that was calibrated with "
-                    "other frames has another principal point and focal length here: scale and shift both"
-                )
-            )
+        raise plan.error(
+            "camera.centre_px",
+            f"({x:g}, {y:g}) does not lie in the frames of {height}x{width} px; a camera that was calibrated with "
+            "other frames has another principal point and focal length here: scale and shift both",
         )
 
 
@@ -79,12 +64,7 @@ def _reference_frame(plan: Plan, source: Source) -> int:
 
 
 def _start(source: Source, reference: int, journal: list[Decision], context: Context) -> ConstantVelocity:
-    """Find the constant velocity with which the first level starts.
-
-    Raises:
-        InputError: the capture has too few frames to find one.
-        LocationError: none was found.
-    """
+    """Find the constant velocity with which the first level starts; `InputError` or `LocationError` if there is none."""
     found = find_velocity(source, context)
     halves = " and ".join(f"{np.degrees(each.turn):.4g}" for each in found.halves)
     reason = (

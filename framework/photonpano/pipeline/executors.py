@@ -27,12 +27,7 @@ from photonpano.values import FrameSpan
 
 @contextmanager
 def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
-    """Build the executor of a plan, and close it at the end of the block.
-
-    Raises:
-        InputError: there are no workers, or they do not have what the run needs.
-        PluginError: a library is missing, or the plugin failed in its own way.
-    """
+    """Build the executor of a plan, and close it at the end of the block; `InputError` if workers lack what the run needs."""
     if plan.executor is None:
         yield LocalExecutor(thread_count(plan.run.threads))
         return
@@ -63,9 +58,6 @@ class CaptureOpener:
 
     Attributes:
         run: unique ID of the run: workers may outlive a run, and files may change.
-        seed: of the run.
-        source: the name of the source.
-        keys: its keys under `with`.
         needed: what the run needs, as `met_by` returns it.
     """
 
@@ -78,8 +70,7 @@ class CaptureOpener:
     def __call__(self) -> PluginSource:
         """Open the capture. From then on, the libraries of the process work in one thread: workers are many processes.
 
-        Raises:
-            InputError: this process joined the cluster late, and does not have what the run needs.
+        Raises `InputError` in a process that joined the cluster late, and does not have what the run needs.
         """
         source = self.unchecked()
         if different := differences(self.needed, met_by(self.needed, source)):

@@ -21,12 +21,10 @@ from photonpano.protocols import Source, camera_of
 from photonpano.threads import in_order
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
 
-# Pictures from which the white balance "grey-world" is taken, all over the video, so that it does not flicker.
+# The white balance "grey-world" is averaged over this many pictures of the video, so that it does not flicker.
 _BALANCED_ON = 16
-# Brightness of the panorama outside the frame, relative to a still.
-_DIMMED = 0.4
-# Width of the outline, as a fraction of the longer side.
-_LINES_PER_PX = 1 / 300
+_DIMMED = 0.4  # brightness of the panorama outside the frame, relative to a still
+_LINES_PER_PX = 1 / 300  # width of the outline, as a fraction of the longer side
 _THINNEST_PX, _MARGIN_PX = 2, 4
 
 
@@ -36,12 +34,10 @@ class Film:
 
     Attributes:
         source: the capture, divided by its vignette and in its light.
-        motion: of every frame.
         canvas: of the panorama; of the view of a frame, if the path is smooth.
         tolerance_px: motion within which frames are summed before they are warped.
         smooth_frames: standard deviation of the smooth path, in frames; None for pictures in the plane of the panorama.
         white_flux: flux that is white, photons per pixel per frame.
-        white_balance: of pictures in colour.
         panorama: (H, W) or (H, W, 3) flux, shown around the frame, whose outline is drawn; None for neither.
     """
 
@@ -57,10 +53,7 @@ class Film:
     def pictures(self, spans: Sequence[FrameSpan], threads: int, bits: Literal[8, 16]) -> Iterator[Picture]:
         """Yield the picture of each exposure, in order: (H, W) or (H, W, 3), red first, in sRGB; unknown pixels are black.
 
-        Args:
-            spans: the frames of each exposure.
-            threads: how many pictures are made at once; they do not depend on it.
-            bits: of each pixel.
+        The pictures do not depend on the number of `threads`; `bits` are those of a value.
         """
         film = self._balanced(spans) if capture_of(self.source).colour is not None else self
         around = None if self.panorama is None else np.nan_to_num(_DIMMED * film._levels(self.panorama))

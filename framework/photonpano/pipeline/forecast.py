@@ -15,7 +15,8 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import render
 from photonpano.motion.loop import LevelResult, resample
 from photonpano.motion.timeline import Timeline
-from photonpano.pipeline.components import build_levels, build_renderer
+from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.rendering import build_renderer
 from photonpano.pipeline.state import State, model_of
 from photonpano.protocols import Source, camera_of_motion
 from photonpano.record.environment import peak_memory_bytes
@@ -23,12 +24,9 @@ from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
-# Length of the trial in the middle of the capture, in groups of the first level.
-TRIAL_GROUPS = 12
-# Length of an untimed trial before it, in groups, for what is done once, such as compiling.
-_WARM_UP_GROUPS = 3
-# Memory for the motion of one frame, as measured in the benchmarks.
-BYTES_PER_FRAME = 1200
+TRIAL_GROUPS = 12  # length of the trial in the middle of the capture, in groups of the first level
+_WARM_UP_GROUPS = 3  # length of an untimed trial before it, in groups, so that compiling is not timed
+BYTES_PER_FRAME = 1200  # memory of the motion of a frame, measured in benchmarks
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,17 +20,7 @@ def write_exposures(folder: Path, levels: Sequence[LevelResult], white_flux: flo
     """Merge the exposures of each level again, as they were located, and write them.
 
     For each level, `exposures/level-1.npy` is (N, H, W) float32, `exposures/level-1.npz` describes its exposures, and
-    `exposures/level-1-0012.png` is a picture of the one of number 12, from 0.
-
-    Args:
-        folder: where the files of the run are gathered.
-        levels: of the run.
-        white_flux: flux that is white in the pictures.
-        context: threads and progress.
-
-    Raises:
-        OSError: the disk is full.
-        PluginError: the merger failed.
+    `exposures/level-1-0012.png` is a picture of the one of number 12, from 0. Raises `OSError` if the disk is full.
     """
     (folder / FOLDER).mkdir()
     for result in levels:

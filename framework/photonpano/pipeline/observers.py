@@ -24,12 +24,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Observers:
-    """The observers of one run; by default there are none.
-
-    Attributes:
-        observers: the plugins with observation hooks.
-        directory: the run folder.
-    """
+    """The observers of one run, which writes into `directory`; by default there are none."""
 
     observers: tuple[Observer, ...] = ()
     directory: Path = Path()

@@ -1,4 +1,4 @@
-"""What is tried after the first level of the loop, and the rule: a change is accepted if it explains the photons no worse."""
+"""The passes after the first level of the loop. A pass is accepted if the residuals of the photons do not grow."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ from photonpano.values import Decision, Light
 
 logger = logging.getLogger(__name__)
 
-# Light that lowers the reduced chi-square of the photons by this factor, or more, is there.
-_EXPLAINED = 0.9
+_EXPLAINED = 0.9  # changing light is accepted if it lowers the reduced chi-square of the photons to this fraction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,9 +35,7 @@ class Proposal:
         worse: returns how the new motion explains the photons worse than the old one, as a clause, empty if it does not. None
             to accept the new state without comparison, so that its errors end the run.
         settle: completes the new state once it is accepted.
-        rejection: begins the message about a proposal that is rejected.
-        severity: of this message.
-        summary: of the change.
+        rejection: begins the message about a proposal that is rejected, of this severity.
     """
 
     make: Callable[[], State | None]
@@ -65,7 +62,7 @@ class Trial(NamedTuple):
 
 
 def tried(state: State, propose: Pass) -> Trial:
-    """Try a pass. The state before is kept where the new motion cannot be estimated, or explains the photons worse."""
+    """Try a pass. The state before is kept if the new motion cannot be estimated, or explains the photons worse."""
     if (proposal := propose(state)) is None:
         return Trial(state)
     try:
@@ -84,7 +81,7 @@ def tried(state: State, propose: Pass) -> Trial:
 
 
 def through_found_lens(state: State) -> Proposal | None:
-    """Run the first level again: through a lens that nobody knew, it has located pairs with errors of pixels."""
+    """Run the first level again with the lens distortion that it found: without that, pairs are off by pixels."""
     if not state.model.finds_lens or camera_of_motion(state.trajectory) is None:
         return None
     return Proposal(lambda: state.located(state.levels[:1], state.trajectory), worse=None)
@@ -93,8 +90,7 @@ def through_found_lens(state: State) -> Proposal | None:
 def without_shading(state: State) -> Proposal | None:
     """Divide the capture by the flat field that its spec asks for, or by its vignette.
 
-    Raises:
-        InputError: the motion cannot tell a flat field from the scene, or the camera turns too far.
+    Raises `InputError` if the motion does not separate a flat field from the scene, or the camera turns too far.
     """
     plan, source = state.plan, state.view.source
     asked = any(isinstance(each, FlatField) for each in plan.corrections)
@@ -156,10 +152,10 @@ def in_changing_light(state: State) -> Proposal | None:
 
 
 def worse_in_light(proposed: MotionFit, before: MotionFit) -> str:
-    """Compare a motion in changing light with that in steady light.
+    """Compare the residuals of a motion in changing light with those in steady light.
 
-    Where the light explains the brightness of the frames, the scatter of the shifts does not count: groups blur the panorama
-    of level 1 by a tremor, and the steps against it are wrong by much more than their noise.
+    Where the light explains the brightness of the frames, the scatter of the shifts does not count: groups blur the panorama of
+    level 1 by a tremor, and the steps against it are wrong by much more than their noise.
     """
     return "" if proposed.misfit < _EXPLAINED * before.misfit else proposed.worse_than(before)
 
@@ -178,7 +174,7 @@ def later_levels(state: State, journal: list[Decision]) -> Proposal:
 
 
 def cut_at_jumps(state: State) -> Proposal | None:
-    """Cut the motion where the image jumps, and locate all levels again: exposures across a jump mislead the first one, too."""
+    """Cut the motion where the image jumps, and locate all levels again: exposures across a jump bias the first level, too."""
     cuts = find_cuts(state.source, state.fit, state.context)
     if not cuts:
         return None
@@ -189,7 +185,7 @@ def cut_at_jumps(state: State) -> Proposal | None:
         measured = [each.along(cut.motion.trajectory, cut.motion.frame_shape) for each in cuts]
         return replace(cut, timeline=cut.timeline.cut_at(measured))
 
-    # Dark frames contradict any motion, and a surer one the more. Their run is doubtful in any case.
+    # Dark frames raise the residuals of any motion, most where its expected error is small; their run is doubtful anyway.
     dark = any(each.dark is not None for each in cuts)
     places = ", ".join(f"frame {each.frame}" for each in cuts)
     rejection = f"the image seems to jump before {places}, but the motion is not cut there"

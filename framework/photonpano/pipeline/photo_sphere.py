@@ -15,13 +15,9 @@ _KEYWORD = b"XML:com.adobe.xmp"
 
 
 def photo_sphere(canvas: Canvas, shape: tuple[int, int]) -> str | None:
-    """Return the XMP packet of a picture of a canvas; None if it is not spherical.
+    """Return the XMP packet of a picture of a canvas, of (height, width); None if it is not spherical.
 
-    Where the picture crosses the back of the sphere, it is turned so that it does not.
-
-    Args:
-        canvas: of the panorama.
-        shape: (height, width) of the picture, which may be smaller than the canvas.
+    The picture may be smaller than the canvas. Where it crosses the back of the sphere, it is turned so that it does not.
     """
     if canvas.projection != "spherical" or canvas.period_px is None:
         return None

@@ -18,15 +18,14 @@ from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.estimate import require_centre
 from photonpano.pipeline.run_steps import BegunRun
 from photonpano.poses import Poses, centres, colmap, in_standard_world, nerfstudio, ply, tum
-from photonpano.record.pose_record import poses_record, poses_warnings
-from photonpano.record.run_json import started_record
+from photonpano.record.run_json import poses_record
+from photonpano.record.run_warnings import poses_warnings
 from photonpano.record.schema import RunRecord
 from photonpano.report import render_pose_report
 from photonpano.specs.plan import Plan
 from photonpano.values import CameraGuess, FluxImage, PoseEstimate, StreamInfo
 
-# Quantile of the flux of an exposure that is white in its picture.
-_WHITE_QUANTILE = 0.995
+_WHITE_QUANTILE = 0.995  # quantile of the flux of an exposure that is white in its picture
 
 
 def find_poses(run: BegunRun) -> None:
@@ -37,7 +36,7 @@ def find_poses(run: BegunRun) -> None:
     run.observers.posed(estimate, time.perf_counter() - start)
     files = write_pose_files(run.folder.staging, estimate, source.info, plan.output.exposures)
     record: RunRecord = {
-        **started_record(plan, source.info, run.journal, run.seconds, run.capture),
+        **run.started_record(),
         "poses": poses_record(estimate),
         "warnings": [*poses_warnings(estimate), *files],
     }
@@ -62,19 +61,9 @@ def _estimated(run: BegunRun) -> PoseEstimate:
 
 
 def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:
-    """Write poses.npz, sparse/, transforms.json, points.ply, poses.tum, and if they are asked for pictures in images/.
+    """Write poses.npz, sparse/, transforms.json, points.ply, poses.tum, and with `exposures` pictures in images/.
 
-    Args:
-        folder: where the files of the run are gathered.
-        estimate: in a world in which the path has the length 1.
-        stream: the capture.
-        exposures: whether the exposures are written.
-
-    Returns:
-        Warnings.
-
-    Raises:
-        OutputError: the disk is full.
+    The path of the estimate has the length 1. Returns warnings; `OutputError` if the disk is full.
     """
     try:
         _write(folder, estimate, stream)

@@ -1,4 +1,4 @@
-"""Refine the motion: each refiner corrects it by what short spans of frames show beyond it."""
+"""Refine the motion: refiners correct it by the residual shifts of short spans of frames."""
 
 from __future__ import annotations
 
@@ -12,23 +12,26 @@ from photonpano.contracts.results import REFINED
 from photonpano.contracts.rules import attributing
 from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, nearest_rotations
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.level import Recorder
+from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.passes import Proposal, tried
 from photonpano.pipeline.state import State
+from photonpano.protocols import Source
 from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement
-from photonpano.values import Refined
+from photonpano.specs.plan import Plan
+from photonpano.values import Decision, Refined
 
-# Most corrections by one refiner. A tremor blurs the panorama that it is seen against, so that one is not enough.
-MAX_ROUNDS = 6
+MAX_ROUNDS = 6  # maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against
+
+
+def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
+    """Build the refiners of a plan, in order; `decisions` receives their choices."""
+    context = stage_context(plan, source, Recorder(decisions))
+    return tuple(NamedRefiner(choice.contribution.name, built(choice, context), choice.label) for choice in plan.refine)
 
 
 def refine(state: State, refiners: Sequence[NamedRefiner]) -> Explained:
-    """Correct the motion by refiners, each until it finds nothing, and measure what is left.
-
-    Raises:
-        CanvasTooLargeError: the panorama is far larger than what fits into the memory.
-        LocationError: frames reach the horizon of the reference plane.
-        PluginError: a refiner failed, or broke its contract.
-    """
+    """Correct the motion by refiners, each until it finds nothing, and measure what is left. For errors, see `run`."""
     refinements = []
     for place, refiner in enumerate(refiners):
         before, rounds, kept_out = state.motion, list[str](), ""

@@ -1,34 +1,40 @@
-"""Render the panorama along a known motion, into a run folder."""
+"""Render the panorama along a known motion, and write it in all formats; what renderers and exporters return is checked."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
 
 from photonpano.context import Context
-from photonpano.corrections import Vignette
-from photonpano.errors import ExtentError, InputError, ProjectionError
+from photonpano.contracts.rules import attributing
+from photonpano.contracts.results import FILES, require_panorama
+from photonpano.contracts.rules import BrokenContract
+from photonpano.contributions import ExporterContribution, RendererContribution
+from photonpano.corrections import Vignette, write_vignette
+from photonpano.errors import ExtentError, InputError, OutputError, ProjectionError
 from photonpano.geometry import Canvas
+from photonpano.lighting import write_light
+from photonpano.merging import MergeRenderer
+from photonpano.merging.canvas_noise import CanvasNoise
+from photonpano.merging.footprints import by_homographies
 from photonpano.merging.panorama import RenderedPanorama, render_panorama
 from photonpano.motion.frame_motion import FrameMotion, view_of
-from photonpano.pipeline.components import build_exporters, build_renderer
-from photonpano.pipeline.exports import export_all
+from photonpano.motion.level import Recorder
+from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.run_folder import RunFolder
-from photonpano.protocols import Source, light_of
+from photonpano.protocols import Exporter, Renderer, Source, Trajectory, camera_of, light_of
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, Panorama
+from photonpano.threads import InOrder
+from photonpano.values import Decision, FrameSpan, Homography, Panorama, PanoramaRows
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rendering:
-    """A panorama whose files are written.
-
-    Attributes:
-        panorama: what the files hold.
-        decisions: what renderer and exporters chose.
-    """
-
-    panorama: RenderedPanorama
-    decisions: tuple[Decision, ...]
+logger = logging.getLogger(__name__)
 
 
 def render_into(
@@ -39,29 +45,16 @@ def render_into(
     motion: FrameMotion,
     context: Context,
     ready: tuple[Canvas, Panorama] | None = None,
-) -> Rendering:
-    """Render the panorama, and write it, its motion, and what its capture was divided by.
+) -> tuple[RenderedPanorama, list[Decision]]:
+    """Render the panorama, and write it, its motion, and what its capture was divided by. For errors, see `run`.
 
-    Args:
-        folder: receives the files.
-        plan: renderer, exporters and settings.
-        source: the capture, divided by its vignette and in its light.
-        vignette: by which it is divided.
-        motion: of every frame.
-        context: threads, progress and checkpoints.
-        ready: the merge of all frames along this motion, and its canvas, where it is known.
-
-    Raises:
-        CanvasTooLargeError: the panorama would exceed the memory of the spec.
-        InputError: no frame shows the extent, or the motion does not suit the projection.
-        LocationError: frames reach the horizon of the reference plane.
-        OutputError: a file cannot be written.
-        PluginError: the renderer or an exporter failed, or broke its contract.
+    `source` is divided by the vignette and in its light. `ready` is the merge of all frames along this motion, where it is
+    known. Returns the panorama, and the decisions of renderer and exporters.
     """
     decisions: list[Decision] = []
     renderer = build_renderer(plan, source, decisions, context.in_order)
     exporters = build_exporters(plan, source, decisions)
-    try:
+    with naming_key_of_canvas(plan):
         panorama = render_panorama(
             renderer,
             source,
@@ -75,15 +68,166 @@ def render_into(
             view_of(motion, source, plan.render.projection, level=plan.render.horizon == "level"),
             ready if renderer.merges else None,
         )
-    except ExtentError as error:
-        raise InputError(str(plan.place("render.extent").problem(str(error)))) from error
-    except ProjectionError as error:
-        raise InputError(str(plan.place("render.projection").problem(str(error)))) from error
     renderer.require_seen(panorama.coverage_share)
     folder.write_results(panorama, motion)
-    export_all(exporters, folder.staging, panorama)
-    if vignette is not None:
-        folder.write_vignette(vignette)
-    if (light := light_of(source)) is not None:
-        folder.write_light(light)
-    return Rendering(panorama, tuple(decisions))
+    for exporter in exporters:
+        exporter.export(StoredPanorama.of(folder.staging, panorama), folder.staging)
+    with folder.writing():
+        if vignette is not None:
+            write_vignette(folder.staging, vignette)
+        if (light := light_of(source)) is not None:
+            write_light(folder.staging, light)
+    return panorama, decisions
+
+
+@contextmanager
+def naming_key_of_canvas(plan: Plan) -> Iterator[None]:
+    """Refuse a canvas that cannot be planned, with the key of the spec that it does not suit."""
+    try:
+        yield
+    except (ExtentError, ProjectionError) as error:
+        key = "render.extent" if isinstance(error, ExtentError) else "render.projection"
+        raise plan.error(key, str(error)) from error
+
+
+@dataclass(frozen=True, slots=True)
+class AttributedRenderer:
+    """A renderer whose errors name its `origin`, and whose panoramas are checked.
+
+    Unless it renders on `any_canvas`, it needs a planar one and a lens without distortion.
+    """
+
+    component: Renderer
+    origin: str
+    bytes_per_pixel: int
+    any_canvas: bool = True
+
+    @property
+    def merges(self) -> bool:
+        """Whether it renders what the residuals were measured against: the merge of all frames."""
+        return isinstance(self.component, MergeRenderer)
+
+    def render(
+        self,
+        source: Source,
+        trajectory: Trajectory,
+        span: FrameSpan,
+        canvas: Canvas,
+        tolerance_px: float,
+        advance: Callable[[int], None],
+    ) -> Panorama:
+        """Render the frames of a span on a canvas; `InputError` if it renders no such canvas, or not through a lens."""
+        self._require_renderable(source, trajectory, span, canvas)
+        with attributing(self.origin, "the panorama"):
+            return require_panorama(self.component.render(source, trajectory, span, canvas, tolerance_px, advance), canvas)
+
+    def _require_renderable(self, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> None:
+        """Refuse what only a renderer on any canvas renders."""
+        if self.any_canvas:
+            return
+        if not canvas.planar:
+            raise InputError(
+                f"{self.origin} renders on a plane only, and this panorama is {canvas.projection}; write render.use: merge, or "
+                "render.projection: planar"
+            )
+        camera = camera_of(source)
+        if camera is not None and camera.distorts:
+            raise InputError(f"{self.origin} does not render through a lens that distorts; write render.use: merge")
+        homographies = trajectory.at(np.arange(span.start, span.stop))
+        if not by_homographies(canvas, camera, homographies, source.info.frame_shape):
+            raise InputError(f"{self.origin} does not leave out frames that reach behind the plane; write render.use: merge")
+
+    def require_seen(self, coverage_share: float) -> None:
+        """Raise `PluginError` if nothing of the panorama was seen, although frames were located."""
+        with attributing(self.origin, "the panorama"):
+            if not coverage_share:
+                raise BrokenContract("no pixel has a positive weight")
+
+
+def build_renderer(
+    plan: Plan, source: Source, decisions: list[Decision], in_order: InOrder | None = None
+) -> AttributedRenderer:
+    """Build the renderer of a plan; `decisions` receives its choices. Without `in_order`, threads share the work."""
+    choice, contribution = plan.renderer, plan.renderer.contribution
+    context = stage_context(plan, source, Recorder(decisions))
+    if in_order is not None:
+        context = replace(context, in_order=in_order)
+    assert isinstance(contribution, RendererContribution)
+    if light_of(source) is not None and not contribution.divides_by_light:
+        logger.warning(
+            f"{choice.label} does not divide by the light, which changes: the panorama shows each place in the mean light of "
+            "the frames that saw it; render with {use: merge} to divide by it"
+        )
+    any_canvas = contribution.renders_on_any_canvas
+    return AttributedRenderer(built(choice, context), choice.label, contribution.bytes_per_pixel, any_canvas)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredPanorama:
+    """The files of a rendered panorama: a `FinishedPanorama`.
+
+    Attributes:
+        flux: (H, W) or (H, W, 3) float32, on disk.
+        weight: the same shape, on disk.
+        canvas: (3, 3), pixels of the reference plane to pixels of the panorama.
+        white_flux: flux that is white in the picture.
+    """
+
+    flux: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    canvas: Homography
+    white_flux: float
+    noise: CanvasNoise
+
+    @classmethod
+    def of(cls, folder: Path, panorama: RenderedPanorama) -> StoredPanorama:
+        """Open panorama.tiff and coverage.tiff in a folder."""
+        flux, weight = (tifffile.memmap(folder / name, mode="r") for name in ("panorama.tiff", "coverage.tiff"))
+        assert panorama.noise is not None
+        return cls(flux, weight, panorama.canvas.transform, panorama.white_flux, panorama.noise)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return self.flux.shape[0], self.flux.shape[1]
+
+    @property
+    def in_colour(self) -> bool:
+        """Whether pixels have red, green and blue."""
+        return self.flux.ndim == 3
+
+    def rows(self, start: int, stop: int) -> PanoramaRows:
+        """Return some rows, as arrays of their own."""
+        flux, weight = (np.array(image[start:stop], np.float32) for image in (self.flux, self.weight))
+        return PanoramaRows(flux, weight, self.noise.std(flux, weight, top=start), self.noise.saturated(flux, weight))
+
+
+@dataclass(frozen=True, slots=True)
+class AttributedExporter:
+    """An exporter whose errors name its `origin`, such as "exporter 'exr' of photonpano 0.1.0", and whose file is checked."""
+
+    component: Exporter
+    origin: str
+    suffix: str
+
+    def export(self, panorama: StoredPanorama, folder: Path) -> None:
+        """Write the panorama into a folder; `OutputError` if the file cannot be written, as on a full disk."""
+        path = folder / f"panorama{self.suffix}"
+        before = {each.name for each in folder.iterdir()}
+        with attributing(self.origin, path.name):
+            try:
+                self.component.export(panorama, path)
+            except OSError as error:
+                reason = f"{path.name} could not be written ({error.strerror or error})"
+                raise OutputError(f"{reason}; what was in the run folder before is unchanged") from error
+            FILES.require({each.name for each in folder.iterdir()} - before, path)
+
+
+def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[AttributedExporter, ...]:
+    """Build the exporters of a plan, in order; `decisions` receives their choices."""
+    context = stage_context(plan, source, Recorder(decisions))
+    exporters = []
+    for choice in plan.formats:
+        assert isinstance(choice.contribution, ExporterContribution)
+        exporters.append(AttributedExporter(built(choice, context), choice.label, choice.contribution.suffix))
+    return tuple(exporters)

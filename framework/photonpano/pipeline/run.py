@@ -9,12 +9,12 @@ from photonpano.captures.obstacles import naming_obstacles
 from photonpano.context import Progress, usual
 from photonpano.errors import InputError
 from photonpano.pipeline.checkpoints.work_folder import Continuation
-from photonpano.pipeline.components import build_refiners
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
 from photonpano.pipeline.following.follow import followed
+from photonpano.pipeline.kept_exposures import write_exposures
 from photonpano.pipeline.pose_run import find_poses
-from photonpano.pipeline.refiners import refine
+from photonpano.pipeline.refiners import build_refiners, refine
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_steps import BegunRun, begun_run
 from photonpano.protocols import light_of
@@ -25,8 +25,7 @@ from photonpano.report.notebook import run_html
 from photonpano.residuals.verdict import Verdict, judge
 from photonpano.specs.plan import Plan
 
-# Seconds without a new frame after which a capture that is followed is complete, by default.
-END_AFTER_S = 5.0
+END_AFTER_S = 5.0  # default time without a new frame after which a followed capture is complete
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,12 +108,11 @@ def make_panorama(run: BegunRun) -> None:
         explained = refine(state, build_refiners(plan, source, journal))
         verdict = judge(explained, state.results, journal)
         merged = explained.canvas, explained.panorama
-        rendering = render_into(folder, plan, source, state.vignette, explained.motion, context, merged)
-        panorama, chosen = rendering.panorama, rendering.decisions
+        panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context, merged)
         run.observers.rendered(panorama.canvas, panorama.seconds)
         if plan.output.keep == "exposures":
-            folder.write_exposures(state.results, panorama.white_flux, context)
-    found = state.results, explained, verdict, panorama, chosen
-    record = record_of(plan, source.info, journal, *found, run.seconds, run.capture)
+            with folder.writing():
+                write_exposures(folder.staging, state.results, panorama.white_flux, context)
+    record = record_of(run.started_record(), plan, state.results, explained, verdict, panorama, chosen)
     light, capture = light_of(source), OpenCapture(source, state.results)
     run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)

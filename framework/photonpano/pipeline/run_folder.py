@@ -17,8 +17,6 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from photonpano.context import Context
-from photonpano.corrections import Vignette, write_vignette
 from photonpano.errors import OutputError
 from photonpano.folders import (
     finish_replacement,
@@ -30,39 +28,41 @@ from photonpano.folders import (
     staging_of,
 )
 from photonpano.geometry import Canvas
-from photonpano.lighting import write_light
 from photonpano.locks import locked
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.loop import LevelResult
-from photonpano.pipeline.kept_exposures import write_exposures
 from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
 from photonpano.record.contents import RECORD, contents_of, names_of_results, recorded_contents, recorded_json
 from photonpano.record.schema import FileContent, RunRecord
-from photonpano.values import FluxImage, Light, Panorama
+from photonpano.values import FluxImage, Panorama
 
-# Files that a message names.
-SHOWN_FILES = 3
+SHOWN_FILES = 3  # files that a message names
 
 
 class RunFolder:
-    """A folder in which the files of a run are gathered, and from which they replace those of the run before.
-
-    Attributes:
-        directory: the run folder.
-        staging: where the files are written.
-    """
+    """A folder, `staging`, in which the files of a run are gathered, and from which they replace those of the run before."""
 
     def __init__(self, directory: Path, stack: ExitStack) -> None:
         self.directory = directory
         self._stack = stack
         self.staging = stack.enter_context(staging_of(directory))
-        self._contents: dict[str, FileContent] = {}
-        """Sizes and hashes of files that were committed before."""
+        self._contents: dict[str, FileContent] = {}  # sizes and hashes of files that were committed before
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Make errors of writing files in the block an `OutputError`."""
+        try:
+            yield
+        except OSError as error:
+            reason = error.strerror or "a file was cut short"  # a short write of an array comes without the system's words
+            raise OutputError(
+                f"{self.directory}: the results could not be written ({reason}); what was there before is unchanged. "
+                "Make room, or choose another folder with --output"
+            ) from error
 
     def write_tile(self, tile: Tile, rendered: Panorama, canvas: Canvas) -> None:
         """Write a part of panorama.tiff and coverage.tiff (float32); the parts make up the canvas."""
-        with _writing(self.directory):
+        with self.writing():
             _write_box(self.staging / "panorama.tiff", rendered.flux, tile, canvas)
             _write_box(self.staging / "coverage.tiff", rendered.weight, tile, canvas)
 
@@ -73,7 +73,7 @@ class RunFolder:
         if not encoded:
             raise OutputError(f"OpenCV could not encode the panorama of {panorama.picture.shape} as PNG")
         sphere = photo_sphere(panorama.canvas, picture.shape[:2])
-        with _writing(self.directory):
+        with self.writing():
             (self.staging / "panorama.png").write_bytes(png.tobytes() if sphere is None else with_xmp(png.tobytes(), sphere))
             motion_arrays: dict[str, Any] = {
                 "homographies": motion.homographies,
@@ -87,39 +87,20 @@ class RunFolder:
             }
             np.savez(self.staging / "trajectory.npz", allow_pickle=False, **motion_arrays, **_of_camera(motion))
 
-    def write_light(self, light: Light) -> None:
-        """Write light.npz."""
-        with _writing(self.directory):
-            write_light(self.staging, light)
-
-    def write_vignette(self, vignette: Vignette) -> None:
-        """Write vignette.npz."""
-        with _writing(self.directory):
-            write_vignette(self.staging, vignette)
-
-    def write_exposures(self, levels: Sequence[LevelResult], white_flux: float, context: Context) -> None:
-        """Write the exposures of each level into exposures/."""
-        with _writing(self.directory):
-            write_exposures(self.staging, levels, white_flux, context)
-
     def write_report(self, page: str) -> None:
         """Write report.html."""
         path = self.staging / "report.html"
         self._contents.pop(path.name, None)
         try:
-            with _writing(self.directory):
+            with self.writing():
                 path.write_text(page, encoding="utf-8")
         except BaseException:
             path.unlink(missing_ok=True)
             raise
 
     def commit(self, record: RunRecord) -> RunRecord:
-        """Put the written files and run.json into the run folder, in one step.
-
-        Returns:
-            The content of run.json: the record, with sizes and hashes of the files.
-        """
-        with _writing(self.directory):
+        """Put the written files and run.json into the run folder, in one step; return the record with sizes and hashes."""
+        with self.writing():
             self._contents = contents_of(self.staging, self._contents)
             record = {**record, "files": self._contents}
             text = json.dumps(record, indent=2, allow_nan=False) + "\n"
@@ -129,7 +110,7 @@ class RunFolder:
 
     def reopen(self) -> None:
         """Gather the files of the next commit, which begin as those of the last one."""
-        with _writing(self.directory):
+        with self.writing():
             self.staging = self._stack.enter_context(staging_of(self.directory))
             for name in recorded_contents(self.directory) or ():
                 (self.staging / name).parent.mkdir(parents=True, exist_ok=True)
@@ -138,15 +119,13 @@ class RunFolder:
 
 @contextmanager
 def run_folder(directory: Path, *, overwrite: bool = False, inputs: Sequence[Path] = ()) -> Iterator[RunFolder]:
-    """Lock a run folder, and gather the files of a run beside it.
+    """Lock a run folder, which may be missing, and gather the files of a run beside it.
 
     The place is proved to be writable before the work starts. When the block raises before `commit`, what was there stays as it
     was, and folders that were not there are gone again.
 
-    Args:
-        directory: the run folder; it may be missing.
-        overwrite: whether it may hold files that no run has written, which stay, or a run of another capture.
-        inputs: files and folders that the run reads, which must not lie in it.
+    With `overwrite`, it may hold files that no run has written, which stay, or a run of another capture. `inputs` are what the
+    run reads, which must not lie in it.
 
     Raises:
         OutputError: the folder cannot be made or written to, another process writes it, or it is none that a run may write.
@@ -244,19 +223,6 @@ def _require_same_capture(directory: Path, inputs: Sequence[Path]) -> None:
                 "with --overwrite"
             )
         return  # the others are files of corrections
-
-
-@contextmanager
-def _writing(directory: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        # A short write of an array comes without the system's words.
-        reason = error.strerror or "a file was cut short"
-        raise OutputError(
-            f"{directory}: the results could not be written ({reason}); what was there before is unchanged. "
-            "Make room, or choose another folder with --output"
-        ) from error
 
 
 def _write_box(path: Path, image: FluxImage, tile: Tile, canvas: Canvas) -> None:

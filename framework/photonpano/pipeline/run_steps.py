@@ -44,15 +44,9 @@ class BegunRun:
     """A run that has begun.
 
     Attributes:
-        plan: what is run.
-        source: the capture, which shows something.
-        folder: the run folder, which is written.
-        observers: of the run.
-        progress: receives stages and messages.
         start: when the capture was open, in seconds of `time.perf_counter`.
         journal: the decisions so far, in the order in which they were taken.
         levels: the levels so far; one that was located again is there more than once.
-        work: what the run finds, for the case of an interruption.
         was_finished: whether the run was finished before, so that nothing is left to do.
         record: of the finished run.
         verdict: whether motion and panorama explain the photons; None for poses.
@@ -87,10 +81,9 @@ class BegunRun:
         context = Context(progress=self.progress, on_level=on_level)
         return context if self.work is None else replace(context, checkpoints=self.work.checkpoints)
 
-    @property
-    def seconds(self) -> float:
-        """Seconds since the capture was open."""
-        return time.perf_counter() - self.start
+    def started_record(self) -> RunRecord:
+        """Return the record of the run, without its results."""
+        return started_record(self.plan, self.source.info, self.journal, time.perf_counter() - self.start, self.capture)
 
     def end(self, record: RunRecord, draw: Callable[[RunRecord], str], verdict: Verdict | None = None) -> None:
         """Put the files of the run into its folder, and then the report that `draw` makes of the record."""
@@ -106,19 +99,14 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
 
     The block ends the run, unless it was finished before. If the block fails, a report of that lies beside the run folder,
     which stays as it was.
-
-    Raises:
-        InputError: the capture cannot be used, or shows nothing, or there is nothing to go on with.
-        OutputError: the run folder cannot be written, or another process writes it.
-        SpecError: a stage does not suit the capture.
     """
     if plan.pose is not None and (how.keep or how.from_level is not None):
         raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")
-    observers = Observers(plan.observers, plan.output.directory)
+    observers, read = Observers(plan.observers, plan.output.directory), [*capture_files(plan), *filter(None, [plan.file])]
     with (
         observers.watching(plan.document) as finished,
         open_source(plan) as source,
-        run_folder(plan.output.directory, overwrite=overwrite, inputs=_read_files(plan)) as folder,
+        run_folder(plan.output.directory, overwrite=overwrite, inputs=read) as folder,
         loading_figures(),
         one_thread_inside(),
         notify_on_first_compile(partial(progress.note, COMPILING)),
@@ -172,7 +160,7 @@ def _reporting_failure(run: BegunRun) -> Iterator[None]:
     except (LocationError, CanvasTooLargeError, PluginError) as error:
         levels = {result.level.number: level_record(result) for result in run.levels}
         record: RunRecord = {
-            **started_record(run.plan, run.source.info, run.journal, run.seconds, run.capture),
+            **run.started_record(),
             "status": "failed",
             "levels": [levels[number] for number in sorted(levels)],
         }
@@ -208,14 +196,9 @@ def _with_report(folder: RunFolder, record: RunRecord, draw: Callable[[RunRecord
         return {**record, "warnings": [*record["warnings"], warning]}
 
 
-def _read_files(plan: Plan) -> list[Path]:
-    """Return the files that a run reads: the capture, and the spec."""
-    return [*capture_files(plan), *([] if plan.file is None else [plan.file])]
-
-
 def _require_photons(plan: Plan, source: Source) -> None:
     """Refuse a capture that is all dark or all lit, at the place of the spec that names it."""
     try:
         require_photons(source)
     except InputError as error:
-        raise InputError(str(plan.place("source").problem(str(error)))) from error
+        raise plan.error("source", str(error)) from error

@@ -33,18 +33,13 @@ class State:
     """A capture as corrected so far, and its motion as known so far. It is frozen: passes return new states.
 
     Attributes:
-        plan: what to do.
         source: the capture as corrected so far, in its light, but not yet through the camera that was found.
         context: threads, progress, and checkpoints that depend on these corrections.
         reference: the frame whose homography is the identity.
-        levels: the components of each level.
         timeline: repeated frames, and where the motion is cut.
-        model: what the motion of the camera may be.
         start: the motion known before the first level; None if there is none.
-        results: of the levels so far.
         outdated: whether the source was corrected since these levels were located.
         vignette: by which the source is divided.
-        decisions: of the passes, for the record.
         refined: the motion corrected by refiners; None for that of the last level.
     """
 
@@ -63,16 +58,7 @@ class State:
     refined: FrameMotion | None = None
 
     def located(self, levels: Sequence[Level], previous: Trajectory | None) -> State:
-        """Run levels of the loop, and return the state with their results in place of those of the same and later levels.
-
-        Args:
-            levels: some of the levels, in order.
-            previous: the motion from which the first of them starts; None if nothing is known.
-
-        Raises:
-            LocationError: too few exposures could be located.
-            PluginError: a component failed, or broke its contract.
-        """
+        """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels."""
         if not levels:
             return self
         before = [each for each in self.results if each.level.number < levels[0].number]
@@ -104,12 +90,7 @@ class State:
 
     @cached_property
     def fit(self) -> MotionFit:
-        """How well the motion explains the photons.
-
-        Raises:
-            CanvasTooLargeError: the panorama is far larger than what fits into the memory.
-            LocationError: frames reach the horizon of the reference plane.
-        """
+        """How well the motion explains the photons; `CanvasTooLargeError` or `LocationError` if the panorama has no canvas."""
         render, memory = self.plan.render, int(self.plan.run.memory)
         return MotionFit(self.view.source, self.motion, render.tolerance_px, memory, self.view.context)
 

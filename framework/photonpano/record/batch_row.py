@@ -6,13 +6,33 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 from photonpano.paths import Location
 from photonpano.text import byte_size, count, duration, pixels
 
-ValueT = TypeVar("ValueT")
 Status = Literal["waiting", "running", "done", "failed", "interrupted"]
+
+
+def _px(value: float) -> str:
+    return f"{pixels(value)} px"
+
+
+def _percent(share: float) -> str:
+    return f"{pixels(100 * share)} %"
+
+
+# The figures of a run by their attributes: the title of each, and how it is written.
+FIGURES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "expected_error_px": ("expected error", _px),
+    "true_error_px": ("true error", _px),
+    "psnr_db": ("PSNR", "{:.1f} dB".format),
+    "expected_position_error": ("expected error", _percent),
+    "true_position_error": ("true error", _percent),
+    "n_frames": ("frames", count),
+    "seconds": ("time", duration),
+    "peak_memory_bytes": ("peak memory", byte_size),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,24 +90,15 @@ class BatchRow:
 
     def cells(self) -> list[str]:
         """Return what stands in each of the `COLUMNS` of a table; a dash where the run has no such figure."""
-        return [
-            self.label,
-            self.verdict or self.status,
-            _error(self.expected_error_px, self.expected_position_error),
-            _error(self.true_error_px, self.true_position_error),
-            _cell(self.n_frames, count),
-            _cell(self.seconds, duration),
-            _cell(self.peak_memory_bytes, byte_size),
-            self.reason.partition("\n")[0],
-        ]
+        expected = "expected_error_px" if self.expected_position_error is None else "expected_position_error"
+        true = "true_error_px" if self.true_position_error is None else "true_position_error"
+        figures = (expected, true, "n_frames", "seconds", "peak_memory_bytes")
+        return [self.label, self.verdict or self.status, *map(self.figure, figures), self.reason.partition("\n")[0]]
 
-
-def _cell(value: ValueT | None, write: Callable[[ValueT], str]) -> str:
-    return "\N{EN DASH}" if value is None else write(value)
-
-
-def _error(in_px: float | None, of_path: float | None) -> str:
-    return _cell(in_px, lambda px: f"{pixels(px)} px") if of_path is None else f"{pixels(100 * of_path)} %"
+    def figure(self, name: str) -> str:
+        """Return one of the `FIGURES`, written with its unit; a dash where the run has none."""
+        value = getattr(self, name)
+        return "\N{EN DASH}" if value is None else FIGURES[name][1](value)
 
 
 def written(value: Any) -> str:

@@ -21,21 +21,19 @@ from photonpano.record.schema import FileContent
 logger = logging.getLogger(__name__)
 
 RECORD = "run.json"
+# The files of a run. Runs of older versions do not list theirs.
 RESULTS = frozenset(
     {
         *("panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "light.npz", "vignette.npz", "report.html"),
         RECORD,
     }
 )
-"""The files of a run. Runs of older versions do not list theirs."""
 
 
 def contents_of(folder: Path, known: Mapping[str, FileContent] | None = None) -> dict[str, FileContent]:
     """Return size and SHA-256 of the files in a folder by their paths in it, such as `sparse/images.txt`, without run.json.
 
-    Args:
-        folder: all files of it count, those in folders as well.
-        known: those of some files, which are not read.
+    Files that are `known` are not read.
     """
     paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
     names = sorted(name for path in paths if (name := path.relative_to(folder).as_posix()) != RECORD)
@@ -67,8 +65,7 @@ def names_of_results(folder: Path) -> set[str]:
 def finish_run_folder(folder: Path) -> None:
     """Put the files of a run in place that was killed while it did so; while another process does that, let it.
 
-    Raises:
-        InputError: the folder cannot be written to.
+    Raises `InputError` if the folder cannot be written to.
     """
     if not (folder / PENDING).is_dir():
         return
@@ -83,12 +80,7 @@ def finish_run_folder(folder: Path) -> None:
 
 
 def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str] | None:
-    """Return the files that are there, and are not what run.json lists; None if it lists none.
-
-    Args:
-        folder: the run folder.
-        names: the files to compare; all by default.
-    """
+    """Return which of the named files, by default all, differ from what run.json lists; None if it lists none."""
     recorded = recorded_contents(folder)
     if recorded is None:
         return None
@@ -97,11 +89,7 @@ def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str]
 
 
 def require_one_run(folder: Path, names: Iterable[str]) -> None:
-    """Refuse files that do not belong to the run.json beside them; warn if it lists no hashes.
-
-    Raises:
-        InputError: a file is another one than the run wrote.
-    """
+    """Raise `InputError` if files are not those of the run.json beside them; warn if it lists no hashes."""
     if not folder.is_dir():
         return
     finish_run_folder(folder)
@@ -117,11 +105,7 @@ def require_one_run(folder: Path, names: Iterable[str]) -> None:
 
 
 def require_same_frames(folder: Path, record: Mapping[str, Any], source: Source) -> None:
-    """Refuse a capture whose sampled frames are not those that a run has read; runs of older versions did not record them.
-
-    Raises:
-        InputError: the frames are others.
-    """
+    """Raise `InputError` if a capture has other frames than a run has read; older versions did not record them."""
     recorded = record.get("capture")
     if isinstance(recorded, dict) and frames_sha256(source) != recorded.get("frames_sha256"):
         raise InputError(f"{folder}: the capture has other frames than when it was run; it is another capture")

@@ -6,28 +6,28 @@ import datetime
 import importlib.metadata
 import json
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from photonpano.captures.fingerprint import CaptureRecord
 from photonpano.errors import InputError
+from photonpano.geometry import Camera
 from photonpano.merging.panorama import RenderedPanorama
-from photonpano.motion.graph import Evidence
 from photonpano.motion.loop import LevelResult
 from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
 from photonpano.record.run_warnings import level_warnings, motion_warnings, refinement_warnings
 from photonpano.record.schema import (
     CameraRecord,
     DecisionRecord,
-    EvidenceRecord,
     FailureRecord,
     LevelRecord,
     MotionRecord,
     PairRecord,
     PanoramaRecord,
-    ReasonRecord,
+    PosesRecord,
     RefinementRecord,
     RescuedRecord,
     RunRecord,
@@ -36,40 +36,24 @@ from photonpano.record.schema import (
 from photonpano.residuals.refinement import Explained, Refinement
 from photonpano.residuals.verdict import Reason, Verdict
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, StreamInfo
+from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, PoseEstimate, StreamInfo
 
 
 def record_of(
+    started: RunRecord,
     plan: Plan,
-    stream: StreamInfo,
-    decisions: Sequence[Decision],
     levels: Sequence[LevelResult],
     explained: Explained,
     verdict: Verdict,
     panorama: RenderedPanorama,
     rendered: Sequence[Decision],
-    seconds: float,
-    capture: CaptureRecord,
 ) -> RunRecord:
-    """Return the record of a finished run.
-
-    Args:
-        plan: what was run.
-        stream: the capture.
-        decisions: the choices that the spec left open.
-        levels: the results of the loop.
-        explained: the motion of every frame, and what refiners did.
-        verdict: whether it is trusted.
-        panorama: the panorama.
-        rendered: the choices of renderer and exporters.
-        seconds: time that the run took.
-        capture: its fingerprint.
-    """
+    """Return the record of a finished run; `rendered` are the decisions of renderer and exporters."""
     motion = explained.motion
-    if plan.until_converged:
-        decisions = [*decisions, levels_decision(levels)]
+    decisions = [levels_decision(levels), *rendered] if plan.until_converged else rendered
     return {
-        **started_record(plan, stream, [*decisions, *rendered], seconds, capture),
+        **started,
+        "decisions": [*started["decisions"], *decision_records(decisions)],
         "levels": [level_record(result) for result in levels],
         "panorama": panorama_record(plan, panorama, rendered),
         "motion": motion_record(motion.std_px),
@@ -82,15 +66,7 @@ def record_of(
 def started_record(
     plan: Plan, stream: StreamInfo, decisions: Sequence[Decision], seconds: float, capture: CaptureRecord
 ) -> RunRecord:
-    """Return the record of a finished run without its results.
-
-    Args:
-        plan: what was run.
-        stream: the capture.
-        decisions: the choices that the spec left open.
-        seconds: time that the run took.
-        capture: its fingerprint.
-    """
+    """Return the record of a finished run without its results."""
     return {
         "photonpano": importlib.metadata.version("photonpano"),
         "status": "done",
@@ -123,11 +99,7 @@ def started_record(
 
 
 def read_record(run_folder: Path) -> RunRecord:
-    """Read the `run.json` of a run folder.
-
-    Raises:
-        InputError: there is none, or it is no record of a run.
-    """
+    """Read the `run.json` of a run folder; `InputError` if there is none, or it is no record of a run."""
     file = run_folder / "run.json"
     if not file.is_file():
         raise InputError(f"{run_folder} has no run.json, so no run has finished in it; give the folder of a finished run")
@@ -171,18 +143,13 @@ def level_record(result: LevelResult) -> LevelRecord:
         "std_px": mean_px if np.isfinite(mean_px) else None,
         "residual_px": located.solution.residual_px,
         "camera": _camera_record(result),
-        "evidence": _evidence_record(located.evidence),
+        "evidence": None if located.evidence is None else _fields(located.evidence),
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
     }
 
 
 def failure_records(groups: Sequence[Group], edges: Sequence[Edge]) -> list[FailureRecord]:
-    """Describe the pairs that were not located.
-
-    Args:
-        groups: of the level.
-        edges: the pairs that were tried.
-    """
+    """Describe the pairs that were not located."""
     return [
         FailureRecord(
             **_pair(groups, edge),
@@ -192,12 +159,6 @@ def failure_records(groups: Sequence[Group], edges: Sequence[Edge]) -> list[Fail
         for edge in edges
         if isinstance(edge.motion, NotLocated)
     ]
-
-
-def _evidence_record(evidence: Evidence | None) -> EvidenceRecord | None:
-    if evidence is None:
-        return None
-    return {"rotation": evidence.rotation, "homography": evidence.homography, "gain": evidence.gain}
 
 
 def _camera_record(result: LevelResult) -> CameraRecord | None:
@@ -215,7 +176,7 @@ def _camera_record(result: LevelResult) -> CameraRecord | None:
 
 def decision_records(decisions: Sequence[Decision]) -> list[DecisionRecord]:
     """Describe what was chosen from the capture."""
-    return [DecisionRecord(what=each.what, value=each.value, reason=each.reason) for each in decisions]
+    return [_fields(each) for each in decisions]
 
 
 def panorama_record(plan: Plan, panorama: RenderedPanorama, rendered: Sequence[Decision]) -> PanoramaRecord:
@@ -244,8 +205,7 @@ def _rounded(decibels: float | None) -> float | None:
 def motion_record(std_px: FloatArray) -> MotionRecord | None:
     """Describe the expected error of the motion; None where no motion is known, as with a single exposure.
 
-    Args:
-        std_px: (T,) expected corner error, infinite where nothing was located.
+    `std_px` is (T,), infinite where nothing was located.
     """
     known = np.flatnonzero(np.isfinite(std_px))
     if not len(known):
@@ -256,24 +216,14 @@ def motion_record(std_px: FloatArray) -> MotionRecord | None:
 
 def verdict_record(verdict: Verdict) -> VerdictRecord:
     """Describe a verdict."""
-    reasons = [_reason(reason) for reason in verdict.reasons]
-    return {"status": verdict.status, "reasons": reasons, "residual_ratio": verdict.residual_ratio}
+    found: VerdictRecord = _fields(verdict) | {"reasons": [_fields(reason) for reason in verdict.reasons]}
+    return found
 
 
 def verdict_of(found: VerdictRecord) -> Verdict:
     """Return the verdict that a record describes."""
     status: Literal["trusted", "doubtful"] = "trusted" if found["status"] == "trusted" else "doubtful"
     return Verdict(status, tuple(Reason(**reason) for reason in found["reasons"]), found["residual_ratio"])
-
-
-def _reason(reason: Reason) -> ReasonRecord:
-    return {
-        "what": reason.what,
-        "figure": reason.figure,
-        "threshold": reason.threshold,
-        "where": reason.where,
-        "what_to_do": reason.what_to_do,
-    }
 
 
 def refinement_record(refinement: Refinement) -> RefinementRecord:
@@ -300,12 +250,43 @@ def levels_decision(results: Sequence[LevelResult]) -> Decision:
     return Decision("levels", len(results), reason)
 
 
+def _fields(described: Any) -> Any:
+    """Return the fields of a dataclass, which are those of its record."""
+    return {each.name: getattr(described, each.name) for each in fields(described)}
+
+
 def _pair(groups: Sequence[Group], edge: Edge) -> PairRecord:
     moving, fixed = groups[edge.moving].span, groups[edge.fixed].span
     return {"moving": [moving.start, moving.stop], "fixed": [fixed.start, fixed.stop]}
 
 
 def _number(value: float) -> float | None:
-    """Convert a number to what JSON can hold: a number of Python, None if it is not finite."""
+    """Return a number as JSON holds it: plain Python, None if it is not finite."""
     plain: float = value.item() if isinstance(value, np.generic) else value
     return plain if np.isfinite(plain) else None
+
+
+def poses_record(estimate: PoseEstimate) -> PosesRecord:
+    """Describe an estimate, in a world in which the path has the length 1."""
+    camera = Camera(estimate.camera_matrix, estimate.distortion)
+    return {
+        "camera": {
+            "focal_px": camera.focal_px,
+            "std_focal_px": _number(estimate.std_focal_px),
+            "centre_px": list(camera.centre_px),
+            "distortion": camera.distortion.tolist(),
+            "std_distortion": [0.0] * 4,
+        },
+        "located": int(estimate.located.sum()),
+        "std_position": _rms(estimate.std_position[estimate.located]),
+        "std_rotation_deg": _rms(estimate.std_rotation_deg[estimate.located]),
+        "points": len(estimate.points.positions),
+        "exposures": len(estimate.views),
+        "lost": [{"frames": [each.span.start, each.span.stop], "reason": each.reason} for each in estimate.lost],
+        "levels": [dict(level) for level in estimate.levels],
+        "doubts": list(estimate.doubts),
+    }
+
+
+def _rms(std: FloatArray) -> float | None:
+    return _number(float(np.sqrt(np.mean(std**2)))) if len(std) else None

@@ -1,4 +1,4 @@
-"""Warn of what is weak in a run: exposures that were not located, outliers, frames whose motion is uncertain."""
+"""Warnings of a run: exposures that were not located, outliers, frames with a large expected error, doubtful poses."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import numpy as np
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.residuals.refinement import Refinement
-from photonpano.values import FloatArray, true_spans
+from photonpano.values import FloatArray, PoseEstimate, true_spans
 
+# Expected corner error above which a warning names the frames: it is likely to be visible.
 UNCERTAIN_PX = 0.5
-"""A warning names the frames whose expected corner error exceeds this: an error of this size is likely to be visible."""
-SHOWN_SPANS = 4
-"""Spans of uncertain frames that a warning names, the worst first."""
+SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst first
+
+
+DOUBTFUL = "doubtful: "  # begins the warnings that are doubts
+_SHOWN_LOST = 3  # spans of lost frames that a warning names
 
 
 def level_warnings(results: Sequence[LevelResult]) -> list[str]:
@@ -57,11 +60,7 @@ def motion_warnings(motion: FrameMotion) -> list[str]:
 
 
 def uncertain_frames(std_px: FloatArray) -> list[str]:
-    """Warn of the frames whose expected error exceeds `UNCERTAIN_PX`.
-
-    Args:
-        std_px: (T,) expected corner error, infinite where nothing was located.
-    """
+    """Warn of frames whose expected error, (T,) and infinite where nothing was located, exceeds `UNCERTAIN_PX`."""
     if not np.isfinite(std_px).any():
         return ["only one exposure was located, so no motion is known: its frames are summed without motion compensation"]
     uncertain = np.isfinite(std_px) & (std_px > UNCERTAIN_PX)
@@ -84,3 +83,14 @@ def refinement_warnings(refinements: Sequence[Refinement]) -> list[str]:
         for each in refinements
         if each.kept_out
     ]
+
+
+def poses_warnings(estimate: PoseEstimate) -> list[str]:
+    """Warn of doubts, and of frames without a pose."""
+    warnings = [f"{DOUBTFUL}{doubt}" for doubt in estimate.doubts]
+    if not estimate.located.all():
+        lost, frames = int((~estimate.located).sum()), len(estimate.located)
+        spans = "; ".join(f"{each.span}: {each.reason}" for each in estimate.lost[:_SHOWN_LOST])
+        more = f"; and {len(estimate.lost) - _SHOWN_LOST} more spans" if len(estimate.lost) > _SHOWN_LOST else ""
+        warnings.append(f"{lost} of {frames} frames have no pose ({spans}{more})")
+    return warnings

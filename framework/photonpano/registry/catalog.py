@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
-from photonpano.contributions import KINDS, Contribution, install_command
+import pluggy
+
+from photonpano.contributions import KINDS, Contribution, Requirement, install_command
 from photonpano.errors import PluginError
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of, require_same_contract
 from photonpano.text import listed, suggestion
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    import pluggy
-
-    from photonpano.contributions import Requirement
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -25,7 +20,6 @@ class Origin:
 
     Attributes:
         plugin: its distribution, such as "photonpano".
-        version: the version of the distribution.
         entry_point: how the distribution names the plugin, such as "core = photonpano_core.hooks".
     """
 
@@ -43,13 +37,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One component on offer.
-
-    Attributes:
-        contribution: the record of the component.
-        origin: the plugin that offers it.
-        missing: libraries that the component needs and that are not installed.
-    """
+    """One component on offer, with the libraries that it needs and that are missing."""
 
     contribution: Contribution
     origin: Origin
@@ -82,12 +70,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class BrokenPlugin:
-    """A plugin that failed to load, and offers nothing.
-
-    Attributes:
-        origin: the plugin.
-        error: what went wrong, in a line.
-    """
+    """A plugin that failed to load, and offers nothing, with what went wrong, in a line."""
 
     origin: Origin
     error: str
@@ -98,12 +81,7 @@ class BrokenPlugin:
 
 @dataclass(frozen=True, slots=True)
 class DisabledPlugin:
-    """A plugin that was not imported, because the environment disables it.
-
-    Attributes:
-        origin: the plugin.
-        by: what disables it, such as "PHOTONPANO_DISABLE_PLUGINS=core".
-    """
+    """A plugin that was not imported, and what disables it, such as "PHOTONPANO_DISABLE_PLUGINS=core"."""
 
     origin: Origin
     by: str
@@ -114,12 +92,7 @@ class DisabledPlugin:
 
 @dataclass(frozen=True, slots=True)
 class Observer:
-    """A plugin with observation hooks.
-
-    Attributes:
-        origin: the plugin.
-        hook: calls the observation hooks of the plugin by their names; a hook that it lacks does nothing.
-    """
+    """A plugin with observation hooks; `hook` calls them by their names, and one that the plugin lacks does nothing."""
 
     origin: Origin
     hook: pluggy.HookRelay

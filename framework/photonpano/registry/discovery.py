@@ -49,7 +49,8 @@ def discover() -> Catalog:
         except BaseException as error:  # whatever the plugin's import does, it is a row
             if is_interrupt(error):
                 raise
-            broken.append(BrokenPlugin(origin, _in_a_line(error)))
+            message = str(error) if isinstance(error, PluginError) else described(error)
+            broken.append(BrokenPlugin(origin, " ".join(message.split())))
     _warn_of_unknown([word for key, word in disabling.items() if key not in set(map(_canonical, names))], names)
     return Catalog(
         ordered(rows),
@@ -71,10 +72,6 @@ def _warn_of_unknown(words: list[str], names: set[str]) -> None:
     hint = suggestion(words[0], names) if len(words) == 1 else f"known: {listed(sorted(names))}"
     are = "is no installed plugin" if len(words) == 1 else "are no installed plugins"
     logger.warning("%s names %s, which %s; %s", DISABLE, listed(map(repr, words)), are, hint)
-
-
-def _in_a_line(error: BaseException) -> str:
-    return " ".join((str(error) if isinstance(error, PluginError) else described(error)).split())
 
 
 def _origin(entry_point: EntryPoint) -> Origin:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pluggy
 
@@ -14,22 +14,16 @@ from photonpano.hookspecs import observation
 from photonpano.interrupts import is_interrupt
 from photonpano.text import listed
 
-if TYPE_CHECKING:
-    from photonpano.contributions import Contribution
-
 PREFIX = f"{hookspecs.PROJECT}_"
 # The hooks that offer nothing: a run calls them, so that a plugin can watch it.
 OBSERVATION_HOOKS = tuple(name for name in vars(observation) if name.startswith(PREFIX))
 # All hooks: those that offer components, in the order in which a run needs these, and those that watch.
 HOOKS = (*(kind.hook for kind in KINDS.values()), *OBSERVATION_HOOKS)
-MAX_OFFERED = 1000  # most components that a hook may offer
+MAX_OFFERED = 1000  # maximum number of components of a hook
 
 
 def contributions_of(plugin: object) -> tuple[Contribution, ...]:
-    """Call the hooks of one plugin that offer components, and check what they return.
-
-    Args:
-        plugin: a module, or any object, with hooks.
+    """Call the hooks of one plugin, a module or any object, that offer components, and check what they return.
 
     Raises:
         PluginError: a hook is unknown, lacks its mark, takes arguments that it does not have, raises, or offers something of
@@ -40,22 +34,14 @@ def contributions_of(plugin: object) -> tuple[Contribution, ...]:
 
 
 def observation_of(plugin: object) -> pluggy.HookRelay | None:
-    """Return the caller of a plugin's observation hooks; None if it has none.
-
-    Raises:
-        PluginError: a hook is unknown, lacks its mark, or takes arguments that it does not have.
-    """
+    """Return the caller of a plugin's observation hooks, None if it has none; errors as in `contributions_of`."""
     manager = _registered(plugin)
     implemented = {caller.name for caller in manager.get_hookcallers(plugin) or ()}
     return manager.hook if implemented.intersection(OBSERVATION_HOOKS) else None
 
 
 def require_same_contract(contribution: Contribution) -> None:
-    """Refuse a contribution that was made for another version of the contract.
-
-    Raises:
-        PluginError: the message has both versions, and what to upgrade.
-    """
+    """Raise `PluginError` if a contribution was made for another version of the contract."""
     made_for = contribution.api_version
     if made_for == API_VERSION:
         return

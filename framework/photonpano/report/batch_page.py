@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -15,46 +14,15 @@ from urllib.parse import quote
 
 import numpy as np
 
-from photonpano.record.batch_row import BatchRow, written
+from photonpano.record.batch_row import FIGURES, BatchRow, written
 from photonpano.report.drawing import INK, MUTED, SERIES, WIDTH_IN, Margins, add_axes, plain_figure, svg_of
 from photonpano.report.environment import filled, yaml_of
-from photonpano.text import byte_size, count, duration, pixels
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
 
 
 _COLOURS = {"trusted": "good", "done": "good", "doubtful": "bad", "failed": "bad", "interrupted": "bad"}
-
-
-@dataclass(frozen=True, slots=True)
-class _Column:
-    """A column of figures, which is shown where a run has one."""
-
-    title: str
-    figure: str
-    write: Callable[[Any], str]
-
-    def written(self, row: BatchRow) -> str:
-        """Return the figure of a run; a dash if it has none."""
-        value = getattr(row, self.figure)
-        return "\N{EN DASH}" if value is None else self.write(value)
-
-
-def _percent(share: float) -> str:
-    return f"{pixels(100 * share)} %"
-
-
-_COLUMNS = (
-    _Column("expected error", "expected_error_px", lambda value: f"{pixels(value)} px"),
-    _Column("true error", "true_error_px", lambda value: f"{pixels(value)} px"),
-    _Column("PSNR", "psnr_db", lambda value: f"{value:.1f} dB"),
-    _Column("expected error", "expected_position_error", _percent),
-    _Column("true error", "true_position_error", _percent),
-    _Column("frames", "n_frames", count),
-    _Column("time", "seconds", duration),
-    _Column("peak memory", "peak_memory_bytes", byte_size),
-)
 
 
 def render_batch(
@@ -66,12 +34,8 @@ def render_batch(
 ) -> str:
     """Return the summary of a batch as one HTML page that needs no other file, no network and no script.
 
-    Args:
-        directory: the folder of the page, from which it links to the reports of the runs.
-        rows: all runs.
-        spec: the text of the spec, or its data.
-        common: what was changed in it for all runs.
-        keys: the swept keys.
+    The page lies in `directory`. `spec` is its text, or its data, `common` what was changed in it for all runs, and `keys` are
+    the swept keys.
     """
     figures = {key: errors_over_setting(rows, key, number) for number, key in enumerate(keys)}
     return filled(
@@ -84,7 +48,7 @@ def render_batch(
         numbers=Counter(row.verdict or row.status for row in rows),
         colours=_COLOURS,
         link_of=partial(_link, directory),
-        columns=[each for each in _COLUMNS if any(getattr(row, each.figure) is not None for row in rows)],
+        columns={name: title for name, (title, _) in FIGURES.items() if any(getattr(row, name) is not None for row in rows)},
         pictures=any(row.thumbnail for row in rows),
         has_truth=any(row.true_error_px is not None or row.true_position_error is not None for row in rows),
         of_positions=any(row.expected_position_error is not None for row in rows),
@@ -102,8 +66,7 @@ def _link(directory: Path, row: BatchRow) -> str | None:
     return None if row.report is None else quote(os.fsencode(Path(os.path.relpath(row.report, directory)).as_posix()))
 
 
-COLOURED = len(SERIES)
-"""Number of lines up to which each has a colour and a name."""
+COLOURED = len(SERIES)  # number of lines up to which each has a colour and a name
 _ERRORS = {
     "true_error_px": "true error (px)",
     "expected_error_px": "expected error (px)",
@@ -115,13 +78,7 @@ _ERRORS = {
 def errors_over_setting(rows: Sequence[BatchRow], key: str, number: int = 0) -> str | None:
     """Draw the errors of runs over a swept setting, a line for each capture and for what else is swept.
 
-    Args:
-        rows: all runs.
-        key: of the setting. Numbers are drawn to scale, other values at equal distances.
-        number: of the figure on its page.
-
-    Returns:
-        SVG; None if no run that is done has an error.
+    Numbers are drawn to scale, other values at equal distances. None if no run that is done has an error.
     """
     errors = [name for name in _ERRORS if any(getattr(row, name) is not None for row in rows)]
     if not errors:

@@ -15,30 +15,37 @@ from numpy.typing import NDArray
 
 from photonpano.record.schema import RunRecord
 from photonpano.registry.description import flow
-from photonpano.report.drawing import INK, SERIES, WIDTH_IN, Margins, add_axes, jpeg_uri, plain_figure, svg_of
+from photonpano.report.drawing import (
+    INK,
+    SERIES,
+    WIDTH_IN,
+    Margins,
+    add_axes,
+    jpeg_uri,
+    mark_frames,
+    mark_logarithmic,
+    plain_figure,
+    svg_of,
+)
 from photonpano.report.environment import filled
 from photonpano.report.figures import instants_of
 from photonpano.text import byte_size, count, duration, pixels, share
 from photonpano.values import FloatArray
 
-_MOST_DIFFERENCES = 60
-"""Number of settings that are listed."""
+_MOST_DIFFERENCES = 60  # number of settings that are listed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ComparedRun:
-    """A run that is laid beside others.
+    """A run that is compared with others.
 
     Attributes:
         name: short, and different from those of the others.
-        folder: the run folder.
-        record: its run.json.
         picture: (H, W) or (H, W, 3) uint8, its panorama on the canvas of the first run.
         difference_px: (T,) mean distance of the corners of each frame from where the first run has them, after the best
             alignment of the planes, in px of a frame; NaN where either has not located it. None for the first run.
         corner_error_px: mean distance of the corners from their true places; None without a truth.
-        psnr_db: of the panorama; None without a true scene.
-        ssim: of the panorama; None without a true scene.
+        psnr_db: of the panorama, as is `ssim`; None without a true scene.
     """
 
     name: str
@@ -57,12 +64,7 @@ class ComparedRun:
 
 
 def render_comparison(runs: Sequence[ComparedRun], output: Path) -> str:
-    """Return the page as HTML that needs no other file and no network.
-
-    Args:
-        runs: at least two.
-        output: where the page will lie; it links to the reports of the runs from there.
-    """
+    """Return the page as HTML that needs no other file and no network, and links to the reports of at least two runs."""
     first = runs[0].record
     shown, hidden = _differing([run.record["spec"] for run in runs])
     return filled(
@@ -82,8 +84,6 @@ def render_comparison(runs: Sequence[ComparedRun], output: Path) -> str:
 
 def differences_over_time(runs: Sequence[ComparedRun]) -> str:
     """Draw how far the motion of each run is from that of the first, frame by frame."""
-    from matplotlib.ticker import LogLocator
-
     others = [run for run in runs if run.difference_px is not None]
     with plain_figure(WIDTH_IN, 3.0) as figure:
         [axes] = add_axes(figure, Margins(right=0.3, top=0.4))
@@ -91,14 +91,9 @@ def differences_over_time(runs: Sequence[ComparedRun]) -> str:
             assert run.difference_px is not None
             frames = instants_of(len(run.difference_px))
             axes.plot(frames, run.difference_px[frames], color=colour, label=run.name)
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-        axes.yaxis.set_minor_formatter("{x:g}")
+        mark_logarithmic(axes)
         axes.set_ylabel("difference (px)")
-        axes.set_xlabel("frame")
-        axes.xaxis.set_major_formatter("{x:,.0f}")
-        axes.set_xlim(-0.5, runs[0].record["source"]["n_frames"] - 0.5)
+        mark_frames(axes, 0, runs[0].record["source"]["n_frames"])
         figure.legend(loc="upper left", ncols=5, handlelength=1.2)
         return svg_of(figure, "differences")
 

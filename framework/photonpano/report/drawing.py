@@ -24,11 +24,9 @@ JPEG_QUALITY = 90
 WIDTH_IN = 10.0
 MAX_MAP_HEIGHT_IN = 5.0
 MIN_MAP_IN = 0.8
-BAR_IN = 1.0
-"""Room for a colour bar to the right of a map, with its numbers and its label."""
+BAR_IN = 1.0  # room for a colour bar to the right of a map, with its numbers and its label
 MAP_PIXELS = 1000
-_X_LABEL_IN, _Y_LABEL_IN, _BAR_LABEL_IN = 0.25, 0.55, 0.45
-"""Distance of the labels of axes, and of colour bars, from these."""
+_X_LABEL_IN, _Y_LABEL_IN, _BAR_LABEL_IN = 0.25, 0.55, 0.45  # distance of the labels of axes, and of colour bars, from these
 
 # matplotlib knows no CSS variables: each of these stand-ins is replaced by one in the finished SVG.
 INK, MUTED, LINE, PAPER, BAD = "#010101", "#010102", "#010103", "#010104", "#010105"
@@ -107,13 +105,7 @@ def add_axes(
 ) -> list[Axes]:
     """Add axes in a column or in a row, with their labels at fixed distances.
 
-    Args:
-        figure: a new one.
-        margins: around all axes.
-        rows: relative heights of the rows.
-        columns: number of equal columns.
-        gap_in: room between axes.
-        share_x: whether all have one range of x.
+    The rows have these relative heights, and the columns are equal.
     """
     from matplotlib.transforms import ScaledTranslation
 
@@ -181,14 +173,7 @@ def _show_pixels(axes: Axes, height: int, width: int) -> None:
 
 
 def add_colour_bar(axes: Axes, image: Any, label: str, numbers: str) -> Colorbar:
-    """Add the colours of an image to the right of its axes.
-
-    Args:
-        axes: with `BAR_IN` inches of room.
-        image: drawn in them.
-        label: of the colours.
-        numbers: their format.
-    """
+    """Add the colours of an image to the right of its axes, which have `BAR_IN` inches of room there."""
     from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
     figure: Any = axes.get_figure(root=True)
@@ -215,6 +200,23 @@ def svg_of(figure: Figure, name: str) -> str:
     for stand_in, variable in _VARIABLES.items():
         svg = svg.replace(stand_in, variable)
     return svg.strip()
+
+
+def mark_frames(axes: Axes, start: int, stop: int) -> None:
+    """Let the x axis count the frames of a span."""
+    axes.set_xlabel("frame")
+    axes.set_xlim(start - 0.5, stop - 0.5)
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+
+
+def mark_logarithmic(axes: Axes) -> None:
+    """Make the y axis logarithmic, with numbers at 1, 2 and 5."""
+    from matplotlib.ticker import LogLocator
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+    axes.yaxis.set_minor_formatter("{x:g}")
 
 
 def add_time_axis(axes: Axes, n_frames: int, frame_rate_hz: float) -> None:

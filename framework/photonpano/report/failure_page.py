@@ -15,26 +15,17 @@ from photonpano.record.schema import FailureRecord, RunRecord
 from photonpano.report import figures
 from photonpano.report.drawing import jpeg_uri, shrunk
 from photonpano.report.environment import filled
-from photonpano.report.page import head_of
-from photonpano.report.tables import FailureGroup, failure_groups
+from photonpano.report.page import FailureGroup, failure_groups, head_of
 from photonpano.values import NotLocated, VirtualExposure
 
-MAX_PAIRS = 8
-"""Number of pairs whose exposures are shown."""
-EXPOSURE_PIXELS = 480
-"""Longer side of an exposure on the page."""
+MAX_PAIRS = 8  # number of pairs whose exposures are shown
+EXPOSURE_PIXELS = 480  # longer side of an exposure on the page
 _WHITE_QUANTILE = 0.995
 
 
 @dataclass(frozen=True, slots=True)
 class ShownPair:
-    """A pair that was not located, to look at.
-
-    Attributes:
-        failure: its frames and its reason.
-        moving: its exposure, as a data URI.
-        fixed: the other one.
-    """
+    """A pair that was not located, with its exposures as data URIs."""
 
     failure: FailureRecord
     moving: str
@@ -44,9 +35,8 @@ class ShownPair:
 def render_failure(record: RunRecord, error: PhotonpanoError) -> str:
     """Return the report of a run that failed as one HTML page that needs no other file and no network.
 
-    Args:
-        record: as `run.json` would be, with the status "failed" and the levels that were finished.
-        error: that ended the run. Of an `UntiedError` the page shows the pairs that were not located.
+    The record has the status "failed" and the levels that were finished. Of an `UntiedError` the page shows the pairs that were
+    not located.
     """
     lost = error if isinstance(error, UntiedError) else None
     failed = [] if lost is None else failure_records(lost.groups, lost.edges)
@@ -73,13 +63,7 @@ def _lines(error: PhotonpanoError) -> list[str]:
 
 
 def _shown(lost: UntiedError, failures: Sequence[FailureRecord], groups: Sequence[FailureGroup]) -> list[ShownPair]:
-    """Return some pairs of each reason with their exposures; none where these cannot be merged again.
-
-    Args:
-        lost: the error.
-        failures: of all its pairs that were not located, in order.
-        groups: the same by their reasons.
-    """
+    """Return some pairs of each reason with their exposures; none where these cannot be merged again."""
     if lost.merged is None:
         return []
     edges = [edge for edge in lost.edges if isinstance(edge.motion, NotLocated)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,8 @@ from photonpano.report.drawing import (
     add_time_axis,
     extent_of,
     map_figure,
+    mark_frames,
+    mark_logarithmic,
     plain_figure,
     shrunk,
     svg_of,
@@ -35,22 +36,15 @@ from photonpano.report.drawing import (
 from photonpano.text import duration
 from photonpano.values import FloatArray, FluxImage, Group, true_spans
 
-if TYPE_CHECKING:  # importing matplotlib takes a second
-    from matplotlib.axes import Axes
+MAX_INSTANTS = 1500  # maximum number of instants at which a trajectory is drawn
 
-MAX_INSTANTS = 1500
-"""Number of instants at which a long trajectory is drawn, evenly spaced."""
-
-MAX_PARTS = 5
-"""Number of parts of a motion graph that have a row of their own."""
+MAX_PARTS = 5  # maximum number of parts of a motion graph with a row of their own
 
 STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "interpolate": "interpolate"}
 
 
 def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
     """Draw the position and the speed of the frame centre, and the expected corner error, over time."""
-    from matplotlib.ticker import LogLocator
-
     instants = instants_of(len(motion.homographies))
     path, unit = _path(motion, instants)
     with plain_figure(WIDTH_IN, 6.0) as figure:
@@ -69,16 +63,12 @@ def path_over_time(motion: FrameMotion, frame_rate_hz: float | None) -> str:
         speed.set_ylabel(f"speed ({unit}/frame)")
         known = np.where(np.isfinite(motion.std_px), motion.std_px, np.nan)
         error.plot(instants, known[instants], color=INK)
-        error.set_yscale("log")
-        error.yaxis.set_major_formatter("{x:g}")
-        error.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-        error.yaxis.set_minor_formatter("{x:g}")
+        mark_logarithmic(error)
         error.set_ylabel("expected error (px)")
-        error.set_xlabel("frame")
-        error.set_xlim(-0.5, len(motion.homographies) - 0.5)
-        error.xaxis.set_major_formatter("{x:,.0f}")
+        mark_frames(error, 0, len(motion.homographies))
         for axes in (position, speed, error):
-            _shade_not_located(axes, motion)
+            for span in true_spans(~motion.located):
+                axes.axvspan(span.start - 0.5, span.stop - 0.5, color=MUTED, alpha=0.18, linewidth=0)
         if frame_rate_hz is not None and len(instants) > 1:
             add_time_axis(position, len(motion.homographies), frame_rate_hz)
         return svg_of(figure, "path-over-time")
@@ -133,11 +123,7 @@ def _cut_at_seam(path: FloatArray, width: int) -> FloatArray:
 
 
 def coverage_map(coverage: FluxImage) -> str:
-    """Draw the number of frames that saw each pixel of the panorama, in any colour; unseen pixels are grey.
-
-    Args:
-        coverage: (H, W), or (H, W, 3) of red, green and blue pixels.
-    """
+    """Draw the number of frames that saw each pixel, (H, W) or (H, W, 3), in any colour; unseen pixels are grey."""
     coverage = coverage if coverage.ndim == 2 else coverage.sum(axis=-1)
     height, width = coverage.shape
     with map_figure(height, width, side_in=BAR_IN) as (figure, axes):
@@ -151,9 +137,7 @@ def coverage_map(coverage: FluxImage) -> str:
 def tied_parts(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
     """Draw the exposures of a level over the frames: a row for each part that is tied together, and one for lone exposures.
 
-    Args:
-        groups: of the level.
-        parts: (N,) number of the connected component of each exposure, 0 for the largest.
+    `parts` is (N,), the number of the connected component of each exposure, 0 for the largest.
     """
     sizes = np.bincount(parts)
     tied = np.flatnonzero(sizes > 1)[:MAX_PARTS]
@@ -168,12 +152,10 @@ def tied_parts(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
             axes.broken_barh(spans, (row - 0.32, 0.64), facecolors=colour, edgecolor=PAPER, linewidth=0.6)
         axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
         axes.set_ylim(len(rows) - 0.5, -0.5)
-        axes.set_xlim(groups[0].span.start - 0.5, groups[-1].span.stop - 0.5)
         axes.grid(visible=False, axis="y")
         axes.spines["left"].set_visible(False)
         axes.tick_params(axis="y", colors=INK)
-        axes.xaxis.set_major_formatter("{x:,.0f}")
-        axes.set_xlabel("frame")
+        mark_frames(axes, groups[0].span.start, groups[-1].span.stop)
         return svg_of(figure, "tied-parts")
 
 
@@ -210,8 +192,3 @@ def instants_of(n_frames: int, most: int = MAX_INSTANTS) -> NDArray[np.int64]:
 def centre_of(frame_shape: tuple[int, int]) -> FloatArray:
     """Return the centre of a frame: (1, 2)."""
     return np.asarray(corners(frame_shape).mean(axis=0, keepdims=True))
-
-
-def _shade_not_located(axes: Axes, motion: FrameMotion) -> None:
-    for span in true_spans(~motion.located):
-        axes.axvspan(span.start - 0.5, span.stop - 0.5, color=MUTED, alpha=0.18, linewidth=0)

@@ -43,10 +43,6 @@ class LiveFigures:
 def render_live(figures: LiveFigures, title: str, picture: str | None, report: str) -> str:
     """Return the page, which loads itself anew each second as long as the run goes on.
 
-    Args:
-        figures: how far the run is.
-        title: the name of the run folder.
-        picture: the address of the picture so far; None as long as there is none.
-        report: the address of the report, once there is one.
+    `picture` and `report` are addresses; None as long as there is no picture.
     """
     return filled("live.html", figures=figures, title=title, picture=picture, report=report)

@@ -11,17 +11,11 @@ from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import shrunk
 from photonpano.text import counted, duration, pixels, share
 
-_MAX_PIXELS = 900
-"""Longer side of the picture."""
+_MAX_PIXELS = 900  # longer side of the picture
 
 
 def run_html(folder: Path, record: RunRecord) -> str:
-    """Return what a notebook shows of a run.
-
-    Args:
-        folder: the run folder; a picture that is no longer there is left out.
-        record: the content of its run.json.
-    """
+    """Return what a notebook shows of a run; a picture that is no longer there is left out."""
     return _picture(folder / "panorama.png") + facts(_rows(record, from_here(folder)))
 
 

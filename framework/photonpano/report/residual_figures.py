@@ -1,4 +1,4 @@
-"""The figures of what the panorama does not explain: maps of the misfit, brightness and shifts over the sensor, spectra."""
+"""Figures of the residuals: maps of the misfit, brightness and shifts over the sensor, spectra."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from photonpano.report.drawing import (
     extent_of,
     map_figure,
     maps_figure,
+    mark_frames,
     plain_figure,
     svg_of,
 )
@@ -33,34 +34,22 @@ from photonpano.values import FloatArray, Light
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
 
-MAX_DOTS = 500
-"""Number of spans whose shifts are drawn, evenly spaced."""
-SMALLEST_SHIFT_PX = 0.06
-"""Shifts of blocks are drawn if their root mean square exceeds this, and three times their noise."""
-_FEWEST_BLOCKS = 16
-"""Blocks that must have fallen on a square of the panorama."""
-_FEWEST_SPANS = 16
-"""Fewer spans than this have no spectrum."""
-_WINDOW_SPANS = 512
-"""Longest window of the spectrum."""
-_MISFIT_RANGE = (0.5, 2.0)
-"""The smallest range of colours of the misfit; the largest misfit that is drawn may widen it."""
+MAX_DOTS = 500  # maximum number of spans whose shifts are drawn
+SMALLEST_SHIFT_PX = 0.06  # shifts of blocks are drawn if their root mean square exceeds this, and three times their noise
+_FEWEST_BLOCKS = 16  # minimum number of blocks per square of the panorama
+_FEWEST_SPANS = 16  # minimum number of spans for a spectrum
+_WINDOW_SPANS = 512  # maximum window of the spectrum
+_MISFIT_RANGE = (0.5, 2.0)  # minimum colour range of the misfit, widened by larger values
 _MISFIT_TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-_FLICKER_PIXELS = 200
-"""Longer side of the maps of the flicker, about."""
-_FLICKERS = 0.2
-"""Places flicker if they do so by this share of the deepest flicker."""
-_GAIN_RANGE_PERCENT = 5.0
-"""The smallest range of colours of the brightness, to both sides."""
+_FLICKER_PIXELS = 200  # approximate longer side of flicker maps
+_FLICKERS = 0.2  # minimum amplitude with a phase, relative to the largest amplitude
+_GAIN_RANGE_PERCENT = 5.0  # minimum colour range of the brightness, to both sides
 
 
 def misfit_over_panorama(residuals: Residuals, measured: Canvas, canvas: Canvas) -> str:
     """Draw the misfit of each place of the panorama.
 
-    Args:
-        residuals: of the run.
-        measured: the canvas of the panorama of the residuals, on which the misfit is drawn if the projections differ.
-        canvas: of the panorama.
+    On its canvas, or on the one on which the residuals were `measured` if that has another projection.
     """
     same = same_projection(measured, canvas)
     shape, onto = (canvas.shape, canvas.transform) if same else (measured.shape, measured.transform)
@@ -83,10 +72,7 @@ def same_projection(one: Canvas, other: Canvas) -> bool:
 def misfit_cells(residuals: Residuals, measured: Canvas, onto: FloatArray) -> tuple[Any, tuple[float, float, float, float]]:
     """Return the misfit over the panorama, masked where it was seen too briefly, and its box.
 
-    Args:
-        residuals: of the run.
-        measured: the canvas of the panorama of the residuals.
-        onto: (3, 3) transform of the canvas in whose pixels the box is: left, top, right, bottom.
+    The box is left, top, right, bottom in the pixels of the canvas with the transform `onto`.
     """
     misfit = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_misfit))
     rows, columns = misfit.shape
@@ -100,7 +86,7 @@ def over_sensor(residuals: Residuals) -> str:
     height, width = residuals.frame_shape
     shifts = significant_shifts(residuals)
     with maps_figure(height, width, 2 if shifts is None else 3) as (figure, maps):
-        extent = _blocks_extent(residuals)
+        extent = extent_of(*(BLOCK_PX * n_blocks for n_blocks in residuals.block_misfit.shape))
         misfit = np.ma.masked_invalid(residuals.block_misfit)
         image = maps[0].imshow(misfit, **_misfit_colours(residuals), extent=extent, interpolation="nearest")
         _add_colour_bar(maps[0], image, "misfit")
@@ -128,10 +114,8 @@ def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
             time.plot([], [], "o", color=colour, markersize=4, label=name)
         limit = float(np.nanquantile(np.abs(np.c_[steps[shown], 1.5 * band]), 0.995))
         time.set_ylim(-1.1 * limit, 1.1 * limit)
-        time.set_xlim(-0.5, residuals.spans[-1].stop - 0.5)
+        mark_frames(time, 0, residuals.spans[-1].stop)
         time.set_ylabel("shift (px)")
-        time.set_xlabel("frame")
-        time.xaxis.set_major_formatter("{x:,.0f}")
         time.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, handletextpad=0.2, columnspacing=1.2)
         _draw_spectrum(spectrum, residuals, frame_rate_hz)
         return svg_of(figure, "shifts")
@@ -146,21 +130,14 @@ def light_over_time(residuals: Residuals) -> str | None:
         [axes] = add_axes(figure, Margins())
         axes.axhline(1, color=MUTED, linewidth=1, linestyle="--")
         axes.plot(residuals.instants, gain, color=SERIES[0])
-        axes.set_xlim(-0.5, residuals.spans[-1].stop - 0.5)
+        mark_frames(axes, 0, residuals.spans[-1].stop)
         axes.set_ylim(0, 1.05 * float(gain.max()))
         axes.set_ylabel("light / mean")
-        axes.set_xlabel("frame")
-        axes.xaxis.set_major_formatter("{x:,.0f}")
         return svg_of(figure, "light")
 
 
 def flicker_over_panorama(light: Light | None, canvas: Canvas) -> str | None:
-    """Draw how deep each place flickers, and at which phase; None if all of the scene has the same light.
-
-    Args:
-        light: of the capture; None if it is steady.
-        canvas: of the panorama.
-    """
+    """Draw how deep each place flickers, and at which phase; None if all of the scene has the same light."""
     if light is None or not light.has_lamps:
         return None
     shape = canvas.shape
@@ -184,10 +161,7 @@ def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     """Return the power spectrum of the shifts of short spans, divided by that of their photon noise.
 
     It is the mean of windows that overlap by half, and of both directions (Welch 1967). The mean shift is left out: it moves
-    the whole panorama.
-
-    Returns:
-        (F,) frequencies in cycles per frame, and (F,) power; 1 is noise. Both are empty for fewer than 16 spans.
+    the whole panorama. Returns (F,) frequencies in cycles per frame, and (F,) power; both empty for fewer than 16 spans.
     """
     found = residuals.steps()
     stds = _noise_px(found.information)
@@ -242,11 +216,6 @@ def _noise_px(information: FloatArray) -> FloatArray:
     """Return the standard deviation of the shifts along x and y that noise and interpolation explain: (S, 2)."""
     with np.errstate(divide="ignore"):
         return np.asarray(np.sqrt(1 / np.diagonal(information, axis1=1, axis2=2)[:, :2].clip(min=0) + SYSTEMATIC_PX**2))
-
-
-def _blocks_extent(residuals: Residuals) -> tuple[float, float, float, float]:
-    rows, columns = residuals.block_misfit.shape
-    return extent_of(rows * BLOCK_PX, columns * BLOCK_PX)
 
 
 def _add_colour_bar(axes: Axes, image: Any, label: str, numbers: str = "{x:.3g}") -> None:

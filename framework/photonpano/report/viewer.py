@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
-from photonpano.photometry import WhiteBalance, balanced, flux_std, tone_mapped
+from photonpano.photometry import balanced, flux_std, tone_mapped
 from photonpano.protocols import Source
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
@@ -25,44 +25,32 @@ from photonpano.report.residual_figures import misfit_cells, same_projection
 from photonpano.residuals.refinement import Explained, distance_to_nearest
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
+# Maximum number of values of linear data, some megabytes; a larger panorama is reduced.
 LINEAR_VALUES = 1_200_000
-"""Most values of linear data on a page, which keeps it below some megabytes; a larger panorama is reduced."""
-CODES = 4095
-"""Codes of 12 bits, logarithmic in the flux."""
-DECADES = 5.0
-"""Range of the codes, in powers of ten below the highest flux: a step is 0.28 %."""
-MAP_PIXELS = 500
-"""Longer side of a map."""
+CODES = 4095  # codes of 12 bits, logarithmic in the flux
+DECADES = 5.0  # range of the codes, in powers of ten below the highest flux: a step is 0.28 %
+MAP_PIXELS = 500  # longer side of a map
+# Number of short sums of frames on the page; fewer in colour, where a sum takes a hundred times as long.
 GLIMPSES, COLOURED_GLIMPSES = 40, 12
-"""Instants of which the page shows what the camera saw; fewer in colour, where a sum takes a hundred times as long."""
 GLIMPSE_PIXELS = 240
-VIEW_PIXELS = 1000
-"""Longer side of the pictures of one instant."""
-_INSTANTS = 600
-"""Frames whose outline is on the page."""
-_COLOURS = 6
-"""Colours of a legend, between which a browser blends."""
+VIEW_PIXELS = 1000  # longer side of the pictures of one instant
+_INSTANTS = 600  # number of frames whose outline is on the page
+_COLOURS = 6  # colours of a legend, between which a browser blends
 
 
 def viewer_data(
     record: RunRecord, explained: Explained, panorama: RenderedPanorama, source: Source, levels: Sequence[LevelResult]
 ) -> dict[str, Any]:
-    """Return what the viewer needs, as plain data for JSON. Frames are read, and exposures merged again.
-
-    Args:
-        record: the content of `run.json`.
-        explained: the motion of every frame, and what the panorama does not explain.
-        panorama: the panorama.
-        source: the capture, still open.
-        levels: whose exposures of one instant are shown.
-    """
+    """Return what the viewer needs, as plain data for JSON. Frames are read, and exposures merged again."""
     motion, white = explained.motion, panorama.white_flux
     render = record["spec"].get("render") or {}
+    balance: Any = render.get("white_balance", "none")
+    balance = balance if isinstance(balance, str) else tuple(balance)
     instant = shared_instant(motion, levels)
     spans = [len(span) for span in explained.residuals.spans]
     return {
         "size": [panorama.canvas.width, panorama.canvas.height],
-        "linear": linear_data(balanced(panorama.thumbnail.flux, cast(WhiteBalance, _balance(render))), white),
+        "linear": linear_data(balanced(panorama.thumbnail.flux, balance), white),
         "picture": None if (render.get("tone") or "srgb") == "srgb" else jpeg_uri(shrunk(panorama.picture, VIEW_PIXELS)),
         "maps": [*panorama_maps(panorama, source), *_misfit_map(explained, panorama.canvas)],
         "path": path_data(motion, panorama),
@@ -73,20 +61,11 @@ def viewer_data(
     }
 
 
-def _balance(render: Any) -> Any:
-    found = render.get("white_balance", "none")
-    return found if isinstance(found, str) else tuple(found)
-
-
 def linear_data(flux: FluxImage, white: float) -> dict[str, Any]:
     """Encode flux for a browser: `low * (high / low) ** ((code - 1) / (codes - 1))`, and the code 0 where nothing was seen.
 
     Codes take two bytes; all high bytes come before all low ones, and `zlib` packs them. So a browser needs no decoder of
-    pictures, which may change colours.
-
-    Args:
-        flux: (H, W) or (H, W, 3); NaN where nothing was seen.
-        white: flux that is white at first.
+    pictures, which may change colours. The flux is (H, W) or (H, W, 3), NaN where nothing was seen.
     """
     channels = 1 if flux.ndim == 2 else flux.shape[2]
     seen = np.isfinite(flux)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from heapq import nsmallest
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import ConfigDict, Field
 
@@ -17,24 +17,19 @@ from photonpano.hookspecs import hookimpl
 from photonpano.interrupts import is_interrupt
 from photonpano.paths import Location, Url
 from photonpano.reading import objections, require_there
+from photonpano.registry import Catalog, Entry
 from photonpano.specs.checks import complaints
 from photonpano.specs.components import LocatorAlias, SourceAlias
 from photonpano.specs.plan import Choice
-from photonpano.specs.validation import validate
+from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, from_python
 from photonpano.text import listed
 from photonpano.values import Decision
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from photonpano.registry import Catalog, Entry
-    from photonpano.specs.spec import Spec
-
 logger = logging.getLogger(__name__)
 
 _SHOWN = 3  # names of a folder in a message
-_SEARCHED = 1000  # files of a folder whose endings are compared with those of sources
+_SEARCHED = 1000  # maximum number of files of a folder whose endings are compared with those of sources
 _MOST_BACKENDS = 16  # locators of a chain
 
 
@@ -145,10 +140,9 @@ def ask_sources(catalog: Catalog, path: Location) -> tuple[list[tuple[Entry, Rec
 
 
 def _near_misses(spec: Spec, keys: Written, path: Location) -> Iterator[tuple[str, str]]:
-    """Yield the problems that sources have with a capture whose files end as theirs do, and whose keys they accept.
+    """Yield the problems that sources have with a capture whose files end as theirs do, with the name of each source.
 
-    Returns:
-        The name of the source, and the problem.
+    Only sources count that accept the keys.
     """
     files = [path] if isinstance(path, Url) or path.is_file() else islice(path.rglob("*"), _SEARCHED)
     endings = {path.suffix.lower(), *(each.suffix.lower() for each in files)}

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.contributions import MergerContribution
-from photonpano.corrections import FlatField
-from photonpano.errors import described
+from photonpano.corrections import Correction, FlatField
+from photonpano.errors import Problem, described
 from photonpano.interrupts import is_interrupt
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from photonpano.corrections import Correction
-    from photonpano.errors import Problem
-    from photonpano.specs.plan import Choice, LevelPlan, Plan
-    from photonpano.specs.settings import CameraSettings, MotionSettings
-    from photonpano.specs.spec import Spec
-    from photonpano.values import StreamInfo
+from photonpano.specs.plan import Choice, LevelPlan, Plan
+from photonpano.specs.settings import CameraSettings, MotionSettings
+from photonpano.specs.spec import Spec
+from photonpano.values import StreamInfo
 
 MAX_COMPLAINTS = 100  # of one component that are reported
 
@@ -26,10 +21,7 @@ MAX_COMPLAINTS = 100  # of one component that are reported
 def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
     """Check a plan against its capture: all stages, refiners and the renderer, and the reference frame.
 
-    Reads no data. What levels share is reported once.
-
-    Returns:
-        The problems, each at its place in the spec; empty if there are none.
+    Reads no data. What levels share is reported once, and each problem at its place in the spec.
     """
     choices = [] if plan.pose is None else [plan.pose]
     for level in plan.levels:
@@ -58,13 +50,7 @@ def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
 
 
 def check_settings(found: dict[str, Any], posed: bool, spec: Spec) -> None:
-    """Check the framework's own sections against each other.
-
-    Args:
-        found: the settings of each section; None where they have problems.
-        posed: whether the run finds poses instead of a panorama.
-        spec: problems are added here.
-    """
+    """Check the settings of each section, None where they have problems, against each other; problems go to the spec."""
     motion, camera, output, render = (found[name] for name in ("motion", "camera", "output", "render"))
     if motion is not None and camera is not None:
         _check_camera(motion, camera, posed, spec)
@@ -102,14 +88,7 @@ def _check_camera(motion: MotionSettings, camera: CameraSettings, posed: bool, s
 
 
 def check_flat_field(corrections: Iterable[Correction], levels: Iterable[LevelPlan], posed: bool, spec: Spec) -> None:
-    """Refuse a flat field where nothing can be divided by it.
-
-    Args:
-        corrections: of the spec.
-        levels: all levels.
-        posed: whether the run finds poses.
-        spec: problems are added here.
-    """
+    """Refuse a flat field where nothing can be divided by it."""
     index = next((place for place, each in enumerate(corrections) if isinstance(each, FlatField)), None)
     if index is None:
         return

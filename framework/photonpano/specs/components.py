@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
-from photonpano.contributions import KINDS, ExporterContribution, LocatorContribution, SourceContribution
+from photonpano.contributions import KINDS, ExporterContribution, Kind, LocatorContribution, SourceContribution
 from photonpano.errors import PluginError, described
 from photonpano.interrupts import is_interrupt
+from photonpano.registry import Entry
 from photonpano.specs.plan import Choice
-from photonpano.specs.validation import validate
+from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, given
 from photonpano.text import listed
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from photonpano.contributions import Kind
-    from photonpano.registry import Entry
-    from photonpano.specs.spec import Spec
 
 # The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks.
 DEFAULT_FALLBACK = "opencv-sift"
@@ -35,8 +30,7 @@ def _unbuilt(*_: object) -> NoReturn:
 class Alias:
     """A name that stands for other components, so that nothing is built of it.
 
-    Attributes:
-        expand: rewrites a section into one that uses other components; None if there are problems, which it adds to the spec.
+    `expand` rewrites a section into one that uses these; None if there are problems, which it adds to the spec.
     """
 
     expand: Callable[[Written, Spec], Written | None]
@@ -55,13 +49,7 @@ class LocatorAlias(Alias, LocatorContribution):
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A section that chooses a component.
-
-    Attributes:
-        section: its keys `use`, `with` and `fallback`, with aliases and defaults spelled out; None if they cannot be.
-        choice: the component; None if there are problems.
-        fallbacks: the locators to which lost pairs are offered.
-    """
+    """A section that chooses a component: with aliases and defaults spelled out, None if they cannot be; and the choices."""
 
     section: Written | None = None
     choice: Choice | None = None
@@ -78,10 +66,7 @@ class ComponentResolver:
     def stage(self, kind: Kind, written: Written, base: Stage | None = None) -> Stage:
         """Resolve a section that chooses a component.
 
-        Args:
-            kind: the kind of the component.
-            written: the section.
-            base: for a section of a level, that of all levels: without `use`, the section updates the keys of this.
+        `base` is, for a section of a level, that of all levels: without `use`, the section updates the keys of this.
         """
         spec = self.spec
         content = spec.mapping(written, " such as {use: NAME}")
@@ -130,10 +115,7 @@ class ComponentResolver:
     def items(self, kind: Kind, written: Written, default: str | None = None) -> list[Written]:
         """Return the sections of a list of components; one alone is a list of it, and a name a section that uses it.
 
-        Args:
-            kind: the kind of the components.
-            written: the list.
-            default: the component that is chosen if it is installed and nothing is written.
+        If nothing is written, the default is chosen, if it is installed.
         """
         items = written.items()
         if written.data is None and default in self.catalog.names(kind.name):
@@ -145,10 +127,7 @@ class ComponentResolver:
     def fallbacks(self, section: Written, written: Written, first: Choice | None) -> tuple[Choice, ...]:
         """Resolve the locators to which the pairs that the first one lost are offered.
 
-        Args:
-            section: the section of the locator, spelled out.
-            written: the section as it was written.
-            first: the locator.
+        `section` is spelled out, `written` as it was written.
         """
         found: list[Choice] = []
         for item in section.at("fallback").items():

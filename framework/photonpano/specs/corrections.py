@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from photonpano.corrections import CORRECTIONS
+from photonpano.corrections import CORRECTIONS, Correction
 from photonpano.reading import missing_file
-from photonpano.specs.validation import validate
+from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, given
 from photonpano.text import suggestion
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from photonpano.corrections import Correction
-    from photonpano.specs.spec import Spec
 
 AUTO = "auto"  # the default: the run masks what stands still, and divides by a vignette
 
 
 def resolved_corrections(written: Written, spec: Spec) -> tuple[Correction, ...] | None:
-    """Resolve the section `corrections`; corrections with problems are left out.
+    """Resolve the section `corrections`: a list, or `auto`, which is the default, and for which it returns None.
 
-    Args:
-        written: a list, `auto`, or nothing, which is `auto` too.
-        spec: problems are added here, each at its place.
-
-    Returns:
-        The corrections of the list; None for `auto`.
+    Corrections with problems are left out; these are added to the spec.
     """
     if written.data is None or written.data == AUTO:
         return None

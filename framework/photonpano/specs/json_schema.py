@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
+from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from photonpano.contributions import KINDS
+from photonpano.contributions import KINDS, Kind
 from photonpano.corrections import CORRECTIONS
-from photonpano.registry.schema_text import TolerantJsonSchema
+from photonpano.registry import Catalog, Entry
+from photonpano.registry.description import TolerantJsonSchema
 from photonpano.specs.components import DEFAULT_FALLBACK, LocatorAlias
 from photonpano.specs.corrections import AUTO
 from photonpano.specs.settings import (
@@ -25,12 +27,6 @@ from photonpano.specs.settings import (
     RenderSettings,
     RunSettings,
 )
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
-
-    from photonpano.contributions import Kind
-    from photonpano.registry import Catalog, Entry
 
 Schema: TypeAlias = dict[str, Any]
 MODES = ["auto", "steady", "changing"]  # words that may stand for the section `light`
@@ -69,7 +65,8 @@ def json_schema(catalog: Catalog) -> Schema:
     sections["source"]["required"] = ["use"]
     definitions[RunSettings.__name__]["properties"]["executor"] = sections.pop("run.executor")
     definitions[OutputSettings.__name__]["properties"]["formats"] = sections.pop("output.formats")
-    rendering = _rendering(sections.pop("render"), definitions[_definition(schemas[RenderSettings])])
+    rendering, settings = sections.pop("render"), definitions[_definition(schemas[RenderSettings])]
+    rendering |= {"description": settings["description"], "properties": rendering["properties"] | settings["properties"]}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "photonpano pipeline spec",
@@ -135,11 +132,6 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
     keys = {"use": use, "with": {"type": SECTION, "description": f"the keys of the {kind.name}"}}
     section: Schema = {"type": SECTION, "additionalProperties": False, "properties": keys}
     return section | {"allOf": bindings} if bindings else section
-
-
-def _rendering(component: Schema, settings: Schema) -> Schema:
-    """Return the schema of the section `render`: the keys that choose the renderer, beside the framework's own."""
-    return component | {"description": settings["description"], "properties": component["properties"] | settings["properties"]}
 
 
 def _item(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Schema]) -> Schema:

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.errors import Problem, SpecError
 from photonpano.paths import Location, location, refusal
 from photonpano.registry import Catalog, discover
 from photonpano.specs.builtin import ask_sources
+from photonpano.specs.plan import Plan
 from photonpano.specs.resolution import resolve
 from photonpano.specs.spec import Spec
 from photonpano.specs.written import Place, Written, from_python, given, joined
 from photonpano.specs.yaml_reader import MAX_LENGTH, read_yaml
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from photonpano.specs.plan import Plan
 
 SPEC_SUFFIXES = {".yaml", ".yml"}
 
@@ -133,11 +130,7 @@ def capture_plan(
 
 
 def read_spec(path: Path) -> str:
-    """Return the text of a spec file.
-
-    Raises:
-        SpecError: it cannot be read, or is too long for a spec.
-    """
+    """Return the text of a spec file; `SpecError` if it cannot be read, or is too long for a spec."""
     if reason := refusal(path):
         raise SpecError([Problem("", reason.removeprefix(f"{path} "), path)])
     try:
@@ -173,10 +166,8 @@ def _capture(root: Written) -> str | None:
 def _overridden(root: Written, text: str, problems: list[Problem]) -> Written:
     """Return a spec with one value changed; mappings on the way to it are made where they are missing.
 
-    Args:
-        root: the spec.
-        text: such as `run.seed=1` or `levels.0.scale=0.5`: keys and list indices (from 0), then a value in YAML.
-        problems: what is wrong with the override is added here, and the spec stays as it is.
+    The text, such as `levels.0.scale=0.5`, has keys and list indices (from 0), then a value in YAML. If it is wrong, that is
+    added to the problems, and the spec stays as it is.
     """
     path, sign, yaml = text.partition("=")
     keys = path.strip().split(".")
@@ -195,11 +186,7 @@ def _overridden(root: Written, text: str, problems: list[Problem]) -> Written:
 
 
 def _changed(node: Written, keys: list[str], value: Written) -> Written:
-    """Return a value of a spec with one of the values in it replaced.
-
-    Raises:
-        LookupError: there is no such place; carries a message.
-    """
+    """Return a value of a spec with one of the values in it replaced; `LookupError` with a message if it has none."""
     if not keys:
         return value
     key, *rest = keys

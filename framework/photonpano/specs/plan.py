@@ -2,40 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import Any, Literal
 
+from photonpano.contributions import Config, Contribution
+from photonpano.corrections import Correction
+from photonpano.errors import InputError
+from photonpano.registry import Observer, Origin
+from photonpano.specs.settings import (
+    CameraSettings,
+    GraphSettings,
+    LightSettings,
+    MotionSettings,
+    OutputSettings,
+    RenderSettings,
+    RunSettings,
+)
 from photonpano.specs.written import Place, Written
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from photonpano.contributions import Config, Contribution
-    from photonpano.corrections import Correction
-    from photonpano.registry import Observer, Origin
-    from photonpano.specs.settings import (
-        CameraSettings,
-        GraphSettings,
-        LightSettings,
-        MotionSettings,
-        OutputSettings,
-        RenderSettings,
-        RunSettings,
-    )
-    from photonpano.values import Decision
+from photonpano.values import Decision
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A component chosen by name, with its validated config.
-
-    Attributes:
-        contribution: what the plugin offers under that name.
-        config: an instance of `contribution.config`.
-        origin: the plugin.
-        place: where the spec chooses it.
-    """
+    """A component chosen by name, with its validated config, at a place of the spec."""
 
     contribution: Contribution
     config: Config
@@ -50,10 +41,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class LevelPlan:
-    """The components of one level, and the scale of its exposures (pixels per pixel of a frame, or auto).
-
-    Pairs that `locate` loses are offered to the `fallbacks`, in order.
-    """
+    """The components of one level, and its scale; pairs that `locate` loses are offered to the `fallbacks`, in order."""
 
     resample: Choice
     merge: Choice
@@ -118,3 +106,7 @@ class Plan:
     def place(self, where: str) -> Place:
         """Return where a value was written, by its path in `document`; for a default, where it would stand."""
         return self.written.at(*where.split(".")).place
+
+    def error(self, where: str, message: str) -> InputError:
+        """Return the error of a value, by its path in `document`, that does not suit the capture."""
+        return InputError(str(self.place(where).problem(message)))

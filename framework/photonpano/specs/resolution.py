@@ -1,16 +1,16 @@
-"""Resolve a spec against a catalog: to a plan, or to all of its problems."""
+"""Resolve a spec against a catalog: to a plan, written down with all defaults, or to all of its problems."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from photonpano.contributions import KINDS
-from photonpano.errors import SpecError
+from photonpano.errors import Problem, SpecError
 from photonpano.specs.checks import check_flat_field, check_settings, complaints
 from photonpano.specs.components import CHOICE, ComponentResolver, Stage
-from photonpano.specs.corrections import resolved_corrections
-from photonpano.specs.document import document_of
+from photonpano.specs.corrections import AUTO, resolved_corrections, written_corrections
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.settings import (
     LEVELS,
@@ -23,26 +23,15 @@ from photonpano.specs.settings import (
     VERSION,
     LevelSettings,
 )
-from photonpano.specs.validation import validate
+from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, given
-
-if TYPE_CHECKING:
-    from photonpano.errors import Problem
-    from photonpano.specs.spec import Spec
 
 # The keys of the framework's own sections that choose components.
 NOT_SETTINGS = {"render": CHOICE, "output": ("formats",), "run": ("executor",)}
 
 
 def resolve(spec: Spec) -> Plan:
-    """Make the plan of a spec.
-
-    Args:
-        spec: the spec, with the problems that reading it has found.
-
-    Raises:
-        SpecError: with all problems, in the order of the file.
-    """
+    """Make the plan of a spec; `SpecError` with all problems, in the order of the file, also those from reading it."""
     root = spec.mapping(spec.root)
     plan = None if root is None else _Resolver(root, spec).plan()
     if plan is None or spec.problems:
@@ -153,8 +142,7 @@ class _Resolver:
     def level(self, written: Written, stages: dict[str, Stage]) -> tuple[Written, LevelPlan | None]:
         """Resolve one level: the stages, as far as it does not override them.
 
-        Returns:
-            The level with the sections that it overrides spelled out, and its plan; None for a level with problems.
+        Returns the level with the sections that it overrides spelled out, and its plan; None for a level with problems.
         """
         content = self.spec.mapping(written)
         if content is None:
@@ -188,3 +176,38 @@ def _without_panorama(root: Written, spec: Spec) -> Written:
         spec.wrong_key(executor, "does not apply with `pose`: poses are found in threads of one process")
     own = root.without(*PANORAMA_ONLY)
     return own.having({"output": own.at("output").without("formats")}) if "output" in own.data else own
+
+
+def document_of(plan: Plan, stages: Mapping[str, Stage]) -> dict[str, Any]:
+    """Return a plan as plain data, which is a spec itself; `stages` are those of levels that override nothing."""
+    chosen = {name: _stage(name, stage.choice, stage.fallbacks) for name, stage in stages.items()}
+    document = {
+        "version": VERSION,
+        "source": _component(plan.source),
+        "corrections": AUTO if plan.corrects_itself else written_corrections(plan.corrections),
+        **chosen,
+        "refine": [_component(refiner) for refiner in plan.refine],
+        "levels": UNTIL_CONVERGED if plan.until_converged else [_level(level, chosen) for level in plan.levels],
+        **({} if plan.pose is None else {"pose": _component(plan.pose)}),
+        **{name: getattr(plan, name).model_dump(mode="json") for name in SETTINGS},
+    }
+    document["render"] = _component(plan.renderer) | document["render"]
+    document["run"] |= {} if plan.executor is None else {"executor": _component(plan.executor)}
+    document["output"] |= {"formats": [_component(each) for each in plan.formats]}
+    inapplicable = ("exposures",) if plan.pose is None else ("formats", "keep")
+    document["output"] = {key: value for key, value in document["output"].items() if key not in inapplicable}
+    return document if plan.pose is None else {key: document[key] for key in document if key not in PANORAMA_ONLY}
+
+
+def _stage(name: str, choice: Any, fallbacks: Iterable[Choice]) -> dict[str, Any]:
+    return _component(choice) | ({"fallback": [_component(each) for each in fallbacks]} if name == "locate" else {})
+
+
+def _component(choice: Choice) -> dict[str, Any]:
+    return {"use": choice.contribution.name, "with": choice.config.model_dump(mode="json", by_alias=True)}
+
+
+def _level(level: LevelPlan, chosen: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Write a level down: its scale, and the stages in which it differs."""
+    own = {name: _stage(name, getattr(level, name), level.fallbacks) for name in STAGES}
+    return {"scale": level.scale} | {name: own[name] for name in STAGES if own[name] != chosen[name]}

@@ -183,6 +183,7 @@ MAX_LEVELS = 8
 UNTIL_CONVERGED = "until-converged"
 # The sections that choose the components of a level, in the order of the loop.
 STAGES = tuple(kind.section for kind in KINDS.values() if kind.of_level)
+# The framework's own sections.
 SETTINGS: dict[str, type[BaseModel]] = {
     "motion": MotionSettings,
     "camera": CameraSettings,
@@ -192,7 +193,6 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "output": OutputSettings,
     "run": RunSettings,
 }
-"""The framework's own sections."""
 # All sections of a spec, in the order in which they are written.
 SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", "pose", *SETTINGS)
 # The sections that do not apply with `pose`.

@@ -1,23 +1,33 @@
-"""What a spec is resolved against, and the problems that are found with it."""
+"""What a spec is resolved against, and its sections validated with problems in plain words."""
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from photonpano.contributions import KINDS
+from photonpano.errors import Problem
 from photonpano.registry import Catalog
+from photonpano.registry.description import (
+    Schema,
+    alternative,
+    alternatives,
+    config_schema,
+    discriminator,
+    expectation,
+    subschema,
+)
 from photonpano.specs.settings import SECTIONS, SETTINGS
 from photonpano.specs.written import Written, given
 from photonpano.text import listed, suggestion
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-
-    from photonpano.errors import Problem
-    from photonpano.values import Decision
+from photonpano.values import Decision
 
 
 @dataclass
@@ -25,11 +35,8 @@ class Spec:
     """A spec while it is resolved.
 
     Attributes:
-        root: the whole spec.
-        catalog: what can be chosen.
         directory: what relative paths count from.
         arriving: whether the capture is still being written, so that its files are not checked.
-        problems: what is wrong, so far.
         decisions: choices that the spec leaves open and that reading it made.
         remark: added to the message of every problem.
     """
@@ -63,13 +70,7 @@ class Spec:
         return None
 
     def check_keys(self, section: Written, known: Iterable[str], below: Iterable[str] = ()) -> None:
-        """Report unknown keys.
-
-        Args:
-            section: a mapping.
-            known: the keys that it may have.
-            below: the keys that the mapping under its `with` may have.
-        """
+        """Report unknown keys of a mapping; those `below` belong under its `with`."""
         for key, value in section.data.items():
             if key not in known:
                 message = "unknown key; it belongs under `with`" if key in below else self.unknown_key(key, section, known)
@@ -96,3 +97,64 @@ class Spec:
         yield from (name for name, model in SETTINGS.items() if key in model.model_fields)
         if key == "fallback":
             yield "locate"
+
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+# Errors that a validator of the model raised itself: its sentence is the message.
+RAISED = {"value_error", "assertion_error"}
+# Errors, beside those of type, whose message is what the schema expects and what was given.
+EXPECTED = {
+    *("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number", "multiple_of"),
+    *("too_short", "too_long", "string_too_short", "string_too_long", "string_pattern_mismatch"),
+    *("literal_error", "enum", "byte_size", "byte_size_unit", "missing"),
+}
+NUMBER = re.compile(r"\s*[-+]?[\d.]+([eE][-+]?\d+)?\s*")
+
+
+def validate(model: type[ModelT], section: Written, spec: Spec) -> ModelT | None:
+    """Validate a section, where nothing counts as an empty mapping; None if it has problems, which are added to the spec.
+
+    Types are those of YAML, so text is no number and a number no switch.
+    """
+    content = spec.mapping(section)
+    if content is None:
+        return None
+    try:
+        return model.model_validate_json(json.dumps(content.plain()), strict=True, context={"directory": spec.directory})
+    except ValidationError as error:
+        schema, n_problems = config_schema(model), len(spec.problems)
+        for each in error.errors(include_url=False):
+            _report(each, content, schema, spec)
+        # The alternatives of a union fail one by one, with one sentence.
+        spec.problems[n_problems:] = dict.fromkeys(spec.problems[n_problems:])
+    return None
+
+
+def _report(error: ErrorDetails, value: Written, root: Schema, spec: Spec) -> None:
+    kind, steps, schema = error["type"], list(error["loc"]), root
+    # The last step is a key that is missing or unknown, or an item that is missing.
+    last = steps.pop() if kind in ("missing", "extra_forbidden") else ""
+    for step in steps:
+        if value.at(step).place.is_written:
+            schema, value = subschema(schema, step, root), value.at(step)
+        else:  # the step names an alternative of a union
+            schema = alternative(schema, step, root)
+    tag_key, tags = discriminator(schema, root)
+    if kind == "missing" and isinstance(last, str):
+        spec.wrong_key(value.at(last), f"required: {expectation(subschema(schema, last, root), root)}")
+    elif kind == "extra_forbidden":
+        known = [key for option in alternatives(schema, root) for key in option.get("properties", ())]
+        spec.wrong_key(value.at(last), spec.unknown_key(str(last), value, known))
+    elif kind == "union_tag_not_found" and tag_key:
+        spec.wrong_key(value.at(tag_key), f"required: {listed(tags, 'or')}")
+    elif kind == "union_tag_invalid" and tag_key:
+        spec.wrong(value.at(tag_key), f"expected {listed(tags, 'or')}, got {given(value.at(tag_key).data)}")
+    elif kind in RAISED:
+        spec.wrong(value, str(error["ctx"]["error"]))
+    elif schema and (kind in EXPECTED or kind.endswith("_type")):
+        number = kind in ("int_type", "float_type") and isinstance(value.data, str) and NUMBER.fullmatch(value.data)
+        got = f"the text {given(value.data)}; leave the quotes out" if number else given(value.data)
+        spec.wrong(value, f"expected {expectation(schema, root)}, got {got}")
+    else:
+        spec.wrong(value, f"{error['msg'][:1].lower()}{error['msg'][1:]}, got {given(value.data)}")

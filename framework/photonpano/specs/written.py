@@ -138,13 +138,7 @@ def given(data: object) -> str:
 
 
 def from_python(data: object, place: Place, problems: list[Problem]) -> Written:
-    """Read plain Python data; anything else is a problem, and nothing in its place.
-
-    Args:
-        data: the data.
-        place: its place; what is inside has the same line.
-        problems: problems are added here.
-    """
+    """Read plain Python data, all of it on the line of its place; anything else is a problem, and nothing in its place."""
     try:
         return _from_python(data, place, problems)
     except RecursionError:

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.composer import Composer
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.nodes import MappingNode, ScalarNode
+from ruamel.yaml.error import MarkedYAMLError, StringMark, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 from ruamel.yaml.reader import ReaderError
 
+from photonpano.errors import Problem
 from photonpano.specs.written import Place, Written, given, joined
-
-if TYPE_CHECKING:
-    from ruamel.yaml.error import StringMark
-    from ruamel.yaml.nodes import Node
-
-    from photonpano.errors import Problem
 
 TAG = "tag:yaml.org,2002:"
 WHOLE = re.compile(r"[-+]?\d+[eE]\+?\d{1,2}")
@@ -52,13 +47,8 @@ class _Composer(Composer):
 def read_yaml(text: str, place: Place, problems: list[Problem]) -> Written:
     """Read one YAML 1.2 document; aliases and merge keys are followed.
 
-    Args:
-        text: the document.
-        place: where the document stands; lines and columns are filled in unless it is an override.
-        problems: what cannot be read is added here.
-
-    Returns:
-        The document, which is nothing if the text is not YAML or holds no document.
+    Its values get lines and columns, unless the place is an override. What cannot be read is added to the problems; nothing is
+    returned for a text that is not YAML, or without a document.
     """
     yaml = YAML(typ="safe", pure=True)
     yaml.Composer = _Composer
@@ -119,12 +109,7 @@ class _Reader:
         return self.marked(node.start_mark, where)
 
     def value(self, node: Node, place: Place) -> Written:
-        """Read a node.
-
-        Args:
-            node: the node.
-            place: that of its key, or where it begins if it has none.
-        """
+        """Read a node, whose place is that of its key, or where it begins if it has none."""
         self.count += 1
         if self.count > MAX_VALUES:
             raise _TooLongError

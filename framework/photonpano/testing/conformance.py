@@ -25,28 +25,8 @@ from photonpano.registry.plugins import contributions_of
 # Libraries that take long to import; numpy is allowed.
 HEAVY = frozenset(
     {
-        "PIL",
-        "av",
-        "cupy",
-        "cv2",
-        "dask",
-        "distributed",
-        "h5py",
-        "imageio",
-        "jax",
-        "kornia",
-        "matplotlib",
-        "numba",
-        "pandas",
-        "pycolmap",
-        "scipy",
-        "skimage",
-        "sklearn",
-        "tensorflow",
-        "tifffile",
-        "torch",
-        "torchvision",
-        "zarr",
+        *("PIL", "av", "cupy", "cv2", "dask", "distributed", "h5py", "imageio", "jax", "kornia", "matplotlib", "numba"),
+        *("pandas", "pycolmap", "scipy", "skimage", "sklearn", "tensorflow", "tifffile", "torch", "torchvision", "zarr"),
     }
 )
 

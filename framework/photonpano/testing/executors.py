@@ -45,12 +45,7 @@ def lost(reason: str) -> None:
 
 
 class ExecutorConformance(Conformance):
-    """Checks of an executor.
-
-    Attributes:
-        contribution: the contribution under test.
-        config: the keys under `with`.
-    """
+    """Checks of an executor."""
 
     kind: ClassVar[str] = "executor"
 

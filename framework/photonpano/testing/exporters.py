@@ -11,7 +11,7 @@ import pytest
 from photonpano.contributions import ExporterContribution
 from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.photometry import BinaryResponse
-from photonpano.pipeline.exports import AttributedExporter, StoredPanorama
+from photonpano.pipeline.rendering import AttributedExporter, StoredPanorama
 from photonpano.testing.conformance import passing
 from photonpano.testing.stages import StageConformance
 
@@ -31,12 +31,7 @@ def panorama(in_colour: bool = False, nothing_seen: bool = False) -> StoredPanor
 
 
 class ExporterConformance(StageConformance):
-    """Checks of an exporter.
-
-    Attributes:
-        contribution: the contribution under test.
-        config: the keys under `with`.
-    """
+    """Checks of an exporter."""
 
     kind: ClassVar[str] = "exporter"
 

@@ -25,9 +25,9 @@ _SIZES = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1.0, 1e-6, 1e-6])
 _PLACES = np.array([0.05, 0.2, 0.5, 0.85, 0.999])  # between two knots, as shares of their distance
 
 
-def shaken_knots(seed: int = 0) -> FloatArray:
+def shaken_knots() -> FloatArray:
     """Return the homographies of a pan with tremor: (N, 3, 3) at `INSTANTS`."""
-    tremor = np.random.default_rng(seed).normal(size=(len(INSTANTS), 8)) * _SIZES
+    tremor = np.random.default_rng(0).normal(size=(len(INSTANTS), 8)) * _SIZES
     return from_parameters(tremor + np.outer(0.15 * INSTANTS, np.eye(8)[4]))
 
 
@@ -35,8 +35,6 @@ class InterpolatorConformance(AnswerConformance):
     """Checks of an interpolator.
 
     Attributes:
-        contribution: the contribution under test.
-        config: the keys under `with`.
         tolerance_px: largest distance of the trajectory from its knots, at the corners of a frame of 254x496 px; more for one
             that smooths. The knots have a tremor of 1 px.
         keeps_velocity: whether a constant velocity is kept between knots.

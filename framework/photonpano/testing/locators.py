@@ -50,8 +50,6 @@ class LocatorConformance(AnswerConformance):
     """Checks of a locator on pairs of exposures of 1,000 frames each.
 
     Attributes:
-        contribution: the contribution under test.
-        config: the keys under `with`.
         tolerance_px: largest error of a motion, as the mean over the corners of the image.
         motions: those of "sub-pixel shift", "shift", "rotation" and "homography" that it estimates; none for an untrained
             network.

@@ -36,8 +36,6 @@ class MergerConformance(AnswerConformance):
     """Checks of a merger on binary frames of 40x56 px, of a still camera and of one that pans and rolls.
 
     Attributes:
-        contribution: the contribution under test.
-        config: the keys under `with`.
         tolerance_px: largest displacement of the image when frames are merged along a known motion.
         scales: supported scales, pixels of an exposure per pixel of a frame.
         compensates: whether it uses the motion; a naive average does not.

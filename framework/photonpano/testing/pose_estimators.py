@@ -65,7 +65,6 @@ class PoseEstimatorConformance(AnswerConformance):
     """Checks of a pose estimator.
 
     Attributes:
-        contribution: the contribution under test.
         config: the keys under `with`, for 320 frames of 128x160 px with one photon a pixel.
         tolerance: largest absolute trajectory error, as a share of the path.
         tolerance_deg: largest root mean square error of the rotations, in degrees.

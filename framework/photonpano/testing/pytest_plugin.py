@@ -12,19 +12,8 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_KINDS = (
-    "sources",
-    "resamplers",
-    "mergers",
-    "locators",
-    "interpolators",
-    "refiners",
-    "renderers",
-    "exporters",
-    "pose_estimators",
-    "executors",
-)
-for _name in ("conformance", "stages", *_KINDS):
+_KINDS = "sources resamplers mergers locators interpolators refiners renderers exporters pose_estimators executors"
+for _name in ("conformance", "stages", *_KINDS.split()):
     pytest.register_assert_rewrite(f"photonpano.testing.{_name}")
 
 

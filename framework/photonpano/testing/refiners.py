@@ -103,10 +103,6 @@ class RefinerConformance(AnswerConformance):
 
     The capture has 512 binary frames of 32x48 px, of which 472 are located, and residuals of spans of 8 frames. Its frame rate
     is not known. The tremor has an amplitude of 1.5 px along x and of 0.9 px along y, and a period of 64 frames.
-
-    Attributes:
-        contribution: the contribution under test.
-        config: the keys under `with`.
     """
 
     kind: ClassVar[str] = "refiner"

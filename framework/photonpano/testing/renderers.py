@@ -51,8 +51,6 @@ class RendererConformance(AnswerConformance):
     """Checks of a renderer on binary frames of 40x56 px of a camera that pans and rolls, of which 200 are rendered.
 
     Attributes:
-        contribution: the contribution under test.
-        config: the keys under `with`.
         tolerance_px: largest displacement of the panorama.
         scales: supported scales, pixels of the canvas per pixel of a frame.
         tile_tolerance: largest difference of 19 of 20 pixels of a tile from the same ones of the canvas, as a share of the mean

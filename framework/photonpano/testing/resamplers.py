@@ -21,7 +21,6 @@ class ResamplerConformance(AnswerConformance):
     """Checks of a resampler, for captures of about 2,000 frames and for short ones.
 
     Attributes:
-        contribution: the contribution under test.
         config: the keys under `with`, which must suit a capture of 2,000 frames.
     """
 

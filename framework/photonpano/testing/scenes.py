@@ -10,7 +10,7 @@ from photonpano.values import BoolArray, FloatArray, Homography
 
 _WAVES = 64
 _PERIODS_PX = (6.0, 120.0)
-_CONTRAST = 2.5  # slope of the sigmoid that limits the sum of waves to the range of the flux, and gives blobs and edges
+_CONTRAST = 2.5  # slope of the sigmoid that maps the sum of waves to flux, which gives blobs and edges
 _DETAIL_PX = (1, 2, 4, 8)  # standard deviations of the Gaussian kernels that make a texture of white noise
 
 

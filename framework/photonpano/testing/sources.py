@@ -25,7 +25,6 @@ class SourceConformance(Conformance):
     """Checks of a source.
 
     Attributes:
-        contribution: the contribution under test.
         config: the keys under `with` of a small capture; those that `write` returns are added.
         frame_shape: (height, width) of the frames that `write` is given; choose an odd width if the format supports it.
         n_frames: number of these frames.
@@ -216,7 +215,7 @@ class SourceConformance(Conformance):
             for method in (source.counts, source.frames):
                 first = method(span)
                 kept = first.copy()
-                method(_last(source))
+                method(FrameSpan(max(0, source.info.n_frames - 5), source.info.n_frames))
                 difference = _difference(first, kept)
                 assert not difference, f"{method.__name__}() overwrites an array that it returned before; return a new array"
                 if first.flags.writeable:
@@ -303,10 +302,6 @@ def _outcome_of(work: Any, argument: Any) -> str:
 
 def _first(source: Source) -> FrameSpan:
     return FrameSpan(0, min(source.info.n_frames, 5))
-
-
-def _last(source: Source) -> FrameSpan:
-    return FrameSpan(max(0, source.info.n_frames - 5), source.info.n_frames)
 
 
 def _spans(source: Source) -> list[FrameSpan]:

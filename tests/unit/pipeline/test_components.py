@@ -25,7 +25,8 @@ from photonpano import (
 )
 from photonpano.lighting import in_light
 from photonpano.photometry import BinaryResponse
-from photonpano.pipeline.components import build_levels, build_renderer, build_source, foreseen_groups, scale_of
+from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
+from photonpano.pipeline.rendering import build_renderer
 from photonpano.registry import Catalog, Origin
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import Plan, parse_spec

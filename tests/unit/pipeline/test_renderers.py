@@ -8,7 +8,7 @@ import pytest
 from photonpano import FrameSpan, InputError
 from photonpano.capture import seen_through
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, canvas_around, covered_by, rotation_matrices
-from photonpano.pipeline.renderers import AttributedRenderer
+from photonpano.pipeline.rendering import AttributedRenderer
 from photonpano.protocols import Renderer
 from photonpano.testing.captures import MemorySource
 

@@ -10,8 +10,15 @@ from pydantic import ByteSize, Field, JsonValue
 from ruamel.yaml import YAML
 
 from photonpano import Config, LocatorContribution, Requirement, SpecPath
-from photonpano.registry.description import ConfigRow, config_rows, snippet
-from photonpano.registry.schema_text import bounds_words, config_schema, expectation, type_words
+from photonpano.registry.description import (
+    ConfigRow,
+    bounds_words,
+    config_rows,
+    config_schema,
+    expectation,
+    snippet,
+    type_words,
+)
 
 
 class Inner(Config):

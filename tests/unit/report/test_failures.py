@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from photonpano.report.tables import failure_groups
+from photonpano.report.page import failure_groups
 
 
 def failure(start: int, reason: str) -> dict:

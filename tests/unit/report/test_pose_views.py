@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from photonpano.report.pose_views import path_views, scene_views, viewpoints
+from photonpano.report.pose_page import path_views, scene_views, viewpoints
 from photonpano.values import PoseEstimate, ScenePoints
 
 SHAPE, N_FRAMES = (90, 120), 60

@@ -12,7 +12,7 @@ import pytest
 
 from photonpano import SpecError
 from photonpano.registry import KINDS, Catalog, discover
-from photonpano.registry.schema_text import config_schema
+from photonpano.registry.description import config_schema
 from photonpano.specs import parse_spec
 from photonpano.specs.settings import GraphSettings, RenderSettings, RunSettings
 

@@ -16,30 +16,27 @@ from photonpano.registry import Catalog
 
 _TRUTH = ".truth.npz"
 _COMPRESSED = (".gz",)
-_LONGEST_LIST = 2**24  # bytes above which a list is no list: a capture that is given by mistake
+_LONGEST_LIST = 2**24  # maximum size of a list, in bytes; a larger file is probably a capture
 
 
 def find_captures(
     given: Iterable[str | Path], lists: Iterable[str | Path], catalog: Catalog, is_capture: Callable[[Path], bool]
 ) -> dict[str, Location]:
-    """Find captures, and name them.
+    """Return captures by their names, each once, in the order in which they were given.
 
-    A file that is missing counts as a capture: its run fails and says so, and the others go on.
+    A missing file counts as a capture: its run fails and says so, and the others go on.
 
     Args:
-        given: files, folders and patterns such as `captures/*.npy`, relative to the current folder, and URLs. A folder that
-            is no capture stands for the captures in it.
+        given: files, folders and patterns such as `captures/*.npy`, relative to the current folder, and URLs. A folder that is
+            no capture stands for the captures in it.
         lists: text files with one of these a line, relative to the folder of the list; empty lines, and those that begin with
             `#`, are left out. `-` is standard input, whose paths count from the current folder.
         catalog: the sources, whose files end as captures do.
         is_capture: returns whether the spec can read a folder, or a file in one.
 
-    Returns:
-        The captures by their names, each once, in the order in which they were given.
-
     Raises:
-        InputError: nothing is found in a place, a list cannot be read, two captures have one name, or there are none at all;
-            the message has all problems, a line each.
+        InputError: nothing is found in a place, a list cannot be read, two captures have one name, or there are none; the
+            message has all problems, a line each.
     """
     found: dict[Location, Location] = {}
     problems: list[str] = []
@@ -72,7 +69,7 @@ def find_captures(
 
 
 def _texts(given: Iterable[str | Path], lists: Iterable[str | Path], problems: list[str]) -> Iterator[tuple[str, Path, str]]:
-    """Yield what stands for captures, the folder that it counts from, and the beginning of a message about it."""
+    """Yield each argument that names captures, its base folder, and the prefix of messages about it."""
     for each in given:
         yield str(each), Path(), ""
     for each in lists:
@@ -92,7 +89,7 @@ def _texts(given: Iterable[str | Path], lists: Iterable[str | Path], problems: l
 
 
 def _lines(path: Path) -> tuple[Sequence[str], Path]:
-    """Return the lines of a list, and what its paths count from."""
+    """Return the lines of a list, and its base folder."""
     if str(path) == "-":
         return sys.stdin.read().splitlines(), Path()
     path = given_path(path)
@@ -111,11 +108,7 @@ def _lines(path: Path) -> tuple[Sequence[str], Path]:
 
 
 def _captures_at(text: str, folder: Path, endings: set[str], is_capture: Callable[[Path], bool]) -> Sequence[Location]:
-    """Return the captures that a text stands for: a path, a URL, or a pattern.
-
-    Raises:
-        InputError: there are none.
-    """
+    """Return the captures that a path, a URL, or a pattern stands for; `InputError` if there are none."""
     if isinstance(url := location(text), Url):
         if "*" in str(url):
             raise InputError(f"{url} is a pattern, and only files of this computer are matched; name each URL, as in a list")

@@ -33,13 +33,9 @@ _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}  # a process
 
 
 def rows_of(jobs: Sequence[Job], n_workers: int) -> Generator[list[tuple[int, BatchRow]], None, None]:
-    """Do jobs, in their order, and yield the rows that have changed with their indices: those that begin, and those that end.
+    """Do jobs in their order, and yield the rows that have changed with their indices: those that begin, and those that end.
 
-    When the generator is closed, or its caller is interrupted, the runs that are going on are ended.
-
-    Args:
-        jobs: what to do.
-        n_workers: how many runs go on at once.
+    At most `n_workers` run at once. When the generator is closed, or its caller is interrupted, these are ended.
     """
     waiting, going_on = iter(enumerate(jobs)), dict[int, _Run]()
     with tempfile.TemporaryDirectory() as folder:
@@ -170,7 +166,7 @@ def _end(runs: Sequence[_Run]) -> None:
 
 
 def _how_it_ended(code: int, printed: Path) -> str:
-    """Say how a process has ended that gave no answer."""
+    """Describe the exit of a process that sent no row."""
     if code == -signal.SIGKILL:
         return (
             "the run was killed (SIGKILL), as the system does when memory runs out; lower run.memory or the number of jobs, "

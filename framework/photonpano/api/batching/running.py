@@ -18,24 +18,15 @@ from photonpano.evaluation import evaluate, evaluate_poses
 from photonpano.paths import Url
 from photonpano.pipeline.run import RunResult, run
 from photonpano.record.batch_row import BatchRow
-from photonpano.registry import Catalog
 from photonpano.report.drawing import jpeg_uri, shrunk
 
 _THUMBNAIL_PIXELS = 240  # longer side
 
 
-def run_job(job: Job, catalog: Catalog | None = None) -> BatchRow:
-    """Do one run, unless it was finished before, and score it if the truth lies beside the capture.
-
-    Args:
-        job: what to do.
-        catalog: what can be chosen; by default what the installed plugins offer.
-
-    Returns:
-        The row of the summary. Errors become its reason; only what ends the process escapes.
-    """
+def run_job(job: Job) -> BatchRow:
+    """Do one run, unless it was finished, and score it by the truth beside the capture; errors become the reason of the row."""
     with _warnings() as warnings:
-        row = _attempted(job, catalog)
+        row = _attempted(job)
     return replace(row, reason="\n".join([row.reason, *warnings]).strip())
 
 
@@ -61,10 +52,10 @@ def _warnings() -> Iterator[list[str]]:
         logger.removeHandler(handler)
 
 
-def _attempted(job: Job, catalog: Catalog | None) -> BatchRow:
+def _attempted(job: Job) -> BatchRow:
     """Do a run; an error becomes the reason of its row."""
     try:
-        plan = job.spec.plan(job.overrides, job.row.directory, catalog)
+        plan = job.spec.plan(job.overrides, job.row.directory)
         if plan.run.threads == "auto":  # the record keeps `auto`: results do not depend on it
             plan = replace(plan, run=plan.run.model_copy(update={"threads": job.threads}))
         result = run(plan, Quiet(), overwrite=job.overwrite, resume=True)

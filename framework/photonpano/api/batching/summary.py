@@ -10,15 +10,11 @@ from typing import Any
 
 from photonpano.atomic import atomic_path
 from photonpano.errors import OutputError
-from photonpano.record.batch_row import BatchRow, written
+from photonpano.record.batch_row import FIGURES, BatchRow, written
 from photonpano.report import render_batch
 
 TABLE, PAGE = "summary.csv", "summary.html"
 _FIRST = ("name", "capture", "run", "status", "verdict")
-_FIGURES = (
-    *("expected_error_px", "true_error_px", "psnr_db", "expected_position_error", "true_position_error"),
-    *("n_frames", "seconds", "peak_memory_bytes"),
-)
 
 
 def write_summary(
@@ -28,18 +24,7 @@ def write_summary(
     common: Sequence[str],
     keys: Sequence[str],
 ) -> None:
-    """Write both files, each whole or not at all.
-
-    Args:
-        directory: the folder of the batch.
-        rows: all runs.
-        spec: the text of the spec, or its data.
-        common: what was changed in it for all runs.
-        keys: the swept keys.
-
-    Raises:
-        OutputError: they cannot be written.
-    """
+    """Write both files, each whole or not at all; for the arguments, see `render_batch`."""
     page = render_batch(directory, rows, spec, common, keys)
     for name, text in ((TABLE, _table(directory, rows, keys)), (PAGE, page)):
         with atomic_path(directory / name, flushed=False) as temporary:
@@ -47,11 +32,7 @@ def write_summary(
 
 
 def require_own(directory: Path) -> None:
-    """Refuse a folder that holds a summary that no batch has written.
-
-    Raises:
-        OutputError: there is one.
-    """
+    """Raise `OutputError` if the folder holds a summary that no batch has written."""
     path = directory / TABLE
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
@@ -68,9 +49,9 @@ def _table(directory: Path, rows: Sequence[BatchRow], keys: Sequence[str]) -> st
     """Return the table in CSV: empty where a run has no such figure."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_FIRST, *keys, *_FIGURES, "reason"])
+    writer.writerow([*_FIRST, *keys, *FIGURES, "reason"])
     for row in rows:
         first = [row.name, str(row.capture), row.directory.relative_to(directory).as_posix(), row.status, row.verdict]
         settings = [written(row.settings[key]) for key in keys]
-        writer.writerow([*first, *settings, *(getattr(row, name) for name in _FIGURES), row.reason])
+        writer.writerow([*first, *settings, *(getattr(row, name) for name in FIGURES), row.reason])
     return text.getvalue()

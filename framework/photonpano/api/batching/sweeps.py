@@ -20,7 +20,7 @@ from photonpano.specs.written import Place
 from photonpano.specs.yaml_reader import read_yaml
 
 CAPTURE_KEY, OUTPUT_KEY = "source.with.path", "output.directory"
-_LONGEST_NAME = 120  # characters of the settings in the name of a folder; file systems allow 255 bytes
+_LONGEST_NAME = 120  # maximum length of the settings in the name of a folder; file systems allow 255 bytes
 _UNSAFE = re.compile(r"[^\w.,=+\-]")
 
 
@@ -28,10 +28,7 @@ _UNSAFE = re.compile(r"[^\w.,=+\-]")
 class SpecText:
     """A spec as it was when the batch began: a file that is edited meanwhile does not change the runs to come.
 
-    Attributes:
-        content: the text of a file, or plain data.
-        directory: what relative paths in it count from.
-        file: where the text was read; None for plain data.
+    Relative paths count from `directory`; `file` is None for plain data.
     """
 
     content: str | Mapping[str, Any]
@@ -39,11 +36,7 @@ class SpecText:
     file: Path | None = None
 
     def plan(self, overrides: Sequence[str], output: Path, catalog: Catalog | None = None) -> Plan:
-        """Resolve the spec with overrides.
-
-        Raises:
-            SpecError: it is wrong.
-        """
+        """Resolve the spec with overrides; `SpecError` if it is wrong."""
         name = self.file.stem if self.file else "spec"
         return parse_spec(
             self.content,
@@ -58,15 +51,7 @@ class SpecText:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What a process needs to know to do one run of a batch. It can be pickled.
-
-    Attributes:
-        row: the capture, the run folder, and the swept settings.
-        spec: the spec.
-        overrides: what the run changes in it: the capture, the settings, and what is set for all runs.
-        threads: how many threads it uses if the spec leaves that open.
-        overwrite: as in `run`.
-    """
+    """What a process needs to do one run of a batch; it can be pickled. `threads` counts if the spec leaves that open."""
 
     row: BatchRow
     spec: SpecText
@@ -76,12 +61,12 @@ class Job:
 
 
 def is_of_capture(where: str) -> bool:
-    """Return whether a problem of a spec, by its path there, is one of the capture that a batch has put in."""
+    """Return whether a problem of a spec, by its path there, concerns the capture."""
     return where in ("source", CAPTURE_KEY)
 
 
 def capture_override(capture: Location) -> str:
-    """Return the override that puts a capture in the place of that of the spec."""
+    """Return the override that replaces the capture of the spec."""
     return override(CAPTURE_KEY, as_written(capture if isinstance(capture, Url) else capture.absolute()))
 
 
@@ -93,15 +78,12 @@ def override(key: str, value: Any) -> str:
 def read_changes(
     changes: Iterable[str], swept: Iterable[str], takes_list: Callable[[str, str], bool]
 ) -> tuple[list[str], dict[str, list[Any]]]:
-    """Sort what is set for all runs from what is swept.
+    """Separate the overrides for all runs from the values of each swept key.
 
     Args:
         changes: overrides such as `run.seed=1`. A list sweeps, as in `levels.0.scale=[0.5, 1]`, where the key takes no list.
         swept: such as `resample.with.group_size=50,100`; with brackets or without.
         takes_list: returns whether a key, given with its override, takes the list.
-
-    Returns:
-        The overrides for all runs, and the values of each swept key.
 
     Raises:
         SpecError: with all problems.
@@ -147,7 +129,7 @@ def combinations(swept: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 def folder_name(capture: str, settings: Mapping[str, Any]) -> str:
     """Return the name of a run folder: that of the capture, and its settings, as in `night,levels=2,run.seed=1`.
 
-    Where file systems or shells would stumble over the settings, they are shortened and end in a hash.
+    Settings that are long, or hold characters that file systems or shells do not take, are shortened and end in a hash.
     """
     text = ",".join(f"{key}={written(value)}" for key, value in settings.items())
     safe = _UNSAFE.sub("_", text)

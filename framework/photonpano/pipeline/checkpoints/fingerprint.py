@@ -1,4 +1,4 @@
-"""What the results of a run depend on, in parts, so that a change can be named; and whether a run is finished already."""
+"""Fingerprints of what the results of a run depend on, in parts that messages can name; and of runs that are finished."""
 
 from __future__ import annotations
 
@@ -26,18 +26,11 @@ _STAGES = ("resample", "merge", "locate", "interpolate")
 
 
 def run_fingerprint(plan: Plan, capture: CaptureRecord, frame_shape: tuple[int, int]) -> Fingerprint:
-    """Return what the results of a run depend on, as plain data.
-
-    The number of threads and the run folder are left out: results do not depend on them.
-
-    Args:
-        plan: what is run.
-        capture: the fingerprint of the capture.
-        frame_shape: (height, width) of a frame.
+    """Return what the results of a run depend on, as plain data; neither the threads nor the run folder.
 
     Returns:
         `versions`, `code` and `capture`, on which everything depends; `common`, the parts of the spec on which it does;
-        `levels`, a list; and `rest`, what only the steps after the last level depend on.
+            `levels`, a list; and `rest`, what only the steps after the last level depend on.
     """
     document = plan.document
     rest = {
@@ -46,34 +39,27 @@ def run_fingerprint(plan: Plan, capture: CaptureRecord, frame_shape: tuple[int, 
         "memory": int(plan.run.memory),
         "formats": [{**_component(choice), "code": _code([choice])} for choice in plan.formats],
     }
-    found: Fingerprint = _plain(
-        {
-            "versions": {"photonpano": importlib.metadata.version("photonpano"), **library_versions(plan)},
-            "code": _code([plan.source], photonpano),
-            "capture": capture,
-            "common": {
-                "source": _component(plan.source),
-                "corrections": document.get("corrections"),
-                "light": document["light"],
-                "graph": document["graph"],
-                "run.seed": plan.run.seed,
-                "render.reference": document["render"]["reference"],
-            },
-            "levels": [_level(plan, number, frame_shape) for number in range(1, len(plan.levels) + 1)],
-            "rest": rest,
-        }
-    )
-    return found
+    found = {
+        "versions": {"photonpano": importlib.metadata.version("photonpano"), **library_versions(plan)},
+        "code": _code([plan.source], photonpano),
+        "capture": capture,
+        "common": {
+            "source": _component(plan.source),
+            "corrections": document.get("corrections"),
+            "light": document["light"],
+            "graph": document["graph"],
+            "run.seed": plan.run.seed,
+            "render.reference": document["render"]["reference"],
+        },
+        "levels": [_level(plan, number, frame_shape) for number in range(1, len(plan.levels) + 1)],
+        "rest": rest,
+    }
+    as_read: Fingerprint = json.loads(json.dumps(found))
+    return as_read
 
 
 def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None) -> list[str]:
-    """Return what differs between two fingerprints, a clause each.
-
-    Args:
-        before: of what was kept.
-        now: of the run.
-        levels: number of levels on whose dependencies the comparison stops; None for everything.
-    """
+    """Return what differs between two fingerprints, a clause each; with `levels`, only what these levels depend on."""
     found = [
         f"the version of {path} was {old} and is {new}" for path, old, new in _changed(before["versions"], now["versions"])
     ]
@@ -88,12 +74,7 @@ def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None
 
 
 def finished_run(plan: Plan, capture: CaptureRecord) -> RunRecord | None:
-    """Return the record in the run folder of a plan, if it is of this spec, capture and software, and unchanged.
-
-    Args:
-        plan: what would be run.
-        capture: the fingerprint of the capture as it is now.
-    """
+    """Return the record in the run folder of a plan, if it is of this spec, capture and software, and unchanged."""
     try:
         record = read_record(plan.output.directory)
         same = (
@@ -140,10 +121,7 @@ def _component(choice: Choice) -> dict[str, Any]:
 
 
 def _code(choices: Sequence[Choice], *packages: Any) -> dict[str, str]:
-    """Return a hash of the Python files of the plugins that provide components, by package.
-
-    The version of a plugin stays the same while its author works on it.
-    """
+    """Return hashes of the Python files of plugins, by package: while its author works on a plugin, its version stays."""
     built_by = (sys.modules.get(choice.contribution.build.__module__.partition(".")[0]) for choice in choices)
     return {
         module.__name__: _hash_of(module.__file__) for module in (*packages, *built_by) if getattr(module, "__file__", None)
@@ -182,8 +160,3 @@ def _changed(before: Any, now: Any, path: str = "") -> Iterator[tuple[str, Any, 
 def _short(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _plain(value: Any) -> Any:
-    """Return data as it is read back from JSON."""
-    return json.loads(json.dumps(value))

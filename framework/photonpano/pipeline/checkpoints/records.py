@@ -23,17 +23,12 @@ _KINDS = (Contrast, Decision, Edge, FrameSpan, Located, NotLocated, Panorama, Pl
 # The dataclasses that can be read back.
 _BY_NAME: dict[str, Any] = {kind.__name__: kind for kind in _KINDS}
 _TREE = "tree"
-# Arrays of fewer values are joined: an archive of thousands of arrays is slow.
-_SMALL = 4096
+_SMALL = 4096  # arrays of fewer values are joined: an archive of thousands of arrays is slow
 _ARRAY, _MAPPING, _DATACLASS = "array", "mapping", "dataclass"
 
 
 def packed(value: Any) -> dict[str, NDArray[np.generic]]:
-    """Return named arrays that hold a value; floats stay the same to the last bit.
-
-    Raises:
-        TypeError: it contains something else than numbers, texts, arrays, sequences, mappings and dataclasses.
-    """
+    """Return named arrays that hold a value; floats stay the same to the last bit. `TypeError` for what cannot be kept."""
     packer = _Packer()
     tree = json.dumps(packer.tree(value), separators=(",", ":"))
     joined = {name: np.concatenate(parts) for name, parts in packer.small.items()}
@@ -41,11 +36,7 @@ def packed(value: Any) -> dict[str, NDArray[np.generic]]:
 
 
 def unpacked(arrays: Arrays) -> Any:
-    """Return the value that `packed` has made arrays of; lists come back as tuples.
-
-    Raises:
-        Exception: these are not such arrays.
-    """
+    """Return the value that `packed` has made arrays of; lists come back as tuples. Damaged arrays raise any exception."""
     return _unpacked(json.loads(bytes(arrays[_TREE]).decode()), arrays)
 
 
@@ -59,12 +50,7 @@ def digest(*values: Any) -> str:
 
 
 class _Packer:
-    """Collects the arrays of a value.
-
-    Attributes:
-        small: parts to join, by the name of their type.
-        large: arrays, by their names.
-    """
+    """Collects the arrays of a value: `small` are parts to join, by the name of their type, `large` arrays by their names."""
 
     def __init__(self) -> None:
         self.small: dict[str, list[NDArray[np.generic]]] = {}

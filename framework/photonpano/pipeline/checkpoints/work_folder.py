@@ -15,8 +15,7 @@ from photonpano.atomic import atomic_path
 from photonpano.context import Checkpoints, KeepNothing, Progress
 from photonpano.errors import InputError, OutputError, PhotonpanoError
 from photonpano.pipeline.checkpoints.fingerprint import Fingerprint, differences
-from photonpano.pipeline.checkpoints.kept import Kept, finished
-from photonpano.pipeline.checkpoints.store import SUFFIX, Store
+from photonpano.pipeline.checkpoints.store import SUFFIX, Kept, Store, finished
 from photonpano.text import counted
 from photonpano.values import Decision
 
@@ -24,8 +23,7 @@ logger = logging.getLogger(__name__)
 
 MANIFEST = "work.json"
 FORMAT = 1
-# Differences that a message names.
-_SHOWN = 3
+_SHOWN = 3  # differences that a message names
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +42,7 @@ class Continuation:
 
 
 class Work:
-    """The work of a run.
-
-    Attributes:
-        checkpoints: keep what the run finds.
-    """
+    """The work of a run; its `checkpoints` keep what the run finds."""
 
     def __init__(self, folder: Path | None, now: Fingerprint, decisions: list[Decision], keep: bool) -> None:
         self._folder, self._now, self._keep = folder, now, keep
@@ -71,8 +65,7 @@ class Work:
     def close(self, *, failed: bool = False) -> bool:
         """Write what has not been written yet; return whether there is work to go on with.
 
-        Args:
-            failed: whether the same run would fail again, so that only finished levels are of use.
+        A run that `failed` would fail again, so that only finished levels are of use.
         """
         if self._finished or self._kept is None or self._store is None or self._folder is None:
             return False
@@ -93,19 +86,9 @@ def path_of(run_folder: Path) -> Path:
 def work_folder(
     run_folder: Path, now: Fingerprint, decisions: list[Decision], how: Continuation, progress: Progress
 ) -> Iterator[Work]:
-    """Open the work folder of a run, whose lock is held.
+    """Open the work folder of a run, whose lock is held; `InputError` if levels before `how.from_level` cannot be taken.
 
     What it holds stays after an interruption or an error. Where nothing can be kept, a warning says so, and the run goes on.
-
-    Args:
-        run_folder: of the run.
-        now: what its results depend on.
-        decisions: the decisions of the run, to which components add.
-        how: what to take from the run before.
-        progress: receives a line for an interrupted run.
-
-    Raises:
-        InputError: the levels before `how.from_level` cannot be taken.
     """
     folder = path_of(run_folder)
     _require_levels(folder, now, how.from_level)
@@ -127,18 +110,8 @@ def work_folder(
     work.close()
 
 
-def finished_before(folder: Path) -> bool:
-    """Return whether a work folder is kept of a run that was finished."""
-    manifest = _manifest(folder)
-    return manifest is not None and bool(manifest["finished"])
-
-
 def _prepare(folder: Path, now: Fingerprint, how: Continuation, progress: Progress) -> None:
-    """Leave in the work folder only what this run may take.
-
-    Raises:
-        OutputError: it cannot be written, or it is the folder of somebody else.
-    """
+    """Clear the work folder of what this run may not reuse; `OutputError` if it is the folder of somebody else."""
     there = os.path.lexists(folder)
     if there and not _is_ours(folder):
         raise OutputError("it is there already, and is not the work folder of a run")
@@ -149,7 +122,8 @@ def _prepare(folder: Path, now: Fingerprint, how: Continuation, progress: Progre
         reasons = _why_not(manifest, now)
         if not reasons:
             progress.note(f"going on with the interrupted run, from {folder}")
-            _remove_partial(folder)
+            for file in filter(_is_record, folder.glob(".*")):  # what a killed process was writing
+                file.unlink(missing_ok=True)
             return
         logger.warning("%s: the interrupted run is not continued, but started again: %s", folder, _named(reasons))
         _clear(folder)
@@ -169,11 +143,7 @@ def _prepare(folder: Path, now: Fingerprint, how: Continuation, progress: Progre
 
 
 def _require_levels(folder: Path, now: Fingerprint, from_level: int | None) -> None:
-    """Refuse to start from a level that is not there, or was found in another way.
-
-    Raises:
-        InputError: names the levels that are there, or what is different now.
-    """
+    """Raise `InputError` if levels to start from are missing, or were found in another way."""
     if from_level is None:
         return
     n_levels, option = len(now["levels"]), f"--from-level {from_level}"
@@ -239,13 +209,6 @@ def _clear(folder: Path, from_level: int = 1) -> None:
     files = [each for each in folder.iterdir() if _is_record(each)] if folder.is_dir() else []
     for file in sorted(files, key=lambda each: each.name == MANIFEST):
         if not file.name.startswith(taken):
-            file.unlink(missing_ok=True)
-
-
-def _remove_partial(folder: Path) -> None:
-    """Remove what a killed process was writing."""
-    for file in folder.glob(".*"):
-        if _is_record(file):
             file.unlink(missing_ok=True)
 
 

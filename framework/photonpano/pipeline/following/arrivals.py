@@ -1,24 +1,26 @@
-"""Watch a capture that is still being written: how many frames are there, how long they wait, and whether more will come."""
+"""Watch a capture that is still being written: the number of its frames and their delays; and copy a pipe to a file."""
 
 from __future__ import annotations
 
+import fcntl
+import os
+import select
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 
-from photonpano.errors import PhotonpanoError
-from photonpano.protocols import Arrived, Source
+from photonpano.errors import InputError, OutputError, PhotonpanoError
+from photonpano.protocols import Arrived, Piped, Source
 
 _POLL_S = 0.02
-# How long an unreadable capture is tolerated: a file may appear before the one before it is complete.
-_TOLERATED_S = 1.0
-# Times of arrival that are kept. While frames wait for minutes, they get coarser.
-_MOST_MARKS = 4096
-# Resolution and number of the bins of delays: 10 ms, up to two minutes.
-_STEP_S, _STEPS = 0.01, 12_000
+_TOLERATED_S = 1.0  # time for which an unreadable capture is tolerated: files may appear in any order
+_MOST_MARKS = 4096  # Maximum number of arrival times; beyond, neighbours are merged.
+_STEP_S, _STEPS = 0.01, 12_000  # resolution and number of the bins of delays: 10 ms, up to two minutes
 
 
 class Arrivals:
@@ -33,32 +35,24 @@ class Arrivals:
     """
 
     def __init__(self, look: Callable[[], Arrived], is_over: Callable[[], bool] | None, silence_s: float) -> None:
-        """Begin to watch.
+        """Begin to watch what `look` returns.
 
-        Args:
-            look: returns what is there.
-            is_over: returns whether no more will come, for a capture that is copied from a pipe. Otherwise a capture is over
-                when all frames are there that it promises, or when nothing comes.
-            silence_s: for how long, in seconds.
+        A capture that is copied from a pipe is over when `is_over` returns true; another one when all frames are there that it
+        promises, or nothing has come for `silence_s` seconds.
         """
         self.n_frames, self.ended, self.fell_silent, self.seconds = 0, False, False, 0.0
         self.promised: int | None = None
         self._look, self._is_over, self._silence_s = look, is_over, silence_s
         self._source: Source | None = None
         self._failure: PhotonpanoError | None = None
-        self._marks: deque[tuple[int, float]] = deque()
-        """Numbers of frames, and when they were not there yet."""
+        self._marks: deque[tuple[int, float]] = deque()  # number of frames, and time of the last look without them
         self._forgotten = 0
         self._lock, self._changed, self._stopped = threading.Lock(), threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._watch, name="arrivals", daemon=True)
         self._thread.start()
 
     def source(self) -> Source | None:
-        """Return the frames that are there; None as long as there is none.
-
-        Raises:
-            InputError: what arrives is no capture.
-        """
+        """Return the frames that are there, None as long as there is none; `InputError` if what arrives is no capture."""
         if self._failure is not None:
             raise self._failure
         return self._source
@@ -169,3 +163,88 @@ class Delays:
             return None
         step = int(np.searchsorted(np.cumsum(self._counts), share * self.n_frames))
         return min((step + 1) * _STEP_S, self._longest)
+
+
+_BUFFER_BYTES = 1024**2
+_WAIT_S = 0.2  # time until a spool notices that it is stopped
+
+
+class Spool:
+    """Copies a pipe to a file, until the pipe ends or the spool is closed; then it has `ended`."""
+
+    def __init__(self, descriptor: int, path: Path, piped: Piped) -> None:
+        """Make the file, which must not be there, and begin to copy; `OutputError` if it cannot be made."""
+        self.path, self.ended = path, False
+        self._empty = True
+        self._failure: PhotonpanoError | None = None
+        self._pipe, self._piped = descriptor, piped
+        self._stopped = threading.Event()
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
+        except OSError as error:
+            raise OutputError(f"cannot write {path}: {error.strerror}; choose another folder with --output") from error
+        self._thread = threading.Thread(target=self._copy, name="spool", daemon=True)
+        self._thread.start()
+
+    def require_whole(self) -> None:
+        """Raise the error of a pipe that could not be copied, or ended within a frame. Whole frames are in the file."""
+        if self._failure is not None:
+            raise self._failure
+
+    def close(self) -> None:
+        """Stop copying. What is no whole frame is cut off, and a file without any frame removed."""
+        self._stopped.set()
+        self._thread.join()
+        if self._empty:
+            self.path.unlink(missing_ok=True)
+
+    def _copy(self) -> None:
+        with suppress(AttributeError, OSError):  # not a pipe, or another system: it is only slower
+            fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, _BUFFER_BYTES)
+        written = 0
+        try:
+            while not self._stopped.is_set():
+                if not select.select([self._pipe], [], [], _WAIT_S)[0]:
+                    continue
+                try:
+                    read = os.read(self._pipe, _BUFFER_BYTES)
+                except OSError as error:
+                    self._failure = InputError(f"standard input cannot be read: {error.strerror}{self._kept(written)}")
+                    break
+                if not read:
+                    self._failure = self._cut_short(written)
+                    break
+                left = memoryview(read)
+                while left:
+                    done = os.write(self._file, left)
+                    left, written = left[done:], written + done
+        except OSError as error:
+            self._failure = OutputError(f"cannot write {self.path}: {error.strerror}{self._kept(written)}; make room")
+        finally:
+            with suppress(OSError):
+                os.ftruncate(self._file, self._piped.header_bytes + self._n_frames(written) * self._piped.frame_bytes)
+            os.close(self._file)
+            self._empty = not self._n_frames(written)
+            self.ended = True
+
+    def _cut_short(self, written: int) -> InputError | None:
+        """Return why a pipe that has ended is no capture; None if it is."""
+        frames = written - self._piped.header_bytes
+        if frames <= 0:
+            return InputError("standard input ended before the first frame: look why the program that writes to it has ended")
+        if not (rest := frames % self._piped.frame_bytes):
+            return None
+        return InputError(
+            f"standard input ended within a frame: after {frames // self._piped.frame_bytes:,} frames of "
+            f"{self._piped.frame_bytes:,} bytes came {rest:,} bytes more. Either the program that writes has died, or height "
+            f"and width are wrong{self._kept(written)}"
+        )
+
+    def _kept(self, written: int) -> str:
+        if not (n_frames := self._n_frames(written)):
+            return ""
+        kept = "whole frame is" if n_frames == 1 else f"{n_frames:,} whole frames are"
+        return f"; the {kept} in {self.path}"
+
+    def _n_frames(self, written: int) -> int:
+        return max(0, written - self._piped.header_bytes) // self._piped.frame_bytes

@@ -24,11 +24,9 @@ from photonpano.errors import InputError, OutputError, PhotonpanoError, describe
 from photonpano.folders import lock_path
 from photonpano.interrupts import is_interrupt
 from photonpano.locks import locked
-from photonpano.pipeline.following.arrivals import Arrivals
+from photonpano.pipeline.following.arrivals import Arrivals, Spool
 from photonpano.pipeline.following.live_run import Every, LiveRun
-from photonpano.pipeline.following.page import PAGE, LivePage
-from photonpano.pipeline.following.picture import PictureSoFar, rehearse
-from photonpano.pipeline.following.spool import Spool
+from photonpano.pipeline.following.picture import PAGE, LivePage, PictureSoFar, rehearse
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.pipeline.run_steps import COMPILING
 from photonpano.protocols import Piped
@@ -39,14 +37,12 @@ from photonpano.threads import one_thread_inside, thread_count
 
 logger = logging.getLogger(__name__)
 
-# The file to which frames of a pipe are copied.
-SPOOL = "frames.raw"
+SPOOL = "frames.raw"  # the copy of the frames of a pipe
 _REFRESH_S = 1.0
 _NOTE_S = 10.0
-# Least time between windows. Long windows take less time for a frame: each repeats the last exposure of the one before.
+# Minimum time between windows: each locates the last exposure of the one before again, so that long ones are faster.
 _WINDOW_S = 0.2
-# Longest wait for frames between two looks at the page.
-_IDLE_S = 0.1
+_IDLE_S = 0.1  # maximum wait for frames between two updates of the page
 
 
 def live_folder(run_directory: Path) -> Path:
@@ -58,19 +54,8 @@ def live_folder(run_directory: Path) -> Path:
 def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: float) -> Iterator[tuple[Plan, LiveFigures]]:
     """Follow a capture until it is complete; the block then runs the whole of it, and the page says how that ended.
 
-    Args:
-        plan: what to do with the capture. One on standard input is copied to a file in the `live_folder`, as it comes.
-        progress: receives messages.
-        overwrite: whether a file of an earlier capture there is replaced, and the run folder; see `run`.
-        end_after: seconds without a new frame after which a growing file counts as complete, unless it promises more frames.
-
-    Yields:
-        The plan that runs the capture, which is now in a file; and how far behind its frames were located.
-
-    Raises:
-        InputError: the source cannot be followed; or what arrives is no capture, or is incomplete. What arrived is kept.
-        OutputError: a file cannot be written, or another process follows a capture into the same folder.
-        SpecError: a stage does not suit the capture.
+    A capture on standard input is copied to a file in the `live_folder`, as it comes. Yields the plan that runs the capture,
+    which is now in a file, and how far behind its frames were located. For `overwrite`, `end_after` and errors, see `run`.
     """
     directory = plan.output.directory.absolute()
     folder = live_folder(directory)
@@ -114,7 +99,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
 
 
 def _followable(plan: Plan) -> Callable[[Any], Any]:
-    """Return the function that opens the part of the capture that is there: an `Arrived`, or a `Piped`."""
+    """Return the function that opens the part of the capture that has arrived: an `Arrived`, or a `Piped`."""
     contribution, config = plan.source.contribution, plan.source.config
     assert isinstance(contribution, SourceContribution)
     if plan.pose is not None:
@@ -125,9 +110,7 @@ def _followable(plan: Plan) -> Callable[[Any], Any]:
             "complete, or have frames written one after the other, for the source packed-raw"
         )
     if isinstance(config, PartOfCapture) and config.frames is not None:
-        raise InputError(
-            str(plan.place("source.with.frames").problem("a part of a capture cannot be followed; remove this key"))
-        )
+        raise plan.error("source.with.frames", "a part of a capture cannot be followed; remove this key")
     return contribution.arrived
 
 
@@ -140,11 +123,7 @@ def _from_file(plan: Plan, path: Path) -> Plan:
 
 
 def _standard_input() -> int:
-    """Return the descriptor of standard input.
-
-    Raises:
-        InputError: it is closed, or a terminal.
-    """
+    """Return the descriptor of standard input; `InputError` if it is closed, or a terminal."""
     if sys.__stdin__ is None or sys.__stdin__.closed or os.isatty(0):
         raise InputError("no frames come on standard input; write PROGRAM | photonpano run SPEC --follow")
     return 0
@@ -166,11 +145,7 @@ def _made(folder: Path) -> Iterator[None]:
 
 
 def _free(path: Path, plan: Plan, overwrite: bool) -> Path:
-    """Return the path of a file that is not there.
-
-    Raises:
-        OutputError: it holds the frames of an earlier capture.
-    """
+    """Remove the file, and return its path; `OutputError` if it holds the frames of an earlier capture."""
     if path.exists() and path.stat().st_size and not overwrite:
         raise OutputError(
             f"{path} holds the frames of an earlier capture: {_way_on(plan)}. To follow another capture, choose another folder "
@@ -181,7 +156,7 @@ def _free(path: Path, plan: Plan, overwrite: bool) -> Path:
 
 
 def _way_on(plan: Plan) -> str:
-    """Return what makes the panorama of frames that were copied from a pipe."""
+    """Return how to run the frames that were copied from a pipe."""
     path = str(plan.document["source"]["with"]["path"])
     if plan.file is None:
         return f"run them with source.with.path = {path!r}, and without follow"
@@ -190,11 +165,7 @@ def _way_on(plan: Plan) -> str:
 
 
 def _require_complete(plan: Plan, arrivals: Arrivals, end_after: float) -> None:
-    """Refuse a capture with too few frames.
-
-    Raises:
-        InputError: none has come, or fewer than it promises.
-    """
+    """Raise `InputError` if no frame has come, or fewer than the capture promises."""
     where = plan.document["source"]["with"].get("path", "the capture")
     waited = f"within {end_after:g} s"
     if not arrivals.n_frames:

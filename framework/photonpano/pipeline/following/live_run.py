@@ -1,24 +1,52 @@
-"""Locate frames as they arrive, and measure how far behind the run is."""
+"""Read and locate frames as they arrive, and measure how far behind the run is."""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections import deque
+from dataclasses import replace
 
+from photonpano.capture import Capture, capture_of
 from photonpano.context import Context
+from photonpano.corrections import without_still_pixels
 from photonpano.errors import PhotonpanoError
+from photonpano.pipeline.components import require_suitable, with_corrections
 from photonpano.pipeline.following.arrivals import Arrivals, Delays
 from photonpano.pipeline.following.located import LocatedSoFar, Window
-from photonpano.pipeline.following.reading import ArrivedFrames
+from photonpano.protocols import Source
 from photonpano.report import LiveFigures
 from photonpano.specs.plan import Plan
+from photonpano.values import BoolArray
+
+_LONG = 1_000_000  # assumed length of a capture that does not promise one, for checks of the stages
+
+
+class ArrivedFrames:
+    """Corrects the frames that have arrived. What stands still is found anew whenever twice as many frames are there."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._valid: BoolArray | None = None
+        self._found_at = 0
+
+    def of(self, arrived: Source, promised: int | None) -> Capture:
+        """Return a capture with its corrections; errors as those of `build_source`."""
+        source = with_corrections(self._plan, capture_of(arrived, self._plan.source.label))
+        if not self._found_at:
+            require_suitable(self._plan, source, replace(source.info, n_frames=promised or _LONG))
+            self._found_at = 1
+        if not self._plan.corrects_itself or source.info.kind != "binary" or source.info.bayer is not None:
+            return source
+        if self._valid is None or source.info.n_frames >= 2 * self._found_at:
+            self._valid, self._found_at = without_still_pixels(source).valid, source.info.n_frames
+        return replace(source, valid=self._valid)
+
 
 logger = logging.getLogger(__name__)
 
-# Time over which the rate of arrival is measured.
-_RATE_S = 3.0
-# Frames come too fast if they wait for longer than the first, once the second has passed since the first were located.
+_RATE_S = 3.0  # time over which the rate of arrival is measured
+# Locating is too slow if frames wait longer than `_FAR_BEHIND_S`, `_STARTED_S` after the first were located.
 _FAR_BEHIND_S, _STARTED_S = 2.0, 10.0
 
 
@@ -33,17 +61,10 @@ class LiveRun:
         self._rates: deque[tuple[float, int]] = deque([(time.monotonic(), 0)])
 
     def next_window(self, *, last: bool) -> Window | None:
-        """Locate the next frames; None if too few have come, or they cannot be located.
+        """Locate the next frames; None if too few have come, or they cannot be located. `last` says that no more frames come.
 
-        What goes wrong while frames are located ends that with a warning, and not the run: the frames still come.
-
-        Args:
-            last: whether no more frames come.
-
-        Raises:
-            InputError: what arrives is no capture.
-            PluginError: the source broke its contract.
-            SpecError: a stage does not suit the capture.
+        If locating fails, a warning says so, and no more frames are located; the run goes on, as the frames still come. What is
+        wrong with the capture itself is raised.
         """
         arrived = self._arrivals.source()
         if arrived is None or self._failure:

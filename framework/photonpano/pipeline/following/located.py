@@ -1,4 +1,4 @@
-"""Locate a growing capture: the loop runs its first level on one window of frames after the other."""
+"""Locate a growing capture: the first level of the loop, on one window of frames after the other."""
 
 from __future__ import annotations
 
@@ -19,10 +19,8 @@ from photonpano.specs.plan import Plan
 from photonpano.threads import Stopwatch
 from photonpano.values import FrameSpan, Homography
 
-# Frames from which the first group size is chosen.
-LEAST_FRAMES = {"binary": 256, "intensity": 16}
-# Groups of the longest window: as many are located in one call if frames come faster than they are located.
-_MOST_GROUPS = 8
+LEAST_FRAMES = {"binary": 256, "intensity": 16}  # minimum number of frames for the first group size
+_MOST_GROUPS = 8  # maximum number of groups in a window, reached if frames come faster than they are located
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,17 +62,10 @@ class LocatedSoFar:
         self._joins = False
 
     def next_window(self, source: Source, *, last: bool = False) -> Window | None:
-        """Locate the next frames, a few groups of them.
+        """Locate the next frames of `source`, which holds all that have arrived: a few groups of them.
 
-        Args:
-            source: all frames that are there.
-            last: whether there will be no more, so that the next window need not wait for more frames.
-
-        Returns:
-            None if there are no new groups yet, or they could not be located: see `problem`.
-
-        Raises:
-            PhotonpanoError: a component failed.
+        None if there are no new groups yet, or they could not be located: see `problem`. With `last`, it does not wait for
+        more.
         """
         level, available = self._level_for(source, last), source.info.n_frames - self._start
         length = None if level is None else _group_length(level, source.info.n_frames)

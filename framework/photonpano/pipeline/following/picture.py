@@ -1,16 +1,22 @@
-"""The picture so far: frames that were located are summed on a canvas that grows."""
+"""The files of a run that follows a capture: a picture of what was located so far, on a canvas that grows, and its page."""
 
 from __future__ import annotations
 
+import json
 import logging
+import time
 from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from urllib.parse import quote
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.atomic import atomic_path
 from photonpano.context import Context
-from photonpano.errors import PhotonpanoError
+from photonpano.errors import OutputError, PhotonpanoError
 from photonpano.geometry import Canvas, apply, corners, normalised, rescaling, translation
 from photonpano.merging import accumulate
 from photonpano.merging.accumulate import PhotonSum
@@ -18,47 +24,35 @@ from photonpano.merging.chunks import chunks_of
 from photonpano.photometry import picture_of
 from photonpano.pipeline.following.located import LocatedSoFar, Window
 from photonpano.reading import BinarySource, FrameLayout
+from photonpano.report import LiveFigures, render_live
 from photonpano.specs.plan import Plan
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Response
 
 logger = logging.getLogger(__name__)
 
-# Most pixels of the canvas; beyond, its scale is halved.
-_MOST_PIXELS = 2_000_000
-# Least scale; beyond, the picture begins anew.
-_LEAST_SCALE = 1 / 8
-# Greatest ratio between the area of a frame on the canvas and that of the first frame, either way.
-_MOST_AREA_CHANGE = 4.0
-# How much more than necessary the canvas grows, in longer sides of a frame.
-_MARGIN = 0.25
-# Motion within which frames are summed before they are warped.
-_TOLERANCE_PX = 1.0
-# Quantile of the flux that is white.
-_WHITE = 0.995
-# Pixels from which that quantile is estimated.
-_SAMPLES = 100_000
-# The made-up capture: a frame, a block, how many frames, and how far the camera pans.
+_MOST_PIXELS = 2_000_000  # maximum canvas size; a larger one is halved in scale
+_LEAST_SCALE = 1 / 8  # minimum scale; below, the picture starts again
+_MOST_AREA_CHANGE = 4.0  # maximum ratio of the areas of a frame and the first frame on the canvas, either way
+_MARGIN = 0.25  # extra growth of the canvas, in longer sides of a frame
+_TOLERANCE_PX = 1.0  # motion within which frames are summed before they are warped
+_WHITE = 0.995  # quantile of the flux that is white
+_SAMPLES = 100_000  # pixels from which that quantile is estimated
+# The simulated capture of `rehearse`: shape, size of blocks, number of frames, length of the pan.
 _SHAPE, _BLOCK_PX, _N_FRAMES, _LENGTH_PX = (64, 96), 8, 2048, 32
 
 
 class PictureSoFar:
     """Sums the frames of windows.
 
-    Convention:
-        The plane of the canvas is that of the first window; (x, y) of the canvas are those of the plane times the scale.
-
-    Attributes:
-        scale: pixels of the canvas per pixel of a frame.
+    Convention: The plane of the canvas is that of the first window; (x, y) of the canvas are those of the plane times `scale`,
+    the pixels of the canvas per pixel of a frame.
     """
 
     def __init__(self) -> None:
         self.scale = 1.0
-        self._sums = np.zeros((2, 0, 0), np.float32)
-        """Counts, and their weights in frames."""
-        self._origin: NDArray[np.integer] = np.zeros(2, int)
-        """(x, y) of the first pixel."""
-        self._to_plane: Homography = np.eye(3)
-        """From the frame that the next window has in common with the last one."""
+        self._sums = np.zeros((2, 0, 0), np.float32)  # counts and weights (frames per pixel)
+        self._origin: NDArray[np.integer] = np.zeros(2, int)  # (x, y) of the first pixel
+        self._to_plane: Homography = np.eye(3)  # from the frame that the next window has in common with the last one
         self._response: Response | None = None
 
     def add(self, window: Window) -> None:
@@ -148,10 +142,7 @@ def _upright(placed: FloatArray, shape: tuple[int, int]) -> bool:
 
 
 def rehearse(plan: Plan, context: Context) -> None:
-    """Locate a made-up capture and draw its picture, so that compiling and loading do not delay the first frames.
-
-    Problems do not matter.
-    """
+    """Locate a made-up capture, so that compiling does not delay the first frames; problems are only logged."""
     located, picture = LocatedSoFar(plan, context), PictureSoFar()
     try:
         with _Blocks() as source:
@@ -178,3 +169,52 @@ class _Blocks(BinarySource):
             left = frame * _LENGTH_PX // _N_FRAMES
             lit = self._rng.random(_SHAPE) < self._scene[:, left : left + _SHAPE[1]]
             yield slice(frame - span.start, frame - span.start + 1), np.packbits(lit, axis=-1)[None]
+
+
+PAGE, PICTURE, FIGURES = "live.html", "live.png", "live.json"
+
+
+class LivePage:
+    """Writes the page of a run, each file whole or not at all; it shows `figures`."""
+
+    def __init__(self, folder: Path, run_folder: Path) -> None:
+        """Remove the files of an earlier run from `folder`; the report will be in `run_folder`, beside it."""
+        self.figures = LiveFigures()
+        self._folder, self._run_folder = folder, run_folder
+        self._failed = False
+        self._remove()
+
+    def write(self, figures: LiveFigures, picture: PictureSoFar | None = None) -> None:
+        """Write the page, and the picture if it is given. If the disk is full, a warning says so: the run goes on."""
+        self.figures = figures
+        try:
+            self._write(figures, picture)
+        except OutputError as error:
+            if not self._failed:
+                logger.warning(f"the page of the run is not up to date: {error}")
+            self._failed = True
+
+    def _write(self, figures: LiveFigures, picture: PictureSoFar | None) -> None:
+        if picture is not None and (png := picture.png()) is not None:
+            self._replace(PICTURE, png)
+        shown = None
+        if (self._folder / PICTURE).exists():
+            shown = f"{PICTURE}?{time.time_ns()}"  # another address, so that no browser shows an old picture
+        page = render_live(figures, self._run_folder.name, shown, f"../{quote(self._run_folder.name)}/report.html")
+        self._replace(PAGE, page.encode())
+        self._replace(FIGURES, f"{json.dumps(asdict(figures), indent=2)}\n".encode())
+
+    def end(self, reason: str, n_frames: int) -> None:
+        """Say why the run has stopped after a number of frames; without any, there is no page."""
+        if n_frames:
+            self.write(replace(self.figures, state="stopped", frames=n_frames, message=reason))
+        else:
+            self._remove()
+
+    def _remove(self) -> None:
+        for name in (PAGE, PICTURE, FIGURES):
+            (self._folder / name).unlink(missing_ok=True)
+
+    def _replace(self, name: str, content: bytes) -> None:
+        with atomic_path(self._folder / name, flushed=False) as temporary:
+            temporary.write_bytes(content)

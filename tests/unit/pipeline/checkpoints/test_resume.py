@@ -31,7 +31,7 @@ class Killed(BaseException):
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw no report, and write every result at once, so that a run can be killed after each."""
     monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "")
-    monkeypatch.setattr("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0)
+    monkeypatch.setattr("photonpano.pipeline.checkpoints.store.FLUSH_S", 0.0)
 
 
 @pytest.fixture(scope="module")

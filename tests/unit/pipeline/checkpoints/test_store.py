@@ -10,8 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from photonpano.pipeline.checkpoints.kept import Kept, finished
-from photonpano.pipeline.checkpoints.store import Store
+from photonpano.pipeline.checkpoints.store import Kept, Store, finished
 from photonpano.values import Decision, Located
 
 VALUE = Located(np.random.default_rng(0).random((3, 3)), None, 0.25, {"matches": 7.0})
@@ -120,7 +119,7 @@ def test_once_keeps_none_as_a_result(store: Store) -> None:
 
 @pytest.fixture
 def written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0)
+    monkeypatch.setattr("photonpano.pipeline.checkpoints.store.FLUSH_S", 0.0)
 
 
 def test_log_goes_on_after_the_last_result_that_was_written(store: Store, written_at_once: None) -> None:

@@ -80,7 +80,7 @@ def grown(moving_frames: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -
         states.append(figures.state)
         return "<html></html>"
 
-    patch.setattr("photonpano.pipeline.following.page.render_live", render)
+    patch.setattr("photonpano.pipeline.following.picture.render_live", render)
     writer = write_slowly(folder / "capture.npy", moving_frames, 300, 1.5)
     try:
         followed = follow(document, folder / "followed")

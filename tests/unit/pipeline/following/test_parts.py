@@ -16,10 +16,9 @@ import pytest
 from photonpano import Arrived, FrameSpan, InputError, OutputError, Piped
 from photonpano.geometry import rescaling, translation
 from photonpano.pipeline.following import picture as picture_module
-from photonpano.pipeline.following.arrivals import Arrivals, Delays
+from photonpano.pipeline.following.arrivals import Arrivals, Delays, Spool
 from photonpano.pipeline.following.located import Window
 from photonpano.pipeline.following.picture import PictureSoFar
-from photonpano.pipeline.following.spool import Spool
 from photonpano.testing import KnownMotion, MemorySource
 
 
@@ -150,7 +149,7 @@ class TestSpool:
 
         reading, writing = os.pipe()
         write(writing, b"0123456789ab")
-        monkeypatch.setattr("photonpano.pipeline.following.spool.os.write", filling)
+        monkeypatch.setattr("photonpano.pipeline.following.arrivals.os.write", filling)
         path = tmp_path / "a.raw"
         spool = Spool(reading, path, Piped(0, 4))
         while not spool.ended:
