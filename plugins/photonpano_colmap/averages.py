@@ -62,9 +62,8 @@ class AveragesEstimator:
     def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
         """Estimate the poses of a capture: see `photonpano.PoseEstimator`.
 
-        Raises:
-            LocationError: the averages show too little texture, the camera only turns or travels too little, or the poses fall
-                into pieces.
+        Raises a `LocationError` if averages show too little texture, the camera only turns or hardly travels, or poses fall
+        into pieces.
         """
         spans = self._spans(source.info.n_frames)
         images = []
@@ -283,10 +282,10 @@ def relative_std(std_position: FloatArray, poses: FloatArray) -> float | None:
 
 
 def chosen_size(capture: CaptureSummary, n_frames: int) -> tuple[int, str]:
-    """Return the number of frames of an average, and a clause with the reason.
+    """Return the frames of an average, and a clause with the reason.
 
-    Light wants 60 photons a pixel, motion a blur of at most 6 px, and the less of both decides; a capture has 24 to 150
-    averages.
+    An average should have 60 photons a pixel, and a motion blur of at most 6 px: the shorter one is taken. A capture has 24 to
+    150.
     """
     light = _PHOTONS / max(capture.flux, 1e-9)
     motion = math.inf if not capture.speed_px else _BLUR_PX / capture.speed_px

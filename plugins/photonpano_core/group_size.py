@@ -23,29 +23,19 @@ _DEFAULT_SIZE = 500  # frames of a group if the speed of the image is unknown
 
 
 class AutoResampler:
-    """A resampler that chooses its group size on the first call of `groups`.
+    """A resampler that chooses its group size on the first call of `groups`, and records the decision.
 
-    If groups get denser from level to level, those of a dim capture are doubled once the motion is known.
+    If each level has about twice as many groups as the one before, those of a dim capture are doubled once the motion is known.
     """
 
     def __init__(self, context: StageContext, of_size: Callable[[int], Resampler], densifies: bool) -> None:
-        """Prepare to choose.
-
-        Args:
-            context: measures flux and speed, and records the decision.
-            of_size: returns the resampler with a group size.
-            densifies: whether each level has about twice as many groups as the one before.
-        """
+        """Take a function that returns the resampler of a group size."""
         self._context, self._of_size, self._densifies = context, of_size, densifies
         self._size: int | None = None
         self._doubled = False
 
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-        """Return the groups of a level: see `photonpano.Resampler`.
-
-        Raises:
-            InputError: the capture is shorter than the shortest group.
-        """
+        """Return the groups of a level: see `photonpano.Resampler`."""
         if self._size is None:
             stream = self._context.stream
             capture = self._context.capture()

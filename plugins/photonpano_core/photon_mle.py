@@ -26,12 +26,7 @@ class PhotonMleMerger:
     """
 
     def __init__(self, config: PhotonMleConfig, decide: Decide | None = None) -> None:
-        """Prepare to merge.
-
-        Args:
-            config: the keys of the spec.
-            decide: called with the mean length of chunks along each motion, and the reason.
-        """
+        """Take the keys of the spec, and what records the mean length of chunks along each motion, with the reason."""
         self._config, self._decide = config, decide
         self._shared: _Shared | None = None
         self._lock = Lock()

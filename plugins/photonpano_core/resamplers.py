@@ -13,11 +13,7 @@ _SHORTEST_END = 4  # frames of the shortest group at an end of the capture, wher
 
 
 class ConstantGroupsResampler:
-    """floor(n / m) groups of m frames at every level: the ablation that fails in the paper.
-
-    Raises:
-        ValueError: the group size is `auto`, which `AutoResampler` resolves.
-    """
+    """floor(n / m) groups of m frames at every level: the ablation that fails in the paper."""
 
     def __init__(self, config: GroupedConfig) -> None:
         if config.group_size == "auto":
@@ -26,13 +22,10 @@ class ConstantGroupsResampler:
         self._size = config.group_size
 
     def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-        """Return the groups of a level, whose references are their centres.
+        """Return the groups of a level, whose references are their centres; raises an `InputError` if none fits.
 
         They are spread evenly: the first starts at frame 0, and the last ends with the capture. Frames that do not fill a group
         are left out between groups, never at an end. No instant comes twice.
-
-        Raises:
-            InputError: the capture has fewer frames than a group.
         """
         if problem := too_short(self._size, n_frames):
             raise InputError(problem)

@@ -60,16 +60,10 @@ class RobustMerger:
 
 
 def trust_weights(block: PhotonSum, reference: PhotonSum, response: Response, config: RobustMergeConfig, scale: float) -> Image:
-    """Return the weights of a block's pixels: (H, W), from 0 to 1.
+    """Return the weights of a block's pixels, (H, W) from 0 to 1, by its difference from the block at the reference instant.
 
-    Both blocks are smoothed with the same weights, and compared on the scale on which photon noise is uniform.
-
-    Args:
-        block: sum of some frames, on the grid of the exposure.
-        reference: sum of the frames around the reference instant.
-        response: the camera's response.
-        config: tolerances and smoothing, in px of a frame.
-        scale: pixels of the exposure per pixel of a frame.
+    Both are smoothed with the same weights, and compared on the scale on which photon noise is uniform. `scale` is in pixels of
+    the exposure per pixel of a frame.
     """
     blur_px = config.smoothing_px * scale
     # The weights for which the smoothed difference has the least variance; 0 where a block saw nothing.

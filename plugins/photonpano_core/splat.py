@@ -39,11 +39,7 @@ class SplatMerger:
     """
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
-        """Merge a group; see `photonpano.Merger`.
-
-        Raises:
-            InputError: the source corrects sums of frames, which this merger does not make, or its lens distorts.
-        """
+        """Merge a group; see `photonpano.Merger`. Raises an `InputError` if sums are corrected, or the lens distorts."""
         capture = capture_of(source)
         if capture.corrects_sums:
             raise InputError(
@@ -109,19 +105,11 @@ def _without_margin(grid: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def splat(frames: Frames, used: NDArray[np.bool_], to_grid: NDArray[np.float64], total: NDArray[np.float32]) -> None:
-    """Add the counts of frames to a grid, each with bilinear weights to four pixels, times the area of a frame's pixel there.
+    """Add the (n, h, w) counts of frames to a grid, each with bilinear weights to four pixels, times the area of its pixel.
 
-    This is the adjoint of bilinear interpolation: a pixel of a frame adds to a pixel of the grid with the weight with which it
-    would interpolate from it.
-
-    Convention:
-        Points are (x, y), integers are pixel centres. The depth `h31 x + h32 y + h33` is positive in front of the camera.
-
-    Args:
-        frames: (n, h, w) counts, most of them 0.
-        used: (h, w), false for pixels to leave out.
-        to_grid: (n, 3, 3), pixels of each frame to pixels of the grid; of determinant 1, so that the area is `1 / depth^3`.
-        total: (H + 2, W + 2), the grid to add to, with a margin of a pixel for photons that cross its border.
+    This is the adjoint of bilinear interpolation. The `to_grid` maps have determinant 1, so that the area is `1 / depth^3` with
+    the depth `h31 x + h32 y + h33`, positive in front of the camera. `total` is (H + 2, W + 2): it has a margin of a pixel for
+    photons that cross its border.
     """
     lanes = _WORD().itemsize // frames.itemsize
     missing = -frames.shape[2] % lanes
@@ -185,13 +173,10 @@ def _splat(
 def add_coverage(
     shape: tuple[int, int], to_frame: NDArray[np.float64], total: NDArray[np.float32], steps: NDArray[np.float32]
 ) -> None:
-    """Add the sum of splats of frames of ones whose pixels stay 1 px apart: 1 inside a frame, less at its border.
+    """Add the sum of splats of frames of ones whose pixels stay 1 px apart, 1 inside a frame and less at its border, to (H, W).
 
-    Args:
-        shape: (h, w) of a frame.
-        to_frame: (n, 3, 3), pixels of the grid to pixels of each frame.
-        total: (H, W) the grid.
-        steps: (H, W + 1), row-wise differences, whose cumulative sums are to be added to it in the end.
+    `to_frame` are (n, 3, 3) maps of the grid to frames. `steps` (H, W + 1) are row-wise differences, whose cumulative sums are
+    to be added in the end.
     """
     height, width = shape
     rows, columns = total.shape

@@ -22,40 +22,25 @@ _PRIOR = np.diag(np.array([PRIOR_STD, PRIOR_STD, PRIOR_STD, PRIOR_STD, np.inf, n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quality:
-    """How well two images agree.
+    """How well two images agree."""
 
-    Attributes:
-        information: (8, 8) inverse covariance of p1..p8 of the homography, from the photons of both images.
-        noise_ratio: mean squared residual relative to that of photon noise.
-        overlap: fraction of the template that both see.
-        std_px: expected error of a corner, in px of the layer.
-    """
-
-    information: FloatArray
-    noise_ratio: float
-    overlap: float
-    std_px: float
+    information: FloatArray  # (8, 8) inverse covariance of p1..p8 of the homography, from the photons of both images
+    noise_ratio: float  # mean squared residual relative to that of photon noise
+    overlap: float  # fraction of the template that both see
+    std_px: float  # expected error of a corner, in px of the layer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aligned:
-    """An aligned template.
-
-    Attributes:
-        template: the moving layer.
-        homography: (3, 3), pixels of the template to pixels of the fixed layer.
-        pixels: number of pixels that both see.
-        squares: weighted sum of the squared residuals.
-        weights: sum of the weights, the inverse variances of the residuals.
-        buffers: residual and weight at the last step. They belong to the thread, and are valid until it aligns another template
-            of this shape.
-    """
+    """An aligned template."""
 
     template: Layer
-    homography: Homography
-    pixels: int
-    squares: float
-    weights: float
+    homography: Homography  # (3, 3), pixels of the template to pixels of the fixed layer
+    pixels: int  # number of pixels that both see
+    squares: float  # weighted sum of the squared residuals
+    weights: float  # sum of the weights, the inverse variances of the residuals
+    # residual and weight at the last step. They belong to the thread, and are valid until it aligns another template of this
+    # shape
     buffers: Buffers
 
     @property
@@ -64,11 +49,7 @@ class Aligned:
         return self.pixels / self.template.image.size
 
     def quality(self, camera_matrix: FloatArray | None) -> Quality:
-        """Return how well the images agree. Overwrites the buffers, so it can be called once.
-
-        Args:
-            camera_matrix: (3, 3) K, in px of the layer, if only a turn was estimated; else None.
-        """
+        """Return how well the images agree, given K in px of the layer for a rotation; it overwrites the buffers."""
         # A Gaussian blur of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
         noise_ratio = self.squares / self.pixels * 4 * np.pi * self.template.blur_px**2
         shape = (self.template.image.shape[0], self.template.image.shape[1])
@@ -97,16 +78,10 @@ def align(
     tolerance_px: float,
     max_steps: int,
 ) -> Aligned | NotLocated:
-    """Align a template to another layer.
+    """Align a template to another layer of the same shape, from an initial map of its pixels to those of the other layer.
 
-    Args:
-        template: the moving layer.
-        fixed: the other layer, of the same shape.
-        homography: (3, 3) initial map, pixels of the template to pixels of the fixed layer.
-        prior_mean: (3, 3) prior mean of the homography.
-        basis: (8, K) small changes of p1..p8 in unit coordinates that are estimated.
-        tolerance_px: converged when a step moves no corner further.
-        max_steps: step limit.
+    `basis` (8, K) are the small changes of p1..p8 in unit coordinates that are estimated. It has converged when a step moves no
+    corner further than `tolerance_px`.
     """
     shape = (template.image.shape[0], template.image.shape[1])
     buffers = buffers_of(template)

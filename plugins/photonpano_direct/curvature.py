@@ -61,13 +61,8 @@ def curvatures(moving: Layer, buffers: Buffers, chance: float, floor: float) -> 
     """Return the (8, 8) Gauss-Newton Hessian of the template, and the part that both images have in common.
 
     The noise of the template has derivatives too, larger in the dark than those of the scene. The two images have only the
-    scene in common.
-
-    Args:
-        moving: the template.
-        buffers: residual and weight from `residuals_and_moments`; the gradients are overwritten.
-        chance: common curvature of noise by chance, relative to the template's; it is subtracted.
-        floor: lower bound of the eigenvalues of the common curvature, relative to the template's.
+    scene in common. The common curvature of noise by `chance` is subtracted, and eigenvalues stay above `floor`, both relative
+    to the template's. The gradients of the buffers are overwritten.
     """
     own = _hessian(moving.gradients, moving.gradients, buffers.weight)
     differentiate(buffers.residual, buffers.gradients)
@@ -91,13 +86,7 @@ def curvatures(moving: Layer, buffers: Buffers, chance: float, floor: float) -> 
 
 @compiled
 def _hessian(first: NDArray[np.float32], second: NDArray[np.float32], weight: NDArray[np.float32]) -> FloatArray:
-    """Return the (8, 8) weighted sums over pixels of products of their derivatives with respect to two parameters.
-
-    Args:
-        first: (2, H, W) derivatives of one image along x and y.
-        second: (2, H, W) those of the other.
-        weight: (H, W).
-    """
+    """Return (8, 8) weighted sums of products of derivatives by two parameters, from (2, H, W) derivatives along x and y."""
     moments = np.empty((3, 5, 5))
     derivative_moments(first, second, weight, moments)
     height, width = weight.shape
@@ -113,10 +102,7 @@ def _hessian(first: NDArray[np.float32], second: NDArray[np.float32], weight: ND
 def expected_px(information: FloatArray, basis: FloatArray, to_corners: FloatArray) -> float:
     """Return the expected error of a corner in px if noise is white; 0 if the information is singular.
 
-    Args:
-        information: (8, 8) inverse covariance of p1..p8.
-        basis: (8, K) changes of p1..p8 that are estimated.
-        to_corners: (8, 8) derivatives of the corners with respect to p1..p8, in px.
+    `basis` (8, K) are the changes of p1..p8 that are estimated, `to_corners` (8, 8) the derivatives of the corners by p1..p8.
     """
     of_basis, n = transposed(basis), basis.shape[1]
     root, moves = np.zeros((n, n)), transposed(product(to_corners, basis))
@@ -139,7 +125,7 @@ def information_of(
     generators: FloatArray,
     to_corners: FloatArray,
 ) -> tuple[FloatArray, float]:
-    """Return the information matrix and the expected corner error of an aligned pair.
+    """Return the inverse covariance of p1..p8, (8, 8), and the expected error of a corner in px, infinite without texture.
 
     Args:
         moving: the template.
@@ -151,10 +137,6 @@ def information_of(
         prior: (8, 8) inverse covariance of the prior.
         generators: (8, 3, 3), see `photonpano.geometry.generators`.
         to_corners: (8, 8) derivatives of the corners of the template with respect to the parameters, in px.
-
-    Returns:
-        The (8, 8) inverse covariance of p1..p8 of the homography, and the expected error of a corner in px of the layer,
-        infinite without texture.
     """
     _, hessian = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
     # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights and positions

@@ -35,11 +35,11 @@ def descend(
     max_steps: int,
     buffers: Buffers,
 ) -> tuple[int, Homography, int, float, float]:
-    """Align a template to an image.
+    """Align a template to an image of the same shape.
 
     Args:
         moving: the template.
-        fixed: the other image, of the same shape.
+        fixed: the other image.
         homography: (3, 3) initial map, pixels of the template to pixels of the fixed image.
         prior_mean: (3, 3) prior mean of the homography.
         prior: (8, 8) inverse covariance of the prior, for small changes in unit coordinates of the template.

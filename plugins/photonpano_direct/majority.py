@@ -28,13 +28,7 @@ _TRIED = 3  # number of shifts that a search returns
 
 
 def part_following(moving: Layer, fixed: Layer, homography: Homography) -> Follows:
-    """Find the part of a template that follows a motion.
-
-    Args:
-        moving: the template.
-        fixed: the other image, of the same shape.
-        homography: (3, 3), pixels of the template to pixels of the fixed image.
-    """
+    """Find the part of a template that follows a motion, (3, 3), to pixels of another image of the same shape."""
     buffers = buffers_of(moving)
     residuals_and_moments(moving, fixed, homography, buffers, np.empty((3, 3)), np.empty((3, 3)))
     noise_left = 1 / (4 * np.pi * moving.blur_px**2)
@@ -44,13 +38,9 @@ def part_following(moving: Layer, fixed: Layer, homography: Homography) -> Follo
 
 
 def shifts_between(moving: Layer, fixed: Layer) -> list[Homography]:
-    """Return the shifts under which most of a template fits, the best first: whatever moves otherwise counts at most half.
+    """Return the shifts under which most of a template fits an image, the best first: what moves otherwise counts half at most.
 
     All shifts by whole pixels, up to a third of the image, are compared.
-
-    Args:
-        moving: the template.
-        fixed: the other image, of the same shape.
     """
     height, width = moving.image.shape
     reach_y, reach_x = height // 3, width // 3

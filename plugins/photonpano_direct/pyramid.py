@@ -17,15 +17,10 @@ _COMPARED = 2  # layer on which aligned images are compared: coarse, so that noi
 
 
 class Pyramid(NamedTuple):
-    """An exposure and its halves.
+    """An exposure and its halves."""
 
-    Attributes:
-        layers: finest first.
-        details: those of the layer `compared`.
-    """
-
-    layers: tuple[Layer, ...]
-    details: Details
+    layers: tuple[Layer, ...]  # finest first
+    details: Details  # those of the layer `compared`
 
     @property
     def compared(self) -> int:
@@ -34,13 +29,7 @@ class Pyramid(NamedTuple):
 
 
 def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> Pyramid:
-    """Return an exposure and its halves, finest first.
-
-    Args:
-        exposure: flux and weight.
-        levels: largest number of layers; small images have fewer.
-        blur_px: standard deviation of the Gaussian blur against photon noise, in px of the exposure.
-    """
+    """Return an exposure, blurred against photon noise, and its halves; small images have fewer than `levels` layers."""
     layers = tuple(_layer_of(view) for view in view_pyramid(exposure, blur_px, levels, SMALLEST_SIDE))
     return Pyramid(layers, details_of(layers[min(_COMPARED, len(layers) - 1)]))
 

@@ -15,18 +15,11 @@ from photonpano_direct.moments import Layer
 
 
 class Details(NamedTuple):
-    """A layer without its local mean.
+    """A layer without its local mean."""
 
-    Attributes:
-        image: (H, W) float32, the layer without its local mean; 0 at masked pixels.
-        weight: (H, W) float32, that of the layer.
-        gain: fraction of the variance of white noise that the blur leaves.
-        autocorrelation: that of the image.
-    """
-
-    image: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    gain: float
+    image: NDArray[np.float32]  # (H, W), the layer without its local mean; 0 at masked pixels
+    weight: NDArray[np.float32]  # (H, W), that of the layer
+    gain: float  # fraction of the variance of white noise that the blur leaves
     autocorrelation: FloatArray
 
     @property
@@ -43,13 +36,7 @@ def details_of(layer: Layer) -> Details:
 
 
 def similarity_under(homography: Homography, moving: Details, fixed: Details) -> Similarity:
-    """Return the similarity of two images under a motion.
-
-    Args:
-        homography: (3, 3), pixels of the moving image to pixels of the fixed one.
-        moving: one image.
-        fixed: another of the same shape.
-    """
+    """Return the similarity of two images of one shape under a homography, from `moving` to `fixed`."""
     sums = np.empty(8)
     _sum_up(moving, fixed, homography, sums)
     pixels, first, second, squares, products, others, weight, other_weight = sums

@@ -35,17 +35,12 @@ _CONFIDENCE = 0.999  # probability of having found the best motion at which RANS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiftFeatures:
-    """Keypoints of one exposure.
+    """Keypoints of one exposure."""
 
-    Attributes:
-        frames: (N, 2, 3) float32, kornia's local affine frames: the last column is the position, the others the shape.
-        descriptors: (N, 128) float16, RootSIFT.
-        shape: (height, width) of the exposure.
-    """
-
+    # (N, 2, 3), kornia's local affine frames: the last column is the position, the others the shape
     frames: NDArray[np.float32]
-    descriptors: NDArray[np.float16]
-    shape: tuple[int, int]
+    descriptors: NDArray[np.float16]  # (N, 128), RootSIFT
+    shape: tuple[int, int]  # (height, width) of the exposure
 
     @property
     def points(self) -> FloatArray:
@@ -118,15 +113,10 @@ class FeatureLocator(PointLocator):
 
 
 class Picture(NamedTuple):
-    """An exposure as input of LoFTR. Its feature maps would take fifty times the memory.
+    """An exposure as input of LoFTR. Its feature maps would take fifty times the memory."""
 
-    Attributes:
-        image: (H, W) uint8; masked pixels have the mean of the others.
-        seen: (H, W) bool, False for masked pixels.
-    """
-
-    image: NDArray[np.uint8]
-    seen: NDArray[np.bool_]
+    image: NDArray[np.uint8]  # (H, W); masked pixels have the mean of the others
+    seen: NDArray[np.bool_]  # (H, W), False for masked pixels
 
 
 class LoftrLocator:
@@ -152,12 +142,7 @@ class LoftrLocator:
         return Picture(image, seen)
 
     def register(self, moving: Picture, fixed: Picture, initial: Homography | None) -> Located | NotLocated:
-        """Match and fit; see `photonpano.Locator`.
-
-        Returns:
-            `NotLocated` with the numbers that decided when too few points match or agree, when they leave the corners of the
-            frame uncertain, or when no camera moves like that.
-        """
+        """Match and fit; see `photonpano.Locator`."""
         if min(moving.image.shape) < _SMALLEST_SIDE:
             height, width = moving.image.shape
             return NotLocated(f"the images have {height} x {width} px, LoFTR needs at least {_SMALLEST_SIDE} along each side")

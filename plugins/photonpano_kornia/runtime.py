@@ -19,11 +19,7 @@ _GENERATOR = Lock()  # held while the global random generator is seeded, which a
 
 
 def device_of(name: str) -> torch.device:
-    """Return the device of a config.
-
-    Raises:
-        InputError: torch does not find the device.
-    """
+    """Return the device of a config; raises an `InputError` if torch does not find it."""
     with warnings.catch_warnings():
         # A CUDA build of torch warns if there is no driver; the error below says so.
         warnings.simplefilter("ignore")

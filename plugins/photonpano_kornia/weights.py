@@ -16,17 +16,10 @@ from photonpano_kornia.runtime import seeded
 
 
 def loftr_from(path: Path, device: torch.device, *, corrected_positions: bool, min_confidence: float) -> LoFTR:
-    """Return LoFTR with the weights of a file, ready for inference.
+    """Return LoFTR with the weights of a file of `torch.save`, ready for inference; only tensors are read, no code is run.
 
-    Args:
-        path: a file of `torch.save`: tensors by name, or a checkpoint with these under `state_dict`. Only tensors are read, no
-            code is run.
-        device: device of the network.
-        corrected_positions: whether the weights were trained with the corrected positional encoding.
-        min_confidence: matches with a lower confidence are dropped.
-
-    Raises:
-        InputError: the file cannot be read, or does not hold the weights of LoFTR.
+    Raises an `InputError` if the file cannot be read, or holds something else than tensors by name, or these under
+    `state_dict`.
     """
     weights = _read(path)
     config = copy.deepcopy(default_cfg)

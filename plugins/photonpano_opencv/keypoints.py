@@ -34,29 +34,18 @@ _ROUNDING_PX = math.sqrt(1 / 12)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keypoints:
-    """Keypoints of one exposure.
+    """Keypoints of one exposure."""
 
-    Attributes:
-        points: (N, 2) float32, pixel centres are integers.
-        sizes: (N,) float32, diameters of the keypoints in px; position errors are proportional to them.
-        descriptors: (N, D) uint8, as the detector returns them.
-        shape: (height, width) of the exposure.
-    """
-
-    points: NDArray[np.float32]
-    sizes: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
-    shape: tuple[int, int]
+    points: NDArray[np.float32]  # (N, 2), pixel centres are integers
+    sizes: NDArray[np.float32]  # (N,), diameters of the keypoints in px; position errors are proportional to them
+    descriptors: NDArray[np.uint8]  # (N, D), as the detector returns them
+    shape: tuple[int, int]  # (height, width) of the exposure
 
 
 def detected(
     detector: cv2.Feature2D, image: NDArray[np.uint8], mask: NDArray[np.uint8], most: int
 ) -> tuple[Sequence[cv2.KeyPoint], Keypoints]:
-    """Detect and describe at most `most` keypoints of an image, the strongest, where the mask is not 0.
-
-    Returns:
-        The keypoints as OpenCV returns them, and as `Keypoints`.
-    """
+    """Detect and describe at most `most` keypoints of an image, the strongest, where the mask is not 0."""
     keypoints, descriptors = detector.detectAndCompute(image, mask)
     # OpenCV keeps all keypoints that are as strong as the weakest, so there may be more than the detector's limit.
     keypoints = keypoints[:most]
@@ -82,15 +71,7 @@ class KeypointMatcher(PointLocator):
         ratio: float,
         rounding_px: float = 0.0,
     ) -> None:
-        """Prepare to match.
-
-        Args:
-            config: thresholds.
-            seed: of MAGSAC.
-            as_unit_vectors: converts descriptors to vectors that are compared by scalar products.
-            ratio: Lowe's ratio for the distances of these vectors.
-            rounding_px: standard deviation of an error common to all matches.
-        """
+        """Take Lowe's ratio for distances of descriptors as unit vectors, and the standard error that all matches share."""
         self._config: KeypointConfig = config
         self._seed = seed
         self._as_unit_vectors = as_unit_vectors

@@ -46,15 +46,10 @@ def match_nearby(
     radius_px: float,
     ratio: float,
 ) -> NDArray[np.intp]:
-    """Match unit descriptors within a radius of predicted positions: pairs of indices (K, 2).
+    """Match unit descriptors (M, D) and (N, D) within a radius of predicted positions: pairs of indices (K, 2).
 
-    Args:
-        moving: (M, D) descriptors.
-        fixed: (N, D) descriptors.
-        predicted: (M, 2) predicted positions of the moving keypoints in the fixed image, px.
-        points: (N, 2) positions of the fixed keypoints, px.
-        radius_px: search radius.
-        ratio: of Lowe's test; without a second candidate its similarity is taken as -1.
+    `predicted` are positions of the moving keypoints in the fixed image, `points` those of the fixed ones, px. Without a second
+    candidate, its similarity is taken as -1.
     """
     if min(len(moving), len(fixed)) == 0:
         return np.zeros((0, 2), dtype=np.intp)

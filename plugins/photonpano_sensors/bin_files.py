@@ -28,16 +28,7 @@ def bin_source(
     recognise: Callable[[Path], Recognised | None],
     footer_bytes: int = 0,
 ) -> SourceContribution:
-    """Return the contribution of a source of .bin files.
-
-    Args:
-        name: the source.
-        summary: a line about it.
-        config: its keys.
-        layout: order of the pixels of a frame in its bytes.
-        recognise: see `SourceContribution`.
-        footer_bytes: number of bytes that may follow the frames of a file.
-    """
+    """Return the contribution of a source of .bin files; `footer_bytes` may follow the frames of a file."""
 
     def opened(config: BinConfig) -> PackedFileSource:
         return PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz)
@@ -67,15 +58,9 @@ def bin_source(
 def frame_files(path: Location, layout: FrameLayout, footer_bytes: int = 0, *, growing: bool = False) -> list[FrameFile]:
     """Return the files of a capture with the number of frames that follows from their sizes.
 
-    Args:
-        path: a file, or a folder.
-        layout: order of the pixels of a frame in its bytes.
-        footer_bytes: number of bytes that may follow the frames of a file.
-        growing: whether the last file is still being written; it then counts with the whole frames that it has.
-
-    Raises:
-        InputError: there is no file; the size of a file is not a whole number of frames; or a file has another size than the
-            first, unless it is the last and shorter: frames are missing, or the order is wrong.
+    If it is `growing`, the last file counts with its whole frames. Raises an `InputError` if there is no file, a size is not a
+    whole number of frames, or a file is larger than the first, or smaller and not the last: frames are missing, or the order is
+    wrong.
     """
     files = files_in(path, ".bin")
     sizes = [size_of(file) for file in files]

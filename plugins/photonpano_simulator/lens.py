@@ -18,11 +18,7 @@ _POINTS_OF_A_SIDE = 16
 
 
 def undistorted(config: SimulationConfig, points: ArrayLike) -> FloatArray:
-    """Return where a lens without distortion images what this lens images at (..., 2) points: see `Lens` and `Distortion`.
-
-    Raises:
-        InputError: the lens images nothing at one of the points.
-    """
+    """Return where a lens without distortion images what this lens images at (..., 2) points: see `Lens` and `Distortion`."""
     points = np.asarray(points, dtype=np.float64)
     if not any(config.distortion.coefficients):
         return _undivided(config.lens, points, config.frame_shape)

@@ -16,11 +16,8 @@ _DETAIL_PX = (1.5, 5.0, 15.0)  # standard deviations of the Gaussian kernels tha
 class DrawnObject:
     """A rectangle or a disc with texture, drawn over frames.
 
-    Args:
-        config: size, texture and motion.
-        frame_shape: (height, width) of a frame.
-        flux: flux of the texture where `config.flux` is 1, photons per pixel per frame.
-        scene_motion: (T, 2), how far the scene has moved through the frame since the first frame, in px.
+    `flux`, in photons per pixel per frame, is that of the texture where `config.flux` is 1; `scene_motion` (T, 2) is how far
+    the scene has moved through the frame since the first frame, in px.
     """
 
     def __init__(self, config: FrameObject, frame_shape: tuple[int, int], flux: float, scene_motion: FloatArray) -> None:
@@ -57,10 +54,7 @@ def _covered(start: float, length: float, n_pixels: int) -> FloatArray:
 
 
 def _disc(left: float, top: float, size: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Return the share of each pixel, (H, W), that the largest disc in a rectangle covers.
-
-    The edge counts as straight within a pixel, and as a ramp one pixel wide, which is exact along rows and columns.
-    """
+    """Return the share of each pixel, (H, W), that the largest disc in a rectangle covers: its edge is a ramp of one pixel."""
     y, x = np.ogrid[: shape[0], : shape[1]]
     from_middle = np.hypot(x - (left + size[0] / 2), y - (top + size[1] / 2))
     return np.asarray(np.clip(size.min() / 2 - from_middle + 0.5, 0, 1))

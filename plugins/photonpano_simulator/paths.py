@@ -41,10 +41,9 @@ _SPLINE_REACH = (1.0, 0.5)  # how far a random path reaches along x and y, relat
 
 
 def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: int) -> FloatArray:
-    """Return the true homographies of all frames: (T, 3, 3), frame pixels to scene pixels.
+    """Return the true homographies of all frames, (T, 3, 3), frame pixels to scene pixels.
 
-    Raises:
-        InputError: a frame reaches beyond the scene, or the file of the path cannot be used.
+    Raises an `InputError` if a frame reaches beyond the scene, or the file of the path cannot be used.
     """
     path, focal = config.path, config.focal_length_px
     frame = _intrinsics(config.frame_shape, focal)
@@ -68,10 +67,9 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
 
 
 def camera_rotations(config: SimulationConfig, homographies: FloatArray, scene_shape: tuple[int, int]) -> FloatArray | None:
-    """Return the rotations of a path: (T, 3, 3), directions of a frame to those of a camera before the middle of the scene.
+    """Return the rotations of a path, (T, 3, 3): directions of a frame to those of a camera before the middle of the scene.
 
-    Returns:
-        None for homographies from a file, which need not be rotations.
+    It is None for homographies from a file, which need not be rotations.
     """
     if isinstance(config.path, FilePath):
         return None
@@ -93,11 +91,7 @@ def scene_motion(homographies: FloatArray, frame_shape: tuple[int, int], path: o
 
 
 def _turn(config: SimulationConfig, path: TurnPath, scene_shape: tuple[int, int], seed: int) -> FloatArray:
-    """Return K R K^-1 of a camera that turns before a panorama of (height, width), 360 degrees wide: (T, 3, 3).
-
-    Raises:
-        InputError: a frame reaches above or below the panorama, or the panorama is too coarse for the camera.
-    """
+    """Return K R K^-1 of a camera that turns before a panorama of (height, width), 360 degrees wide: (T, 3, 3)."""
     focal, per_radian = config.focal_length_px, scene_shape[1] / (2 * np.pi)
     if per_radian < focal * config.scene_scale / 2:
         raise InputError(
@@ -177,15 +171,7 @@ def _raster(path: ScanPath) -> FloatArray:
 def random_path(
     reach: tuple[float, ...], length: float, knots: int, progress: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return a cubic spline through random points, (T, D), around 0, whose speed changes on the way.
-
-    Args:
-        reach: how far it reaches along each axis, relative to each other.
-        length: of the path.
-        knots: number of random points, evenly spaced in time.
-        progress: (T,) times from 0 to 1.
-        rng: draws the points.
-    """
+    """Return a spline of a length through random knots around 0, (T, D), at times from 0 to 1; `reach` is relative."""
     spline = random_spline(reach, knots, rng)
     dense = spline(np.linspace(0, 1, _DENSE))
     middle = (dense.min(axis=0) + dense.max(axis=0)) / 2
@@ -222,11 +208,7 @@ def _intrinsics(shape: tuple[float, float], focal: float) -> FloatArray:
 
 
 def looking(ahead: FloatArray) -> FloatArray:
-    """Return rotations of the world to level cameras that look along directions (T, 3): (T, 3, 3).
-
-    Convention:
-        x right, y down, z ahead. A camera cannot be level that looks straight up or down.
-    """
+    """Return rotations of the world to level cameras that look along directions (T, 3), not straight up or down: (T, 3, 3)."""
     x, y, z = ahead.T
     side = np.hypot(x, z)
     reach, zero = np.hypot(side, y), np.zeros_like(x)
@@ -277,11 +259,7 @@ def _require_inside(homographies: FloatArray, frame: FloatArray, scene_shape: tu
 
 
 def _read_homographies(path: Path, n_frames: int) -> FloatArray:
-    """Read (n_frames, 3, 3) homographies from a .npy file, or from `homographies` in an .npz archive.
-
-    Raises:
-        InputError: the file is missing, is something else, or has another number of homographies.
-    """
+    """Read (n_frames, 3, 3) homographies from a .npy file, or from `homographies` in an .npz archive."""
     arrays = read_arrays(path, "a file of homographies", ("homographies", "scene_projection", "camera_from_world"))
     if "scene_projection" in arrays and str(arrays["scene_projection"]) == "spherical":
         raise InputError(f"{path} is the truth of a turn, and its homographies lie on no plane; take a path of the kind turn")

@@ -20,11 +20,7 @@ from photonpano_simulator.views import Views
 
 
 class SimulatedSource(SingleFrameSource):
-    """A simulated camera, whose frames depend only on the config, the seed and their index.
-
-    Raises:
-        InputError: a file of the sensor cannot be used, or frames are dropped that do not exist.
-    """
+    """A simulated camera, whose frames depend only on the config, the seed and their index."""
 
     def __init__(self, config: SimulatorConfig | CameraSimulatorConfig | TravelConfig, context: SourceContext) -> None:
         self._seed = context.seed if config.seed is None else config.seed
@@ -56,11 +52,7 @@ class SimulatedSource(SingleFrameSource):
 
 
 class SimulatorSource(SimulatedSource):
-    """A camera that rotates in front of a scene (paper, section 5, "Simulation Details").
-
-    Raises:
-        InputError: a file cannot be used, the camera path leaves the scene, or frames are dropped that do not exist.
-    """
+    """A camera that rotates in front of a scene (paper, section 5, "Simulation Details")."""
 
     def __init__(self, config: SimulatorConfig | CameraSimulatorConfig, context: SourceContext) -> None:
         super().__init__(config, context)
@@ -142,13 +134,7 @@ class SimulatorSource(SimulatedSource):
         return truth
 
     def sharp_view(self, frame: int) -> NDArray[np.float32]:
-        """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W).
-
-        Behind colour filters, each pixel shows its own colour.
-
-        Raises:
-            InputError: there is no such frame.
-        """
+        """Return the flux of a frame, (H, W), without noise, dark counts and differences between pixels but their filters."""
         self.info.require(FrameSpan(frame, frame + 1))
         taken = int(self._taken[frame])
         return self._flux(taken) * np.float32(self._light[taken])

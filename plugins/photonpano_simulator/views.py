@@ -23,12 +23,6 @@ class Views:
 
     The flux between the pixels of the scene is interpolated linearly. Pixels of the camera have an area if the scene is finer
     than they are: its flux is averaged over squares of whole pixels of the scene, and the averages are interpolated.
-
-    Args:
-        config: of the simulation.
-
-    Raises:
-        InputError: the lens images nothing at some pixels.
     """
 
     def __init__(self, config: SimulationConfig) -> None:
@@ -54,12 +48,10 @@ class Views:
         return np.asarray(averages[:, : -self._side] if self._is_round else averages, np.float32)
 
     def view(self, averages: NDArray[np.float32], homography: FloatArray) -> NDArray[np.float32]:
-        """Return the flux of a scene in a frame, (H, W) or (H, W, 3).
+        """Return the flux of a scene in a frame, (H, W) or (H, W, 3), from `averaged`.
 
-        Args:
-            averages: from `averaged`.
-            homography: (3, 3), pixels of the frame to pixels of the scene; before a panorama, K R K^-1, scaled by a positive
-                number, where R turns directions of the frame to those of the panorama.
+        The homography is (3, 3), pixels of the frame to pixels of the scene; before a panorama, K R K^-1, scaled by a positive
+        number, where R turns directions of the frame to those of the panorama.
         """
         if self._points is not None and self._is_round:
             return self._around(averages, self._points, homography)

@@ -21,19 +21,10 @@ _LEAST = 4  # fewest points of a depth map
 def inverse_depth_of(
     pose: FloatArray, points: FloatArray, camera_matrix: FloatArray, shape: tuple[int, int]
 ) -> NDArray[np.float32] | None:
-    """Return the inverse depth of the pixels of a view.
+    """Return the inverse depth of the pixels of a view, (H, W), from points of the world; None if it sees fewer than 4.
 
     It is linear between points, as that of a plane is. At the edges of things it is wrong by the width of a triangle; within a
     group, the camera moves so little that this hardly matters.
-
-    Args:
-        pose: (3, 4) of the view.
-        points: (N, 3) of the world.
-        camera_matrix: (3, 3) K.
-        shape: (height, width) of the view.
-
-    Returns:
-        (H, W), or None if the view sees fewer than 4 points.
     """
     height, width = shape
     seen = points @ pose[:, :3].T + pose[:, 3]

@@ -35,55 +35,33 @@ _OUT_OF_SIGHT = 0.8  # exposures are compared if their centres are closer than t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Path and scene before a level.
-
-    Attributes:
-        path: of the camera.
-        located: (T,) frames whose pose is known.
-        points: (N, 3) of the world.
-    """
+    """Path and scene before a level."""
 
     path: Path
-    located: BoolArray
-    points: FloatArray
+    located: BoolArray  # (T,) frames whose pose is known
+    points: FloatArray  # (N, 3) of the world
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merged:
-    """The exposures of a level.
-
-    Attributes:
-        exposures: of all groups.
-        path: along which they are merged.
-        tremor: the last one found; None if the capture is too short.
-    """
+    """The exposures of a level."""
 
     exposures: Sequence[PosedExposure]
-    path: Path
-    tremor: Tremor | None
+    path: Path  # along which they are merged
+    tremor: Tremor | None  # the last one found; None if the capture is too short
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedLevel:
-    """The exposures of a level, located.
-
-    Attributes:
-        groups: of the exposures.
-        is_located: (V,) bool.
-        adjusted: poses of the located exposures, and points.
-        observations: of these points, in the located exposures.
-        exposures: all of them.
-        path: of the camera.
-        tremor: what was found last before the exposures were located.
-    """
+    """The exposures of a level, located."""
 
     groups: Sequence[Group]
-    is_located: BoolArray
-    adjusted: Adjusted
-    observations: Observations
+    is_located: BoolArray  # (V,)
+    adjusted: Adjusted  # poses of the located exposures, and points
+    observations: Observations  # of these points, in the located exposures
     exposures: Sequence[PosedExposure]
     path: Path
-    tremor: Tremor | None
+    tremor: Tremor | None  # what was found last before the exposures were located
 
     @property
     def scene(self) -> Scene:
@@ -142,13 +120,9 @@ def merge(source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: 
 def locate(
     exposures: Sequence[PosedExposure], camera_matrix: FloatArray, pool: ThreadPoolExecutor
 ) -> tuple[FloatArray, Observations]:
-    """Choose points in key exposures, and find them in the others.
+    """Choose points in key exposures, (N, 3) where the depth so far has them, and find them in the others.
 
-    Returns:
-        (N, 3) points of the world, where the depth so far has them, and where exposures see them.
-
-    Raises:
-        LocationError: no patch of an exposure is found in another one.
+    Raises a `LocationError` if hardly a patch of an exposure is found in another one.
     """
     views = list(pool.map(stabilised, exposures))
     number = len(exposures)
@@ -185,11 +159,7 @@ def locate(
 def interpolate(
     groups: Sequence[Group], merged: Merged, points: FloatArray, observations: Observations, camera_matrix: FloatArray
 ) -> PosedLevel:
-    """Adjust exposures and points to the observations, and correct the path by the poses of the exposures.
-
-    Raises:
-        LocationError: few exposures show points of others.
-    """
+    """Adjust exposures and points to the observations, and correct the path by the poses of the exposures."""
     exposures = merged.exposures
     located = np.bincount(observations.views, minlength=len(exposures)) >= _LEAST_OBSERVATIONS
     if located.sum() < _LEAST_LOCATED:

@@ -18,17 +18,11 @@ _CHUNK_PX = 1.0  # frames that move less than this are summed before they are wa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedExposure:
-    """A virtual exposure, with its place in the world.
+    """A virtual exposure, with its place in the world."""
 
-    Attributes:
-        exposure: flux and weight, seen from the reference instant of its group.
-        pose: (3, 4) of that instant.
-        inverse_depth: (H, W) of its pixels.
-    """
-
-    exposure: VirtualExposure
-    pose: FloatArray
-    inverse_depth: NDArray[np.float32]
+    exposure: VirtualExposure  # flux and weight, seen from the reference instant of its group
+    pose: FloatArray  # (3, 4) of that instant
+    inverse_depth: NDArray[np.float32]  # (H, W) of its pixels
 
 
 def merge_through_depth(
@@ -37,13 +31,6 @@ def merge_through_depth(
     """Merge the frames of a group as its reference instant sees them (paper, section 6: aggregation that is consistent in 3D).
 
     Each chunk of frames is interpolated once, where its frames see the points of the reference view. Occlusions are ignored.
-
-    Args:
-        source: the capture.
-        group: the frames and the reference instant.
-        path: of the camera.
-        inverse_depth: (H, W) of the view at the reference instant.
-        camera_matrix: (3, 3) K.
     """
     pose = path.at([group.reference])[0]
     counts, weight = np.zeros((2, *source.info.frame_shape), np.float32)

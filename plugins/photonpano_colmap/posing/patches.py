@@ -30,43 +30,26 @@ _SLOPE_PX = 3.0  # standard deviation of the blur before slopes of the inverse d
 
 
 class Stabilised(NamedTuple):
-    """An exposure as an image of uniform noise.
+    """An exposure as an image of uniform noise."""
 
-    Attributes:
-        image: (H, W) float32, blurred; NaN where it is unknown.
-        noise: variance of a pixel before the blur.
-        noise_left: share of this variance that the blur leaves.
-    """
-
-    image: NDArray[np.float32]
-    noise: float
-    noise_left: float
+    image: NDArray[np.float32]  # (H, W), blurred; NaN where it is unknown
+    noise: float  # variance of a pixel before the blur
+    noise_left: float  # share of this variance that the blur leaves
 
 
 class Patches(NamedTuple):
-    """Patches of an exposure.
+    """Patches of an exposure."""
 
-    Attributes:
-        pixels: (N, 2) their middles, px.
-        inverse_depth: (N, 3) that of their middles, and its slopes along x and y per px.
-    """
-
-    pixels: FloatArray
-    inverse_depth: FloatArray
+    pixels: FloatArray  # (N, 2) their middles, px
+    inverse_depth: FloatArray  # (N, 3) that of their middles, and its slopes along x and y per px
 
 
 class Found(NamedTuple):
-    """Where some patches are in another exposure.
+    """Where some patches are in another exposure."""
 
-    Attributes:
-        patches: (M,) their numbers.
-        pixels: (M, 2) px.
-        covariance: (M, 2, 2) px^2, as photon noise has it.
-    """
-
-    patches: NDArray[np.intp]
-    pixels: FloatArray
-    covariance: FloatArray
+    patches: NDArray[np.intp]  # (M,) their numbers
+    pixels: FloatArray  # (M, 2) px
+    covariance: FloatArray  # (M, 2, 2) px^2, as photon noise has it
 
 
 def stabilised(posed: PosedExposure) -> Stabilised:
@@ -100,15 +83,9 @@ def find_patches(
     there: tuple[PosedExposure, Stabilised],
     camera_matrix: FloatArray,
 ) -> Found:
-    """Find the patches of an exposure in another one.
+    """Find the patches of an exposure, `here`, in another one, `there`.
 
     The noise of the patch itself shifts it alike in all other exposures, and with it the point of the scene that it stands for.
-
-    Args:
-        patches: of the exposure `here`.
-        here: the exposure that they were chosen in.
-        there: the other one.
-        camera_matrix: (3, 3) K.
     """
     (posed, view), (other, image) = here, there
     turn, shift = between(posed.pose, other.pose, camera_matrix)
@@ -142,7 +119,7 @@ def _find(
     hessian: FloatArray,
     chi_square: FloatArray,
 ) -> None:
-    """Find patches in an image; those that are lost stay NaN.
+    """Find patches of a template, (H, W), in an image by Gauss-Newton steps; those that are lost stay NaN.
 
     Args:
         template: (H, W) the image that they were chosen in.

@@ -41,21 +41,17 @@ _TOLERANCE = 8.0  # squared difference of a frequency that costs half of its wei
 class BurstMerger:
     """Aligns blocks of frames patch by patch with the block around the reference instant, once, and merges them.
 
-    It uses no global motion: the trajectory is ignored. Each block is searched around the motion that the blocks before it
-    extrapolate, coarse to fine. Frames are warped by the motion of the blocks, interpolated linearly. Patches are merged in
-    the frequency domain, where a block that differs from the reference by more than noise gets less weight, as in a Wiener
-    filter. The weight of a pixel is the number of frames that showed it; what the filter leaves out is not subtracted.
+    It ignores the trajectory. Each block is searched coarse to fine around the motion that the blocks before it extrapolate.
+    Frames are warped by the motion of the blocks, interpolated linearly. Patches are merged in the frequency domain by a Wiener
+    filter: where a block differs from the reference by more than noise, it gets less weight. The weight of a pixel is the
+    number of frames that showed it; what the filter leaves out is not subtracted.
     """
 
     def __init__(self, config: BurstConfig) -> None:
         self._config = config
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
-        """Merge a group; see `photonpano.Merger`.
-
-        Raises:
-            InputError: the lens of the source distorts, or its light changes.
-        """
+        """Merge a group; see `photonpano.Merger`. Raises an `InputError` if the lens distorts, or the light changes."""
         del trajectory
         capture = capture_of(source)
         if capture.camera is not None and capture.camera.distorts:
@@ -126,17 +122,10 @@ class _Burst:
 
 
 def aligned(fixed: Image, moving: Image, grid: PatchGrid, start: FloatArray, variance: float) -> FloatArray:
-    """Find the patches of an image in another, coarse to fine.
+    """Find the patches of `fixed` in `moving`, (H, W) on the scale of uniform noise: displacements (rows, columns, 2).
 
-    Args:
-        fixed: (H, W) on the scale of uniform noise.
-        moving: (H, W) likewise.
-        grid: the patches of `fixed`.
-        start: (rows, columns, 2), displacements x and y around which the search begins.
-        variance: of the noise of the difference of both images.
-
-    Returns:
-        (rows, columns, 2); zeros if no patch agrees significantly better with another place than its own.
+    The search goes coarse to fine from the displacements `start`, x and y. `variance` is that of the noise of the difference.
+    Returns zeros if no patch agrees significantly better elsewhere than at its own place.
     """
     pyramid = [(fixed, moving)]
     while len(pyramid) < _LEVELS and min(pyramid[-1][0].shape) >= 4 * grid.side:
@@ -172,13 +161,7 @@ def _resized(motion: FloatArray, n_patches: tuple[int, int], shift: int = 0) -> 
 
 
 def at_instant(middles: list[float], motion: FloatArray, instant: float) -> FloatArray:
-    """Interpolate the motion of blocks linearly in time; beyond the first and the last, the velocity is kept.
-
-    Args:
-        middles: (K,) instants, increasing.
-        motion: (K, ...) at these.
-        instant: in frames.
-    """
+    """Interpolate the motion (K, ...) of blocks linearly between their middles, in frames, or with the velocity beyond them."""
     if len(middles) == 1:
         return np.asarray(motion[0])
     after = int(np.clip(np.searchsorted(middles, instant), 1, len(middles) - 1))
@@ -187,19 +170,10 @@ def at_instant(middles: list[float], motion: FloatArray, instant: float) -> Floa
 
 
 def wiener_mean(counts: Image, weight: Image, reference: int, response: Response) -> Image:
-    """Merge blocks of patches in the frequency domain.
+    """Merge sums of blocks of patches, (K, rows, columns, side, side), in the frequency domain to mean counts of a frame.
 
-    D is the difference of a frequency of a block from that of the reference block, and s^2 the variance of D from photon
-    noise. The block is replaced by the reference by the share `|D|^2 / (|D|^2 + 8 s^2)`.
-
-    Args:
-        counts: (K, rows, columns, side, side), sums of blocks.
-        weight: the same of numbers of frames.
-        reference: index of the reference block.
-        response: the camera's response.
-
-    Returns:
-        (rows, columns, side, side), mean count of a frame.
+    D is the difference of a frequency of a block from that of the reference block, and s^2 the variance of D from photon noise.
+    The block is replaced by the reference by the share `|D|^2 / (|D|^2 + 8 s^2)`.
     """
     fixed = _mean(counts[reference], weight[reference], np.float32(0))
     frames = weight.mean(axis=(-2, -1))

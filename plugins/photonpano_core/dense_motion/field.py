@@ -22,15 +22,11 @@ class MotionField:
     """Motion of each pixel of a grid beyond the global motion, as a polynomial of time that is 0 at the reference instant.
 
     Convention:
-        What lies at the pixel p at the reference instant lies at `p + at(elapsed)` a time later, if both are seen along the
-        global motion. Points are (x, y), integers are pixel centres. Time is a share of the longer part of the group before or
-        after the reference instant.
-
-    Attributes:
-        coefficients: (D, H, W, 2) float32, in px of the grid: the displacement is `sum_d coefficients[d] elapsed^(d + 1)`.
+        What lies at the pixel p at the reference instant lies at `p + at(elapsed)` later, both along the global motion. Points
+        are (x, y), integers are pixel centres. Time is relative to the longer part of the group before or after.
     """
 
-    coefficients: Image
+    coefficients: Image  # (D, H, W, 2), in px of the grid: the displacement is `sum_d coefficients[d] elapsed^(d + 1)`
 
     @classmethod
     def zero(cls, shape: tuple[int, int]) -> MotionField:

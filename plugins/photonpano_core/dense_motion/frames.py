@@ -14,11 +14,7 @@ _SHARE = np.float32(0.01)  # relative step of the numerical derivative
 
 
 class WeightedFrames:
-    """Returns the sum of the frames of a span: (H, W) float32, corrected, and multiplied by the weight of each pixel.
-
-    Attributes:
-        worth: (H, W) float32, weight of a frame of each pixel, from 0, for a masked one, to 1; (0, 0) if it is 1 for all.
-    """
+    """Returns the sum of the frames of a span: (H, W) float32, corrected, and multiplied by the weight of each pixel."""
 
     def __init__(self, source: Source) -> None:
         self._capture = capture = capture_of(source)
@@ -34,11 +30,7 @@ class WeightedFrames:
 
 
 def rescaled(photons: PhotonSum, scale: float) -> PhotonSum:
-    """Return a sum on the grid of another scale; each pixel averages counts and weights alike, so that flux stays the same.
-
-    Convention:
-        The pixel centre p goes to `(p + 0.5) * scale - 0.5`.
-    """
+    """Return a sum on the grid of another scale: p goes to `(p + 0.5) * scale - 0.5`. Flux stays the same."""
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     counts, weight = (
         np.asarray(cv2.resize(each, None, fx=scale, fy=scale, interpolation=how), np.float32)
@@ -48,12 +40,7 @@ def rescaled(photons: PhotonSum, scale: float) -> PhotonSum:
 
 
 def count_variance(mean: Image, response: Response) -> Image:
-    """Return the variance of the count of one frame, from the slope of the scale on which it is uniform.
-
-    Args:
-        mean: expected count of a frame.
-        response: the camera's response.
-    """
+    """Return the variance of the count of one frame of this mean, from the slope of the scale on which it is uniform."""
     low, high = mean * (1 - _SHARE), mean * (1 + _SHARE) + np.float32(1e-4)
     low_value, high_value = (response.stabilised(response.flux(each, _MANY), _MANY) for each in (low, high))
     per_unit = (high - low) / np.maximum(high_value - low_value, np.float32(1e-9))

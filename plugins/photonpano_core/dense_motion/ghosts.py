@@ -23,34 +23,23 @@ _FEWEST = 0.5  # fewest degrees of freedom, on average over the window, of a pix
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GhostMap:
-    """Where photons of a group contradict the global motion.
+    """Where photons of a group contradict the global motion, on the grid of the exposure at the reference instant."""
 
-    Convention:
-        The grid is that of the exposure at the reference instant.
-
-    Attributes:
-        significance: (H, W) float32, at least 0: by how many standard deviations of photon noise the sub-exposures differ from
-            each other; 0 where fewer than two saw a pixel.
-        moving: (H, W) bool, where it exceeds the threshold, over an area of some pixels, with connected pixels of slightly less
-            significance, and gaps between these.
-    """
-
+    # (H, W), at least 0: by how many standard deviations of photon noise the sub-exposures differ from each other; 0 where
+    # fewer than two saw a pixel
     significance: Image
+    # (H, W), where it exceeds the threshold, over an area of some pixels, with connected pixels of slightly less significance,
+    # and gaps between these
     moving: BoolArray
 
 
 def compared(parts: SubExposures, n: int, threshold: float, tolerated_px: float) -> GhostMap:
-    """Compare sub-exposures that are merged along the global motion.
+    """Compare sub-exposures that are merged along the global motion, joined to `n` longer ones for more light.
 
     Of K sub-exposures of a still scene, the squared differences from their mean, in units of the photon noise, add up to
     chi-squared with K - 1 degrees of freedom, here averaged over a window. The cube root of the average is nearly normal
-    (Wilson and Hilferty 1931), from which the significance follows.
-
-    Args:
-        parts: sub-exposures along the global motion.
-        n: number of longer ones to which they are joined, for more light.
-        threshold: significance from which on a pixel moves.
-        tolerated_px: error of the global motion whose effect is not significant, in px of a frame.
+    (Wilson and Hilferty 1931), from which the significance follows. A pixel moves from the `threshold` of significance on; an
+    error of the global motion by `tolerated_px` of a frame is not significant.
     """
     response = parts.response
     images = [parts.smoothed(each, _DETAIL_PX) for each in parts.joined(parts.sums, n).sums]

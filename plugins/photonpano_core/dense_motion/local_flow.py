@@ -34,10 +34,10 @@ _MARGIN_PX = 32  # surroundings of these in which flow is estimated, in px of a 
 class LocalFlowMerger:
     """Warps the counts of a group along the global motion, and where they contradict it, along a dense field beyond it.
 
-    A group is divided into sub-exposures of half the size. Where these agree, as everywhere in a still scene, all frames are
-    merged as `photon-mle` does, to the same flux. Elsewhere optical flow is estimated in rounds. Sub-exposures that still
-    differ from the one around the reference instant, such as those in which a pixel is occluded, get less weight. Then counts
-    are warped along the sum of both motions, in one interpolation, at full size, and its blur is undone where noise allows it.
+    A group is divided into sub-exposures of half the size. Where these agree, all frames are merged as `photon-mle` does, to
+    the same flux. Elsewhere optical flow is estimated in rounds. Sub-exposures that still differ from the one around the
+    reference instant, such as those in which a pixel is occluded, get less weight. Then counts are warped along the sum of both
+    motions, in one interpolation at full size, and its blur is undone where noise allows it.
 
     In a group with too few photons, and while no motion is known, frames are merged as `photon-mle` does.
     """
@@ -46,22 +46,14 @@ class LocalFlowMerger:
         self._config = config
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
-        """Merge a group; see `photonpano.Merger`.
-
-        Raises:
-            InputError: the lens of the source distorts, or its light changes.
-        """
+        """Merge a group; see `photonpano.Merger`. Raises an `InputError` if the lens distorts, or the light changes."""
         if trajectory is None:
             return exposure_of(unwarped_sum(source, group, scale), source, group, scale)
         photons = self._merged(source, group, trajectory, max(scale, 1.0))
         return exposure_of(rescaled(photons, scale) if scale < 1 else photons, source, group, scale)
 
     def ghost_map(self, source: Source, group: Group, trajectory: Trajectory) -> GhostMap:
-        """Find the pixels of a group whose photons contradict the global motion, on the grid of a frame.
-
-        Raises:
-            InputError: the lens of the source distorts, or its light changes.
-        """
+        """Find the pixels of a group whose photons contradict the global motion, on the grid of a frame."""
         found = self._ghosts(self._divided(source, group, trajectory))
         shape = source.info.frame_shape
         return GhostMap(enlarged(found.significance, shape), enlarged(found.moving, shape))

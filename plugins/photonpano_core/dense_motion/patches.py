@@ -17,15 +17,10 @@ _ROUNDED_UP = 1 + 1e-6
 
 @dataclass(frozen=True, slots=True)
 class PatchGrid:
-    """Patches at steps of half a side, from half a side before the image, so that each pixel lies in four.
+    """Patches at steps of half a side, from half a side before the image, so that each pixel lies in four."""
 
-    Attributes:
-        shape: (height, width) of the image.
-        side: of a patch, in px, even.
-    """
-
-    shape: tuple[int, int]
-    side: int
+    shape: tuple[int, int]  # (height, width) of the image
+    side: int  # of a patch, in px, even
 
     @property
     def step(self) -> int:
@@ -56,14 +51,10 @@ class PatchGrid:
 
 @compiled
 def add_patches(summed: Frames, shifts: NDArray[np.float64], step: int, counts: Image, weight: Image) -> None:
-    """Add an image to patches, each shifted and interpolated bilinearly; the image is 0 outside of its border.
+    """Add an image to patches, shifted and interpolated bilinearly; the image is 0 outside of its border.
 
-    Args:
-        summed: frames, with the weight of each pixel.
-        shifts: (rows, columns, 2), x and y: the pixel p of a patch is read at p + shift.
-        step: distance of neighbouring patches, in px.
-        counts: (rows, columns, side, side) sums that are added to.
-        weight: the same of numbers of frames.
+    The pixel p of a patch is read at p + shift, for `shifts` x and y (rows, columns, 2). `counts` and `weight` are (rows,
+    columns, side, side), added to; `step` is the distance of neighbouring patches, in px.
     """
     image, weights = summed.image, summed.weights
     height, width = image.shape
@@ -94,7 +85,7 @@ def add_patches(summed: Frames, shifts: NDArray[np.float64], step: int, counts: 
 def search(
     fixed: Image, moving: Image, side: int, starts: NDArray[np.int64], radius: int, found: NDArray[np.float64], costs: Image
 ) -> None:
-    """Find each patch of an image in another, by the mean squared difference over the pixels that both show.
+    """Find each patch of `fixed`, (h, w), in `moving`, by the mean squared difference over the pixels that both show.
 
     Args:
         fixed: (h, w) where patches are cut out.

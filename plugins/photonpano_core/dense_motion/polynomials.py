@@ -16,15 +16,7 @@ def add_moments(
     moments: NDArray[np.float32],
     right: NDArray[np.float32],
 ) -> None:
-    """Add the values of pixels at a time to the sums from which `fit_each` fits polynomials.
-
-    Args:
-        time: of the values.
-        value: (H, W, 2), x and y.
-        trust: (H, W), weights.
-        moments: (2 D - 1, H, W) sums that are added to.
-        right: (D, H, W, 2) sums that are added to.
-    """
+    """Add the values (H, W, 2) of pixels at a time, with weights (H, W), to the sums from which `fit_each` fits polynomials."""
     for row in range(trust.shape[0]):
         weights, xy = trust[row], value[row]
         power = time
@@ -85,13 +77,7 @@ def fit_each(
 
 @compiled
 def value_of_each(coefficients: NDArray[np.float32], time: np.float32, found: NDArray[np.float32]) -> None:
-    """Evaluate polynomials without a constant term, by Horner's rule.
-
-    Args:
-        coefficients: (D, N), of the powers 1 to D of time.
-        time: where they are evaluated.
-        found: (N,) output.
-    """
+    """Evaluate polynomials with coefficients (D, N) of the powers 1 to D of time, by Horner's rule, into `found` (N,)."""
     found[:] = 0
     for degree in range(len(coefficients) - 1, -1, -1):
         own = coefficients[degree]

@@ -21,17 +21,11 @@ _MOVES_PX = 1.0  # motion within a group that a neighbour takes over, in px of a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighted:
-    """Motion of each pixel, and weights of the sub-exposures along it.
-
-    Attributes:
-        field: the motion.
-        trusts: (K, H, W) float32, weights from 0 to 1.
-        explained: (H, W) float32, share of the frames of a pixel that remain.
-    """
+    """Motion of each pixel, and weights of the sub-exposures along it."""
 
     field: MotionField
-    trusts: Image
-    explained: Image
+    trusts: Image  # (K, H, W), weights from 0 to 1
+    explained: Image  # (H, W), share of the frames of a pixel that remain
 
     def improved(self, other: Weighted, where: BoolArray) -> Weighted:
         """Return what takes, within `where`, each pixel from the one that explains more frames."""
@@ -44,15 +38,10 @@ class Weighted:
 
 
 def weighted(parts: SubExposures, field: MotionField, where: BoolArray) -> Weighted:
-    """Find, for each pixel, a motion that explains most of its frames.
+    """Find, for each of some pixels (H, W), the motion beyond the global one that explains most of its frames.
 
     A field is smooth, but the motion jumps at the border of an object. Where the field explains too few frames, a pixel may
     move as its nearest neighbour that moves and is explained, or not at all beyond the global motion.
-
-    Args:
-        parts: the sub-exposures, along the global motion.
-        field: the motion beyond it.
-        where: (H, W) pixels that may move.
     """
     sums = parts.along(field, where)
     best = _weighted(parts, field, sums)
@@ -70,8 +59,8 @@ def weighted(parts: SubExposures, field: MotionField, where: BoolArray) -> Weigh
 def _weighted(parts: SubExposures, field: MotionField, sums: Sequence[PhotonSum]) -> Weighted:
     """Weight sub-exposures where they differ from the reference by more than photon noise.
 
-    D^2 is the squared difference in units of its variance, averaged over a window. Above what noise explains, by e, the weight
-    is `1 / (1 + e)`: the gain of a Wiener filter. Pixels that one of both did not see keep their weight.
+    D^2 is the squared difference in units of its variance, averaged over a window. If it exceeds the tolerance by e, the weight
+    is `1 / (1 + e)`, the gain of a Wiener filter; it is 1 where either is unseen.
     """
     fixed = parts.smoothed(sums[parts.reference], _DETAIL_PX)
     trusts = np.ones((len(sums), *parts.shape), np.float32)

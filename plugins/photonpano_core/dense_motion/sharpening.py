@@ -15,19 +15,13 @@ _WINDOW_PX = 1.5  # standard deviation of the window over which the Laplacian is
 
 
 def sharpened(photons: PhotonSum, blur: Image, where: BoolArray, response: Response) -> PhotonSum:
-    """Sharpen the mean count of some pixels, m, to `m - g s/2 laplacian(m)`.
+    """Sharpen the mean count m of some pixels, (H, W), to `m - g s/2 laplacian(m)`, unless a neighbour is unseen.
 
-    Interpolation at a fraction f of a pixel blurs by the variance `f (1 - f)`, on average s, which this undoes to the second
-    order. The Wiener gain g is that of the least squared error. Along an axis, interpolation leaves `r0 = 1 - 2 s` of the
-    variance v of photon noise, and a covariance of `r1 = s` between neighbours. So the noise of the Laplacian has the variance
-    `N v`, and a covariance of `-C v` with that of the pixel. With the mean square E of the Laplacian, over a window,
-    `g = 1 - (N + 2 C / s) v / E`, and 0 where this is negative.
-
-    Args:
-        photons: (H, W), interpolated linearly at the scale of frames.
-        blur: (H, W), s, in px^2.
-        where: (H, W) pixels that are sharpened, unless a neighbour is unseen.
-        response: the camera's response.
+    Linear interpolation at a fraction f of a pixel blurs by the variance `f (1 - f)`, on average s (`blur`, in px^2), which
+    this undoes to the second order. The Wiener gain g is that of the least squared error. Along an axis, interpolation leaves
+    `r0 = 1 - 2 s` of the variance v of photon noise, and a covariance of `r1 = s` between neighbours. So the noise of the
+    Laplacian has the variance `N v`, and a covariance of `-C v` with that of the pixel. With the mean square E of the
+    Laplacian, over a window, `g = 1 - (N + 2 C / s) v / E`, and 0 where this is negative.
     """
     counts, weight = photons.counts, photons.weight
     seen = cv2.erode((weight > 0).astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)

@@ -33,15 +33,10 @@ _SEEN = 0.1  # a pixel is seen by a sub-exposure if this share of its frames, sm
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
-    """A sub-exposure on the scale on which photon noise is uniform.
+    """A sub-exposure on the scale on which photon noise is uniform."""
 
-    Attributes:
-        values: (H, W) float32, stabilised flux of the smoothed counts; 0 where unseen.
-        frames: (H, W) float32, number of frames of one pixel whose noise equals that of the smoothed value; 0 where unseen.
-    """
-
-    values: Image
-    frames: Image
+    values: Image  # (H, W), stabilised flux of the smoothed counts; 0 where unseen
+    frames: Image  # (H, W), number of frames of one pixel whose noise equals that of the smoothed value; 0 where unseen
 
     def squared_difference(self, other: Smoothed, response: Response) -> Image:
         """Return (H, W): the squared difference, in units of its photon noise; 0 where one of both is unseen."""
@@ -53,17 +48,11 @@ class Smoothed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joined:
-    """Sub-exposures that are joined to longer ones.
+    """Sub-exposures that are joined to longer ones."""
 
-    Attributes:
-        sums: counts and weights of each.
-        times: the middle of each: see `SubExposures.elapsed`.
-        reference: index of the one that contains the reference instant.
-    """
-
-    sums: list[PhotonSum]
-    times: list[float]
-    reference: int
+    sums: list[PhotonSum]  # counts and weights of each
+    times: list[float]  # the middle of each: see `SubExposures.elapsed`
+    reference: int  # index of the one that contains the reference instant
 
 
 class SubExposures:
@@ -74,19 +63,11 @@ class SubExposures:
         shape: (height, width) of the grid.
         sums: counts and weights of each along the global motion.
         reference: index of the one that contains the reference instant.
-        response: of the camera.
         spread: mean of f (1 - f) over the fractions f of a pixel at which frames are interpolated.
     """
 
     def __init__(self, source: Source, group: Group, trajectory: Trajectory, n: int) -> None:
-        """Merge along the global motion.
-
-        Args:
-            source: the capture.
-            group: its frames are divided.
-            trajectory: the global motion.
-            n: number of sub-exposures; fewer if the group has fewer frames.
-        """
+        """Merge `n` sub-exposures along the global motion; fewer if the group has fewer frames."""
         self._group, self._trajectory = group, trajectory
         self._frames = WeightedFrames(source)
         self._weights = halved(self._frames.worth) if self._frames.worth.size else self._frames.worth
@@ -127,12 +108,7 @@ class SubExposures:
         return crop
 
     def joined(self, sums: Sequence[PhotonSum], n: int) -> Joined:
-        """Join sub-exposures to `n` longer ones.
-
-        Args:
-            sums: of all sub-exposures.
-            n: number of longer ones, at most that of all.
-        """
+        """Join the sums of all sub-exposures to `n` longer ones."""
         groups = divided(len(self.spans), n)
         times = [self.elapsed((self.spans[each.start].start + self.spans[each.stop - 1].stop - 1) / 2) for each in groups]
         reference = next(place for place, each in enumerate(groups) if self.reference in each)
@@ -148,13 +124,7 @@ class SubExposures:
         return (instant - reference) / max(reference - span.start, span.stop - 1 - reference, 1)
 
     def along(self, field: MotionField, where: BoolArray, others: Sequence[PhotonSum] | None = None) -> list[PhotonSum]:
-        """Merge along the global motion and a field.
-
-        Args:
-            field: the motion beyond the global one, in px of the grid.
-            where: (H, W) pixels that are merged again, one at least.
-            others: the sums elsewhere; those along the global motion by default.
-        """
+        """Merge some pixels, (H, W), along the global motion and a field in px of the grid; `others` are the sums elsewhere."""
         merged, unwanted = [], np.zeros((0, 0), np.float32)
         fastest_px = self.fastest_px(field, where)
         for span, other in zip(self.spans, others or self.sums, strict=True):
@@ -177,16 +147,9 @@ class SubExposures:
     def moving(
         self, chunks: Sequence[Chunk], field: MotionField, fastest_px: float, tolerance_px: float
     ) -> Iterator[tuple[Chunk, Image]]:
-        """Divide the chunks of a sub-exposure, so that a field moves by less than a tolerance within each.
+        """Divide the chunks of a sub-exposure so that a field moves by less than a tolerance within each.
 
-        Args:
-            chunks: to divide.
-            field: the motion beyond the global one, which is linear within a sub-exposure.
-            fastest_px: its speed.
-            tolerance_px: the tolerance.
-
-        Returns:
-            Each with the displacement at its centre, (H, W, 2).
+        Yields each with the displacement at its centre, (H, W, 2); the field is linear in time within a sub-exposure.
         """
         finer: list[Chunk] = []
         for chunk in chunks:
@@ -217,12 +180,7 @@ def halved(image: Image) -> Image:
 
 
 def _spread(to_image: FloatArray, shape: tuple[int, int]) -> float:
-    """Return the mean of `f (1 - f)` over the fractions f of a pixel at which images are interpolated.
-
-    Args:
-        to_image: (N, 3, 3), pixels of the grid to pixels of frames.
-        shape: (height, width) of the grid.
-    """
+    """Return the mean of `f (1 - f)` over the fractions f of a pixel at which (N, 3, 3) maps interpolate a grid."""
     places = np.stack(np.meshgrid(*(np.arange(0, side, max(1, side // _PLACES)) for side in shape[::-1])), axis=-1)
     found = transform_points(to_image, places.reshape(-1, 2))
     fraction = found - np.floor(found)
@@ -239,15 +197,7 @@ def total_of(sums: Sequence[PhotonSum]) -> PhotonSum:
 
 
 def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: float, spread: float) -> Smoothed:
-    """Blur a sub-exposure, and stabilise its noise.
-
-    Args:
-        photons: the sub-exposure.
-        response: the camera's response.
-        blur_px: standard deviation of the Gaussian, in px of a frame.
-        scale: pixels of the sub-exposure per pixel of a frame.
-        spread: of the interpolation that has blurred the noise before: see `SubExposures`.
-    """
+    """Blur a sub-exposure by a Gaussian in px of a frame, at `scale` px per px of a frame, and stabilise its noise."""
     counts, weight = (blurred(each, blur_px * scale) for each in (photons.counts, photons.weight))
     mean, frames = np.empty_like(counts), np.empty_like(counts)
     area = noise_area_px2(blur_px, scale, spread)
@@ -261,8 +211,8 @@ def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: floa
 def noise_area_px2(blur_px: float, scale: float, spread: float) -> float:
     """Return the number of pixels of a frame whose average has the noise of a smoothed pixel; arguments as in `smoothed`.
 
-    Along an axis, noise is lowered by the sum of the squares of the kernel. Interpolation at a fraction f of a pixel takes
-    `2 f (1 - f)` of it from the products of neighbours.
+    Along an axis, noise is lowered by the sum of the squares of the kernel. Interpolation at a fraction f of a pixel takes `2 f
+    (1 - f)` of it from the products of neighbours.
     """
     kernel = cv2.getGaussianKernel(2 * math.ceil(_REACH * blur_px * scale) + 1, blur_px * scale)[:, 0]
     squares, products = float(kernel @ kernel), float(kernel[1:] @ kernel[:-1])

@@ -11,59 +11,35 @@ from photonpano.compiling import compiled
 
 
 class Frames(NamedTuple):
-    """A sum of frames.
+    """A sum of frames."""
 
-    Attributes:
-        image: (h, w) float32 sum.
-        weights: (h, w) float32 of a frame of each pixel, from 0 to 1; (0, 0) if it is 1 for all.
-        number: of frames in the sum.
-    """
-
-    image: NDArray[np.float32]
-    weights: NDArray[np.float32]
+    image: NDArray[np.float32]  # (h, w) sum
+    weights: NDArray[np.float32]  # (h, w) of a frame of each pixel, from 0 to 1; (0, 0) if it is 1 for all
     number: float
 
 
 class Moved(NamedTuple):
-    """How the pixels of a grid move beyond a homography, in cells of a coarser or finer grid.
+    """How the pixels of a grid move beyond a homography, in cells of a coarser or finer grid."""
 
-    Attributes:
-        where: (H, W) pixels of the grid that are added to.
-        cells: cells per pixel, and the row and the column of the first cell. Pixels in one cell move alike.
-        motion: (h', w', 2), x and y by which cells are displaced, in cells.
-        trust: (h', w') weight of the image in each cell.
-    """
-
-    where: NDArray[np.bool_]
+    where: NDArray[np.bool_]  # (H, W) pixels of the grid that are added to
+    # cells per pixel, and the row and the column of the first cell. Pixels in one cell move alike
     cells: tuple[float, int, int]
-    motion: NDArray[np.float32]
-    trust: NDArray[np.float32]
+    motion: NDArray[np.float32]  # (h', w', 2), x and y by which cells are displaced, in cells
+    trust: NDArray[np.float32]  # (h', w') weight of the image in each cell
 
 
 class Sums(NamedTuple):
-    """What `add_along` adds to.
+    """What `add_along` adds to."""
 
-    Attributes:
-        counts: (H, W) sums.
-        weight: (H, W) numbers of frames.
-        blur: (H, W) variances of the blur of interpolation, mean of x and y in px^2, times numbers of frames; (0, 0) for none.
-    """
-
-    counts: NDArray[np.float32]
-    weight: NDArray[np.float32]
+    counts: NDArray[np.float32]  # (H, W) sums
+    weight: NDArray[np.float32]  # (H, W) numbers of frames
+    # (H, W) variances of the blur of interpolation, mean of x and y in px^2, times numbers of frames; (0, 0) for none
     blur: NDArray[np.float32]
 
 
 @compiled
 def add_along(summed: Frames, to_image: NDArray[np.float64], moved: Moved, sums: Sums) -> None:
-    """Add an image to some pixels of a grid, interpolated bilinearly; the image is 0 outside of its border.
-
-    Args:
-        summed: frames.
-        to_image: (3, 3), pixels of the grid to pixels of the image.
-        moved: how pixels move beyond that.
-        sums: added to.
-    """
+    """Add a sum of frames to some pixels of a grid, which (3, 3) maps to the image, bilinearly; 0 outside of its border."""
     image, weights, where, trust = summed.image, summed.weights, moved.where, moved.trust
     counts, weight, blur = sums.counts, sums.weight, sums.blur
     scale, first_row, first_column = moved.cells
@@ -140,16 +116,10 @@ def mean_of_seen(
     mean: NDArray[np.float32],
     frames: NDArray[np.float32],
 ) -> None:
-    """Divide counts by weights where these are large and even.
+    """Divide counts by weights, (H, W), where these exceed `least`, and their gradient is below `steepest` relative to them.
 
-    Args:
-        counts: (H, W) sums.
-        weight: (H, W) numbers of frames.
-        least: weight above which a pixel is seen.
-        steepest: largest gradient of the weight, relative to it.
-        area: pixels that are averaged.
-        mean: (H, W) output, mean count of a frame; 0 where unseen.
-        frames: (H, W) output, number of frames of one pixel with the same noise, 1 or more; 0 where unseen.
+    Writes the mean count of a frame, and the frames of one pixel whose noise equals that of an average over `area` pixels, 1 or
+    more; both 0 where unseen.
     """
     height, width = counts.shape
     for row in range(height):

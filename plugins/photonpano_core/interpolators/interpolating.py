@@ -24,7 +24,7 @@ class LucasKanadeInterpolator:
         self._config = config
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> ParameterTrajectory:
-        """Interpolate; the information is not used, since the spline passes through every knot."""
+        """Interpolate through every knot."""
         del information
         spline = interpolating_spline(instants, parameters(homographies))
         return ParameterTrajectory(instants, spline, self._config.hold_frames)
@@ -41,11 +41,7 @@ class GeodesicInterpolator:
         self._config = config
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> GroupTrajectory:
-        """Interpolate; the information is not used, since the curve passes through every knot.
-
-        Raises:
-            LocationError: two knots are half a turn or more apart, so that the motion between them has no real logarithm.
-        """
+        """Interpolate through every knot; raises a `LocationError` if two knots are half a turn or more apart."""
         del information
         return GroupTrajectory(instants, homographies, 1, self._config.hold_frames)
 
@@ -63,11 +59,7 @@ class LieInterpolator:
         self._corners = corners(frame_shape)
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> GroupTrajectory:
-        """Interpolate; the information is not used, since the curve passes through every knot.
-
-        Raises:
-            LocationError: knots are half a turn or more apart, or the iteration does not converge.
-        """
+        """Interpolate through every knot; raises a `LocationError` if knots are half a turn apart, or nothing converges."""
         del information
         hold = self._config.hold_frames
         if len(instants) < 3:

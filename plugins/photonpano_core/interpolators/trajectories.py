@@ -21,10 +21,7 @@ def interpolating_spline(instants: FloatArray, values: FloatArray, degree: int =
 
 
 class HeldTrajectory(ABC):
-    """A trajectory that keeps its velocity for a bounded time beyond the first and last knot, and then stands still.
-
-    Extrapolating the polynomial would diverge.
-    """
+    """A trajectory that keeps its velocity for a bounded time beyond its ends, and then stands still: polynomials diverge."""
 
     def __init__(self, instants: FloatArray, hold_frames: float | None) -> None:
         """Take the (N,) increasing instants of the knots; `hold_frames` is twice their mean distance by default."""
@@ -40,15 +37,7 @@ class HeldTrajectory(ABC):
 
     @abstractmethod
     def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
-        """Return the homographies after going on from N instants between the knots at the velocity there.
-
-        Args:
-            inside: (N,) instants, clipped to the range of the knots.
-            beyond: (N,) frames to go on, 0 for instants between the knots.
-
-        Returns:
-            (N, 3, 3) homographies with h33 = 1.
-        """
+        """Return (N, 3, 3), going on from instants `inside` the knots, (N,), at the velocity there for `beyond` frames."""
 
 
 class SplinePath(HeldTrajectory):
@@ -71,23 +60,16 @@ class ParameterTrajectory(SplinePath):
 
 
 class GroupTrajectory(HeldTrajectory):
-    """A cumulative B-spline of homographies.
+    """A cumulative B-spline of homographies, frame to reference plane; the curve does not depend on the plane.
 
     A B-spline with control points C[j] is C[0] + sum of w[j](t) (C[j] - C[j-1]), where w[j] is the sum of the basis functions
     from the j-th on. With products for sums it is a curve of homographies (Kim, Kim and Shin 1995), as smooth as its basis:
 
         H(t) = C[0] (C[0]^-1 C[1])^w[1](t) (C[1]^-1 C[2])^w[2](t) ...
-
-    Convention:
-        Homographies map pixels of a frame to those of a reference plane. The curve does not depend on the reference plane.
     """
 
     def __init__(self, instants: FloatArray, controls: FloatArray, degree: int, hold_frames: float | None) -> None:
-        """Take a (3, 3) control point for each of the (N,) instants; the degree is at most N - 1.
-
-        Raises:
-            LocationError: the motion from a control point to the next has no real logarithm.
-        """
+        """Take a (3, 3) control point for each instant, (N,); raises a `LocationError` if a step has no real logarithm."""
         super().__init__(instants, hold_frames)
         spline = interpolating_spline(instants, np.zeros(len(instants)), degree)
         self._knots, self._degree = spline.t, spline.k

@@ -64,10 +64,7 @@ class ShortSpansRefiner:
         )
 
     def _corrected(self, trajectory: Trajectory, n_frames: int, corrections: CubicSpline, instants: FloatArray) -> FloatArray:
-        """Return the homographies of all frames, moved by a spline of (shift x, shift y, roll, zoom), (T, 3, 3).
-
-        Frames before the first instant, and after the last one, are moved as at these.
-        """
+        """Return the homographies of all frames, (T, 3, 3), moved by a spline of (shift x, shift y, roll, zoom)."""
         refined, from_reference = np.empty((n_frames, 3, 3)), np.empty(n_frames)
         for start in range(0, n_frames, BLOCK_FRAMES):
             frames = np.arange(start, min(start + BLOCK_FRAMES, n_frames))
@@ -115,15 +112,10 @@ def _goes_dark(variances: FloatArray) -> bool:
 
 
 def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> Filtered:
-    """Filter one mode where the light goes out.
+    """Filter one mode, (S,) steps in px, where the light goes out.
 
-    What the motion does in the dark follows from what it does before and after, and not from the steps, which vanish there once
-    the trajectory is right: so the wiggles of the trajectory are part of what is filtered.
-
-    Args:
-        steps: (S,) in px.
-        wiggles: (S,) what the trajectory does faster than a smooth one.
-        variances: (S,) of the photon noise of the steps.
+    The motion in the dark follows from that before and after, not from the steps, which vanish there once the trajectory is
+    right. So the wiggles of the trajectory, its motion beyond a smooth one, are part of what is filtered.
     """
     size = min(WINDOW, len(steps))
     noise = variances + SYSTEMATIC_PX**2

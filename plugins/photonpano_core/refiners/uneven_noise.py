@@ -14,18 +14,12 @@ _NEIGHBOURS = 3, 5  # windows and frequencies over which the power is averaged t
 
 
 def separated(values: FloatArray, variances: FloatArray, size: int, significant: float, slow: tuple[int, float]) -> Filtered:
-    """Estimate a motion whose spectrum is not known, in windows that overlap by half.
+    """Estimate a motion (S,) whose spectrum is not known, in windows of `size` that overlap by half.
 
-    In each window the motion is a Gaussian process. Its power at the frequencies that stand out from the noise is estimated by
-    expectation and maximisation (Dempster et al. 1977), and the motion as its expectation (Wiener 1949), also where nothing
-    was measured.
-
-    Args:
-        values: (S,) the motion, with noise.
-        variances: (S,) of the noise; infinite where a value is unknown.
-        size: length of a window, at most S.
-        significant: factor by which the power of a frequency exceeds that of the noise.
-        slow: number of the lowest frequencies that exceed a constant of a size, too; and this size.
+    In each window the motion is a Gaussian process. Its power at the frequencies that stand out from the noise by the factor
+    `significant` is estimated by expectation and maximisation (Dempster et al. 1977), and the motion as its expectation (Wiener
+    1949), also where nothing was measured and the variance is infinite. `slow` is the number of the lowest frequencies that
+    must also exceed a constant of a size, and this size.
     """
     n = len(values)
     known = np.isfinite(variances)
@@ -57,10 +51,7 @@ def _standing_out(windows: list[tuple[FloatArray, FloatArray]], significant: flo
 
 
 def _expected(values: FloatArray, noise: FloatArray, allowed: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Return the expected motion in a window, and its variance: (size,) each.
-
-    The window is half of a period of the process, so that its ends are not neighbours.
-    """
+    """Return the expected motion in a window, half of a period of the process, and its variance: (size,) each."""
     size, period = len(values), 2 * len(values)
     if not allowed.any():
         return np.zeros(size), np.zeros(size)

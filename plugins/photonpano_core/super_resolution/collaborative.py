@@ -30,17 +30,11 @@ _DCT = _dct_matrix()
 
 
 class Patches(NamedTuple):
-    """Reference patches on a regular grid, and the patches that are similar to each.
+    """Reference patches on a regular grid, and the patches that are similar to each."""
 
-    Attributes:
-        rows: (R,) first rows of the reference patches.
-        columns: (C,) their first columns.
-        similar: (R, C, GROUP, 2) first row and column of the similar patches, the reference first.
-    """
-
-    rows: NDArray[np.int32]
-    columns: NDArray[np.int32]
-    similar: NDArray[np.int32]
+    rows: NDArray[np.int32]  # (R,) first rows of the reference patches
+    columns: NDArray[np.int32]  # (C,) their first columns
+    similar: NDArray[np.int32]  # (R, C, GROUP, 2) first row and column of the similar patches, the reference first
 
     @classmethod
     def over(cls, shape: tuple[int, ...]) -> Patches:
@@ -147,12 +141,7 @@ def filter_groups(
 ) -> None:
     """Filter each group of similar patches, and add its patches where they lie, weighted by how few coefficients are left.
 
-    Args:
-        image: (H, W).
-        noise: (H, W) standard deviation of the noise to remove.
-        patches: from `find_similar`.
-        total: (H, W) weighted sum of patches, added to.
-        weights: (H, W) sum of weights, added to.
+    `noise` is (H, W), the standard deviation to remove; `total` and `weights`, (H, W), are added to.
     """
     rows, columns, found = patches
     stack = np.empty((GROUP, PATCH, PATCH), np.float32)

@@ -24,21 +24,13 @@ _BRIGHTEST = 1.55  # largest value on the stabilised scale, below pi / 2: a flux
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """The photons of the cells of a grid.
+    """The photons of the cells of a grid."""
 
-    Attributes:
-        lit: (H, W) float32, sums of counts.
-        seen: (H, W) float32, frames in these sums; in changing light the sum of their gains, in frames of mean light.
-        kernel: (2 r + 1,) float32, the area of a pixel along x and along y: see `pixel_area`.
-        binary: whether a count is 1 for one photon or more; otherwise counts are photons.
-        light: frames and gains by the class of their light; None in steady light.
-    """
-
-    lit: FluxImage
-    seen: FluxImage
-    kernel: FluxImage
-    binary: bool
-    light: LitFrames | None = None
+    lit: FluxImage  # (H, W), sums of counts
+    seen: FluxImage  # (H, W), frames in these sums; in changing light the sum of their gains, in frames of mean light
+    kernel: FluxImage  # (2 r + 1,), the area of a pixel along x and along y: see `pixel_area`
+    binary: bool  # whether a count is 1 for one photon or more; otherwise counts are photons
+    light: LitFrames | None = None  # frames and gains by the class of their light; None in steady light
 
     @property
     def frames(self) -> FluxImage:
@@ -61,13 +53,9 @@ class Observations:
         return np.asarray(self.lit * np.log(lit / n) + (n - self.lit) * np.log(dark / n), np.float32) * (self.seen > 0)
 
     def photon_ratio(self, mean: FluxImage, into: FluxImage) -> None:
-        """Return the photons that each cell detected, given its counts, for each photon of the flux: (H, W).
+        """Write the photons that each cell detected, given its counts, for each expected photon of the flux: (H, W).
 
         In changing light it is `k sum_c n_c g_c / sum_c n_c (1 - exp(-g_c mean))` of counts k in n_c frames of gain g_c.
-
-        Args:
-            mean: (H, W) expected photons of a pixel in a frame.
-            into: (H, W) output.
         """
         if self.light is None or not self.binary:
             photon_ratio(self.lit, self.seen, mean, self.binary, into)
@@ -83,13 +71,10 @@ class Observations:
 
 
 def pixel_area(width: float) -> FluxImage:
-    """Return the share of each pixel of a grid in the light of a pixel of the sensor, along one axis.
+    """Return the share of each pixel of a grid in the light of a pixel of the sensor of a width in px, along one axis.
 
-    The light falls on a box. Its middle may lie anywhere within a cell, and the flux is constant within each pixel: the
-    weights are the integrals of two boxes, convolved with each other.
-
-    Args:
-        width: of the light-sensitive area of a pixel, in px of the grid.
+    The light falls on a box. Its middle may lie anywhere within a cell, and the flux is constant within each pixel: the weights
+    are the integrals of two boxes, convolved with each other.
     """
     radius = int(np.ceil(width / 2 + 1))
     offsets = np.arange(-radius, radius + 1)
@@ -105,13 +90,9 @@ def pixel_area(width: float) -> FluxImage:
 def rounds_of(observed: Observations, n_rounds: int) -> list[FluxImage]:
     """Estimate the flux, round by round; the last image is the best of the most rounds.
 
-    Each round increases the likelihood of the flux by some steps of expectation-maximisation,
-    `x <- x B'[k / (1 - exp(-B x))] / B'[n]` with the area B of a pixel, counts k and frames n, and then removes what looks
-    like noise: a plug-and-play prior (Venkatakrishnan et al. 2013).
-
-    Args:
-        observed: the photons.
-        n_rounds: how many rounds, at most those of `STRENGTHS`.
+    Each round increases the likelihood of the flux by some steps of expectation-maximisation, `x <- x B'[k / (1 - exp(-B x))] /
+    B'[n]` with the area B of a pixel, counts k and frames n, and then removes what looks like noise: a plug-and-play prior
+    (Venkatakrishnan et al. 2013).
     """
     seen = observed.weight()
     noise = 0.5 / np.sqrt(np.maximum(cv2.blur(seen, (PATCH, PATCH)), _FEWEST_FRAMES))
@@ -163,10 +144,7 @@ def _started(observed: Observations) -> FluxImage:
 
 
 def _as_bright(flux: FluxImage, before: FluxImage) -> FluxImage:
-    """Return flux that is as bright as before, on average over the surroundings of each pixel.
-
-    The mean on the stabilised scale is below that of the flux by what the noise spreads: by 10 % in a cell of few photons.
-    """
+    """Return flux as bright as before, on average around each pixel: denoising on the stabilised scale lowers the mean."""
     wanted, found = (cv2.GaussianBlur(each, (0, 0), _KEPT_PX) for each in (before, flux))
     return np.asarray(flux * (wanted / found), np.float32)
 

@@ -24,19 +24,11 @@ def add_observations(
     lit: NDArray[np.float32],
     seen: NDArray[np.float32],
 ) -> None:
-    """Add the pixels of a sum of frames to the cells that their centres fall into.
+    """Add the pixels of a sum of frames, (h, w), to the cells that their centres fall into.
 
-    Convention:
-        Points are (x, y), integers are the centres of pixels and of cells.
-
-    Args:
-        counts: (h, w) sum of frames.
-        usable: (h, w), False for masked pixels.
-        amounts: (P,) what each usable pixel adds to each image of `seen`, such as the frames in the sum.
-        to_grid: (3, 3), pixels of the frame to cells of the whole grid.
-        first: row of the whole grid at which `lit` and `seen` begin.
-        lit: (H, W) rows of the grid: counts, added to.
-        seen: (P, H, W): amounts, added to.
+    `to_grid` (3, 3) maps pixels of the frame to cells of the whole grid, of which `lit` (H, W) and `seen` (P, H, W) are the
+    rows from `first` on. Each usable pixel adds its count to `lit`, and `amounts` (P,), such as the frames in the sum, to
+    `seen`.
     """
     height, width = counts.shape
     rows, columns = lit.shape
@@ -64,13 +56,10 @@ def add_observations(
 def expected(
     flux: NDArray[np.float32], kernel: NDArray[np.float32], room: NDArray[np.float32], into: NDArray[np.float32]
 ) -> None:
-    """Average the flux over the areas of pixels that are centred at each cell; the border is repeated.
+    """Average the flux, (H, W), over the areas of pixels that are centred at each cell; the border is repeated.
 
-    Args:
-        flux: (H, W).
-        kernel: (2 r + 1,) weights along x and along y, with the sum 1; symmetric, so that this is its own adjoint.
-        room: (H, W), overwritten.
-        into: (H, W) output.
+    `kernel` (2 r + 1,) are symmetric weights along x and y with the sum 1, so that this is its own adjoint; `room` is
+    overwritten.
     """
     height, width = flux.shape
     radius = len(kernel) // 2
@@ -111,15 +100,7 @@ def _lit_share(light: np.float32) -> np.float32:
 def photon_ratio(
     lit: NDArray[np.float32], seen: NDArray[np.float32], mean: NDArray[np.float32], binary: bool, into: NDArray[np.float32]
 ) -> None:
-    """Return the photons that each cell detected, given its counts, for each photon of the flux: `k / (1 - exp(-mean))`.
-
-    Args:
-        lit: (H, W) counts k.
-        seen: (H, W) frames.
-        mean: (H, W) expected photons of a pixel in a frame.
-        binary: whether counts are of pixels that are 1 with one photon or more; otherwise the ratio is k / mean.
-        into: (H, W) output.
-    """
+    """Write `k / (1 - exp(-mean))` of the counts k of each cell, (H, W), or k / mean of counts that are not binary."""
     least = np.float32(1e-9)
     for y in range(lit.shape[0]):
         k, n, m, out = lit[y], seen[y], mean[y], into[y]
@@ -159,14 +140,9 @@ def counts_in_light(
     lit: NDArray[np.float32],
     dark: NDArray[np.float32],
 ) -> None:
-    """Return the expected lit and dark frames of each cell in changing light, summed over the classes of its frames.
+    """Write the expected frames of each cell with and without photons in changing light, (H, W), from the mean flux.
 
-    Args:
-        mean: (H, W) expected photons of a pixel in a frame of mean light.
-        frames: (C, H, W) frames of each class.
-        gains: (C, H, W) sums of their gains.
-        lit: (H, W) output: frames with one photon or more.
-        dark: (H, W) output: frames without.
+    `frames` and `gains` are (C, H, W): the frames of each class of light, and the sums of their gains.
     """
     for y in range(mean.shape[0]):
         for x in range(mean.shape[1]):

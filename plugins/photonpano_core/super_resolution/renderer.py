@@ -56,13 +56,7 @@ class SuperResolutionRenderer:
     """
 
     def __init__(self, config: SuperResolutionConfig, threads: int, decide: Decide) -> None:
-        """Prepare to render.
-
-        Args:
-            config: the keys of the spec.
-            threads: how many blocks are estimated at once; the result does not depend on it.
-            decide: records how many rounds were chosen, and why.
-        """
+        """Take the keys of the spec, how many blocks are estimated at once, and what records decisions."""
         self._config, self._threads, self._decide = config, threads, decide
         self._chosen: _Chosen | None = None
         self._lock = Lock()
@@ -253,11 +247,7 @@ def _blocks(wide: Canvas) -> list[Box]:
 
 
 def _seen_part(seen: FluxImage, block: Box) -> tuple[Box, Box, Box] | None:
-    """Return the part of a block around which something was seen.
-
-    Returns:
-        The part, rows and columns; where it lies within the third; and the part with its margin. None if nothing was seen.
-    """
+    """Return the part of a block around which something was seen, its place within the third, and the part with its margin."""
     rows, columns = block
     near = seen[rows.start - _HALO_PX : rows.stop + _HALO_PX, columns.start - _HALO_PX : columns.stop + _HALO_PX] > 0
     found = []
@@ -277,10 +267,7 @@ def _seen_part(seen: FluxImage, block: Box) -> tuple[Box, Box, Box] | None:
 
 
 def _probe(share: float, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> Canvas:
-    """Return a square, with its margin, around the middle of the frame at a share of the span.
-
-    It lies on the pixels of the canvas, wherever the canvas begins, so that all tiles find the same.
-    """
+    """Return a square, with its margin, around the middle of the frame at a share of the span, on pixels of the canvas."""
     instant = span.start + share * (len(span) - 1)
     shape = source.info.frame_shape
     to_canvas = canvas.transform @ trajectory.at([instant])[0]

@@ -24,17 +24,11 @@ _MANY_PIECES = 64  # a span is divided into at least this many chunks, if it has
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotonSums:
-    """Sums over the frames whose pixels fall into each cell of a grid.
+    """Sums over the frames whose pixels fall into each cell of a grid."""
 
-    Attributes:
-        lit: (H, W) float32, counts. For a camera that does not count single photons, they are photons.
-        seen: (H, W) float32, frames, or binary frames where a frame is a sum of these; in changing light, their gains.
-        light: frames and gains by the class of their light; None in steady light.
-    """
-
-    lit: FluxImage
-    seen: FluxImage
-    light: LitFrames | None
+    lit: FluxImage  # (H, W), counts. For a camera that does not count single photons, they are photons
+    seen: FluxImage  # (H, W), frames, or binary frames where a frame is a sum of these; in changing light, their gains
+    light: LitFrames | None  # frames and gains by the class of their light; None in steady light
 
     def part(self, box: tuple[slice, slice]) -> PhotonSums:
         """Return some rows and columns."""

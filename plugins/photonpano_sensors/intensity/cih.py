@@ -32,23 +32,14 @@ _KEYS = {
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """The header of a recording.
+    """The header of a recording."""
 
-    Attributes:
-        n_frames: frames in the .mraw file.
-        height: rows of a frame.
-        width: columns of a frame.
-        bits: bits of a pixel in the file: 8, 12 or 16.
-        encoding: meaning of the levels; it has fewer bits than the file if the camera has.
-        frame_rate_hz: frames per second in the file, without frames that were skipped when it was saved.
-    """
-
-    n_frames: int
+    n_frames: int  # frames in the .mraw file
     height: int
     width: int
-    bits: int
-    encoding: Encoding
-    frame_rate_hz: float | None
+    bits: int  # bits of a pixel in the file: 8, 12 or 16
+    encoding: Encoding  # meaning of the levels; it has fewer bits than the file if the camera has
+    frame_rate_hz: float | None  # frames per second in the file, without frames that were skipped when it was saved
 
     @property
     def frame_bytes(self) -> int:
@@ -57,11 +48,7 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Read a .cih or .cihx file.
-
-    Raises:
-        InputError: the file is missing or something else, or describes frames that cannot be read.
-    """
+    """Read a .cih or .cihx file; raises an `InputError` if it is missing or something else, or frames cannot be read."""
     with reading(path), path.open("rb") as file:
         content = file.read(_MOST_BYTES + 1)
     if len(content) > _MOST_BYTES:
@@ -79,10 +66,7 @@ def _of_text(content: bytes) -> Callable[[str], str | None]:
 
 
 def _of_xml(path: Path, content: bytes) -> Callable[[str], str | None]:
-    """Return a function that looks up a value of a .cihx file.
-
-    Everything before `<cih>` is cut off, including a document type: so no entities can be expanded.
-    """
+    """Return what looks up a value of a .cihx file, without all before `<cih>`: so no entities can be expanded."""
     start, end = content.find(b"<cih>"), content.rfind(b"</cih>")
     if not 0 <= start < end:
         raise InputError(f"{path} is no header of a Photron camera: it has no part between <cih> and </cih>")

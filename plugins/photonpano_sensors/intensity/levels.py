@@ -18,17 +18,11 @@ _MOST = 2**16 - 1  # the highest linear level
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """The encoding of the levels of a file.
+    """The encoding of the levels of a file."""
 
-    Attributes:
-        bits: bits of a level.
-        black: the level without light.
-        white: the level at which a pixel saturates.
-    """
-
-    bits: int
-    black: float
-    white: float
+    bits: int  # bits of a level
+    black: float  # the level without light
+    white: float  # the level at which a pixel saturates
 
     @classmethod
     def full(cls, bits: int) -> Encoding:
@@ -38,27 +32,20 @@ class Encoding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearLevels:
-    """The conversion of levels of a file to linear levels, and their response.
+    """The conversion of levels of a file to linear levels, and their response."""
 
-    Attributes:
-        bits: bits of a linear level.
-        table: (2^b,) uint16, the linear level of each level of a file of b bits; None if these are linear already.
-        response: how flux becomes linear levels.
-    """
-
-    bits: int
+    bits: int  # bits of a linear level
+    # (2^b,), the linear level of each level of a file of b bits; None if these are linear already
     table: NDArray[np.uint16] | None
-    response: IntensityResponse
+    response: IntensityResponse  # how flux becomes linear levels
 
 
 def linear_levels(config: ResponseConfig, encoding: Encoding) -> LinearLevels:
     """Return the conversion of the levels of a file to linear levels.
 
     The curve is continued below black, point-symmetrically, so that noise in the dark is not clipped. Quantisation noise, that
-    of the levels in the middle of the range, is added to the read noise.
-
-    Raises:
-        InputError: black and white do not suit the bits, or the file of the curve cannot be used.
+    of the levels in the middle of the range, is added to the read noise. Raises an `InputError` if the levels, or a file, do
+    not suit.
     """
     black = encoding.black if config.black_level is None else config.black_level
     white = encoding.white if config.white_level is None else config.white_level

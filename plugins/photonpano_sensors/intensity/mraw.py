@@ -17,11 +17,7 @@ from photonpano_sensors.intensity.source import IntensitySource, Levels
 
 
 class FastcamMrawSource(IntensitySource):
-    """Frames of 8, 12 or 16 bits in one .mraw file, described by the .cih or .cihx file beside it.
-
-    Raises:
-        InputError: a file is missing, or the header describes frames that cannot be read, or more than there are.
-    """
+    """Frames of 8, 12 or 16 bits in one .mraw file, described by the .cih or .cihx file beside it."""
 
     def __init__(self, config: FastcamMrawConfig) -> None:
         self._path, header = open_recording(config.path)
@@ -45,14 +41,7 @@ class FastcamMrawSource(IntensitySource):
 
 
 def open_recording(path: Path) -> tuple[Path, Header]:
-    """Return the .mraw file of a recording and its header.
-
-    Args:
-        path: the .mraw file or its header.
-
-    Raises:
-        InputError: a file is missing, the header cannot be used, or the .mraw file is shorter than the header promises.
-    """
+    """Return the .mraw file and the header of a recording, named by either; raises an `InputError` if one is unfit."""
     refuse_mdat(path)
     if not path.exists():
         raise InputError(missing_file(path))

@@ -42,15 +42,10 @@ class _Form(NamedTuple):
 
 
 class _Pictures(Protocol):
-    """Frames that are pictures.
-
-    Attributes:
-        n_frames: number of frames.
-        form: size and bits of each.
-    """
+    """Frames that are pictures."""
 
     n_frames: int
-    form: _Form
+    form: _Form  # size and bits of each
 
     def read(self, index: int) -> Image:
         """Return a frame: (H, W)."""
@@ -62,11 +57,7 @@ class _Pictures(Protocol):
 
 
 class ImageFolderSource(IntensitySource):
-    """Pictures of grey levels of 8 or 16 bits.
-
-    Raises:
-        InputError: there is no picture, one cannot be read or is not grey, or pictures differ in size or bits.
-    """
+    """Pictures of grey levels of 8 or 16 bits, all of one size; anything else raises an `InputError`."""
 
     def __init__(self, config: ImageFolderConfig) -> None:
         self._pictures: _Pictures = _Folder(config.path) if config.path.is_dir() else _Pages(config.path)

@@ -55,11 +55,7 @@ def recognise_pictures(path: Path) -> Recognised | None:
 
 
 def refuse_mdat(path: Path) -> None:
-    """Refuse raw files of an Infinicam, with a sentence about what to do.
-
-    Raises:
-        InputError: the path is such a file, or its header.
-    """
+    """Refuse raw files of an Infinicam, or the header of one, with an `InputError` that says what to do."""
     header_of = _beside(path, ".mdat") if path.suffix.lower() in (".cih", ".cihx") and not mraw_beside(path) else None
     if path.suffix.lower() == ".mdat" or header_of is not None:
         raise InputError(

@@ -24,24 +24,13 @@ _BLOCK_PIXELS = 4096  # pixels summed at once: their sums stay in the L1 cache
 class IntensitySource(Closing, ABC):
     """Grey levels that are linear in flux: a `photonpano.Source`.
 
-    A saturated pixel counts with the saturation level, so its flux is a lower bound: in a sum, saturated frames cannot be
-    separated from others.
+    A saturated pixel counts with the saturation level, so its flux is a lower bound.
     """
 
     def __init__(
         self, config: IntensityConfig, shape: tuple[int, int, int], frame_rate_hz: float | None, encoding: Encoding
     ) -> None:
-        """Prepare to read.
-
-        Args:
-            config: the keys of the spec.
-            shape: frames, height and width of the capture.
-            frame_rate_hz: frame rate of the file, used unless the spec has one.
-            encoding: encoding of the levels of the file.
-
-        Raises:
-            InputError: the response of the spec does not suit the levels.
-        """
+        """Take (frames, height, width), the frame rate unless the spec has one, and the encoding of the levels of the file."""
         linear = linear_levels(config.response, encoding)
         self.info = StreamInfo(*shape, config.frame_rate_hz or frame_rate_hz, "intensity", linear.bits)
         self.response = linear.response
@@ -52,11 +41,7 @@ class IntensitySource(Closing, ABC):
 
     @abstractmethod
     def _read(self, span: FrameSpan, levels: Levels) -> None:
-        """Fill an array (n, H, W) with the levels of a span as they are in the file; the span is within the capture.
-
-        Raises:
-            InputError: the levels cannot be read.
-        """
+        """Fill (n, H, W) with the levels of a span as they are in the file; raises an `InputError` if they cannot be read."""
 
     def frames(self, span: FrameSpan) -> Levels:
         """Return the frames of a span, in linear levels: (n, H, W)."""
@@ -65,11 +50,7 @@ class IntensitySource(Closing, ABC):
         return levels if self._table is None else self._table[levels]
 
     def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
-        """Sum the frames of a span: (H, W) uint32.
-
-        Raises:
-            InputError: the sum might not fit into uint32.
-        """
+        """Sum the frames of a span: (H, W) uint32; raises an `InputError` if the sum might not fit."""
         self.info.require(span)
         most = _MOST_COUNT // (2**self.info.bit_depth - 1)
         if len(span) > most:

@@ -19,19 +19,13 @@ _GAP_M = 1e-3  # rays begin this far above their plane
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """The light of a scene.
+    """The light of a scene."""
 
-    Attributes:
-        lamps: (x, y, z) in m, radius in m, and light: at `reach_m` ahead of the lamp it is this, relative to the ambient light.
-        ambient: light from everywhere.
-        shadow_m: how far away a thing still takes ambient light.
-        reach_m: distance at which the light of the lamps is given.
-    """
-
+    # (x, y, z) in m, radius in m, and light: at `reach_m` ahead of the lamp it is this, relative to the ambient light
     lamps: tuple[tuple[float, float, float, float, float], ...]
-    ambient: float
-    shadow_m: float
-    reach_m: float = 1.0
+    ambient: float  # light from everywhere
+    shadow_m: float  # how far away a thing still takes ambient light
+    reach_m: float = 1.0  # distance at which the light of the lamps is given
 
 
 def light_on(planes: Planes, index: int, lighting: Lighting) -> NDArray[np.float32]:

@@ -28,21 +28,13 @@ _SMALLEST = 1e-9  # inverse depth of the furthest point that is seen, in 1 / m
 
 
 class Atlas(NamedTuple):
-    """The levels of all textures in one array.
+    """The levels of all textures in one array."""
 
-    Attributes:
-        texels: float32, all levels of all textures, row by row.
-        starts: (P, L), where a level begins.
-        heights: (P, L), its rows; 0 for none.
-        widths: (P, L), its columns.
-        counts: (P,), how many levels a texture has.
-    """
-
-    texels: NDArray[np.float32]
-    starts: NDArray[np.int64]
-    heights: NDArray[np.int64]
-    widths: NDArray[np.int64]
-    counts: NDArray[np.int64]
+    texels: NDArray[np.float32]  # all levels of all textures, row by row
+    starts: NDArray[np.int64]  # (P, L), where a level begins
+    heights: NDArray[np.int64]  # (P, L), its rows; 0 for none
+    widths: NDArray[np.int64]  # (P, L), its columns
+    counts: NDArray[np.int64]  # (P,), how many levels a texture has
 
 
 def atlas_of(textures: tuple[NDArray[np.float16], ...], gain: float = 1.0) -> Atlas:
@@ -67,27 +59,15 @@ def atlas_of(textures: tuple[NDArray[np.float16], ...], gain: float = 1.0) -> At
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What renders the frames of one camera.
-
-    Attributes:
-        planes: of the scene.
-        atlas: their flux.
-        matrix: (3, 3), K.
-        frame_shape: (height, width).
-    """
+    """What renders the frames of one camera."""
 
     planes: Planes
-    atlas: Atlas
+    atlas: Atlas  # their flux
     matrix: FloatArray
     frame_shape: tuple[int, int]
 
     def flux(self, pose: FloatArray, frame: float) -> NDArray[np.float32]:
-        """Return the flux in a frame: (H, W); 0 where no plane is seen.
-
-        Args:
-            pose: (3, 4).
-            frame: the instant, for planes that move.
-        """
+        """Return the flux in a frame, (H, W), from a (3, 4) pose at an instant; 0 where no plane is seen."""
         image = np.empty(self.frame_shape, np.float32)
         maps = self.planes.maps(pose, self.matrix, frame)
         rows = self.planes.rows(pose, self.matrix, frame, self.frame_shape[0])

@@ -18,12 +18,7 @@ _METERED = 9  # frames along the path over which the mean flux is taken
 
 
 class TravelSource(SimulatedSource):
-    """A single-photon camera that travels through a scene with depth.
-
-    Raises:
-        InputError: a file cannot be used, the camera leaves the scene or passes through something, or frames are dropped that
-            do not exist.
-    """
+    """A single-photon camera that travels through a scene with depth."""
 
     def __init__(self, config: TravelConfig, context: SourceContext) -> None:
         super().__init__(config, context)
@@ -71,11 +66,7 @@ class TravelSource(SimulatedSource):
         return {**super().truth(), **self._truth.arrays(), **gains}
 
     def sharp_view(self, frame: int) -> NDArray[np.float32]:
-        """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W).
-
-        Raises:
-            InputError: there is no such frame.
-        """
+        """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W)."""
         return sharp_view(self._truth, frame)
 
 

@@ -76,16 +76,9 @@ class _Place:
 class Stage:
     """A scene that is placed, and not drawn yet.
 
-    Args:
-        config: of the simulation.
-
     Attributes:
-        planes: the rectangles.
         middle: (3,), where a camera looks by default, in m.
         free: (2, 3), the smallest and the largest coordinates that a camera may have.
-
-    Raises:
-        InputError: the photograph cannot be used.
     """
 
     def __init__(self, config: TravelConfig) -> None:
@@ -212,16 +205,7 @@ def with_objects(
     frame_shape: tuple[int, int],
     mean: float,
 ) -> Scene:
-    """Add what moves on its own.
-
-    Args:
-        scene: without it.
-        objects: what moves.
-        pose: (3, 4) of the first frame, which they face.
-        matrix: (3, 3), K.
-        frame_shape: (height, width).
-        mean: of the light that the scene sends to the camera.
-    """
+    """Add what moves on its own, and faces the first frame, of pose (3, 4); `mean` is that of the light of the scene."""
     if not objects:
         return scene
     height, width = frame_shape

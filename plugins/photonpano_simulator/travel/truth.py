@@ -27,25 +27,15 @@ _SAME = 1e-6  # inverse depths that differ by less, relative to each other, are 
 
 @dataclass(frozen=True, eq=False)
 class TravelTruth:
-    """The truth of a capture of a scene with depth.
+    """The truth of a capture of a scene with depth."""
 
-    Attributes:
-        camera_from_world: (T, 3, 4), the pose of each frame of the capture.
-        camera_matrix: (3, 3), K.
-        frame_shape: (height, width).
-        taken: (T,), when each frame was taken: its index before any were dropped or repeated.
-        light: (T,), light of each frame, relative to the first that was taken.
-        scene: its planes and textures.
-        flux: photons per pixel per frame that are detected where a texture is 1.
-    """
-
-    camera_from_world: FloatArray
+    camera_from_world: FloatArray  # (T, 3, 4), the pose of each frame of the capture
     camera_matrix: FloatArray
     frame_shape: tuple[int, int]
-    taken: NDArray[np.int64]
-    light: FloatArray
+    taken: NDArray[np.int64]  # (T,), when each frame was taken: its index before any were dropped or repeated
+    light: FloatArray  # (T,), light of each frame, relative to the first that was taken
     scene: Scene
-    flux: float
+    flux: float  # photons per pixel per frame that are detected where a texture is 1
 
     @cached_property
     def view(self) -> View:
@@ -74,34 +64,23 @@ class TravelTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flow:
-    """Where the pixels of a frame are in another frame.
+    """Where the pixels of a frame are in another frame."""
 
-    Attributes:
-        vectors: (H, W, 2), from the place of a pixel's point in the first frame to its place in the other, (x, y) in px; NaN
-            where the pixel shows nothing, or where its point lies behind the other camera.
-        visible: (H, W) bool, whether the other frame shows the point: within the frame, and not behind another plane.
-    """
-
+    # (H, W, 2), from the place of a pixel's point in the first frame to its place in the other, (x, y) in px; NaN where the
+    # pixel shows nothing, or where its point lies behind the other camera
     vectors: FloatArray
+    # (H, W), whether the other frame shows the point: within the frame, and not behind another plane
     visible: NDArray[np.bool_]
 
 
 def read_truth(path: Path | str) -> TravelTruth:
-    """Read the truth file of a capture of `travel-simulator`.
-
-    Raises:
-        InputError: the file is missing, or is something else.
-    """
+    """Read the truth file of a capture of `travel-simulator`; raises an `InputError` if it is missing, or something else."""
     path = Path(path)
     return truth_of(read_arrays(path, "a truth of travel-simulator"), str(path))
 
 
 def truth_of(arrays: Mapping[str, NDArray[Any]], name: str = "the truth") -> TravelTruth:
-    """Return the truth from its arrays.
-
-    Raises:
-        InputError: an array is missing.
-    """
+    """Return the truth from its arrays; raises an `InputError` if one is missing."""
     wanted = (
         "camera_from_world",
         "camera_matrix",
@@ -133,22 +112,14 @@ def truth_of(arrays: Mapping[str, NDArray[Any]], name: str = "the truth") -> Tra
 
 
 def depth(truth: TravelTruth, frame: int) -> FloatArray:
-    """Return the depth of what a frame shows at its pixel centres: (H, W), along the optical axis in m; inf for nothing.
-
-    Raises:
-        InputError: the capture has no such frame.
-    """
+    """Return the depth of what a frame shows at its pixel centres: (H, W), along the optical axis in m; inf for nothing."""
     _, inverse_depth = _traced(truth, _require(truth, frame), _pixels(truth))
     with np.errstate(divide="ignore"):
         return np.asarray((1 / inverse_depth).reshape(truth.frame_shape))
 
 
 def flow(truth: TravelTruth, from_frame: int, to_frame: int) -> Flow:
-    """Return where the points that a frame shows at its pixel centres are in another frame.
-
-    Raises:
-        InputError: the capture has no such frame.
-    """
+    """Return where the points that a frame shows at its pixel centres are in another frame."""
     start, end = _require(truth, from_frame), _require(truth, to_frame)
     pixels = _pixels(truth)
     owner, inverse_depth = _traced(truth, start, pixels)
@@ -172,11 +143,7 @@ def flow(truth: TravelTruth, from_frame: int, to_frame: int) -> Flow:
 
 
 def sharp_view(truth: TravelTruth, frame: int) -> NDArray[np.float32]:
-    """Return the flux of a frame without noise: (H, W), photons that are detected per pixel per frame, without dark counts.
-
-    Raises:
-        InputError: the capture has no such frame.
-    """
+    """Return the flux of a frame, (H, W), without noise and dark counts: photons that are detected per pixel per frame."""
     place = _require(truth, frame)
     return truth.view.flux(truth.camera_from_world[place], float(truth.taken[place])) * np.float32(truth.light[place])
 
