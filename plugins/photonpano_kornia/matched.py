@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import apply
+from photonpano.geometry import transform_points
 from photonpano.locating import (
     Matches,
     MatchingConfig,
@@ -99,7 +99,7 @@ class FeatureLocator(PointLocator):
         distances = torch.cdist(here, there)
         near = None
         if guide is not None:
-            near = cdist(apply(guide, moving.points), fixed.points) <= self._config.search_px
+            near = cdist(transform_points(guide, moving.points), fixed.points) <= self._config.search_px
             distances.masked_fill_(torch.tensor(~near, device=self._device), _FAR)
         if self._config.matcher == "smnn":
             _, pairs = match_smnn(here, there, self._config.ratio, distances)
@@ -156,7 +156,7 @@ class LoftrLocator:
     def _attempts(self, here: FloatArray, there: FloatArray, initial: Homography | None) -> Iterator[Matches]:
         """Return the matches near the positions that the current motion predicts, then all."""
         if initial is not None:
-            near = np.linalg.norm(apply(initial, here) - there, axis=1) <= self._config.search_px
+            near = np.linalg.norm(transform_points(initial, here) - there, axis=1) <= self._config.search_px
             yield Matches(here[near], there[near], guided=True)
         yield Matches(here, there, guided=False)
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import apply, normalised, rescaled, translation, why_implausible
+from photonpano.geometry import normalised, rescaled, transform_points, translation, why_implausible
 from photonpano.locating import (
     NO_TEXTURE,
     TRANSLATION,
@@ -106,4 +106,4 @@ class PhaseCorrelationLocator:
 def _shift_of(motion: Homography, shape: tuple[int, int]) -> FloatArray:
     """Return the translation that moves the centre of an image as a motion does."""
     centre = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
-    return translation(*(apply(motion, centre) - centre)[0])
+    return translation(*(transform_points(motion, centre) - centre)[0])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import apply, why_implausible
+from photonpano.geometry import transform_points, why_implausible
 from photonpano.locating import (
     KeypointConfig,
     Matches,
@@ -81,7 +81,7 @@ class KeypointMatcher(PointLocator):
     def _matches(self, moving: Keypoints, fixed: Keypoints, initial: Homography | None) -> Iterator[Matches]:
         descriptors = self._descriptors(moving, fixed)
         if initial is not None:
-            predicted = apply(initial, moving.points)
+            predicted = transform_points(initial, moving.points)
             pairs = match_nearby(*descriptors, predicted, fixed.points, self._config.search_px, self._ratio)
             yield Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided=True)
         pairs = match_everywhere(*descriptors, self._ratio)
@@ -100,7 +100,7 @@ class KeypointMatcher(PointLocator):
         descriptors = self._descriptors(moving, fixed)
         for radius, max_std_px in zip(GUIDED_RADII, (np.inf, config.max_std_px), strict=True):
             limits = config.model_copy(update={"threshold_px": radius * config.threshold_px, "max_std_px": max_std_px})
-            predicted = apply(homography, moving.points)
+            predicted = transform_points(homography, moving.points)
             pairs = match_nearby(*descriptors, predicted, fixed.points, limits.threshold_px, GUIDED_RATIO)
             here, there, sizes = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], moving.sizes[pairs[:, 0]]
             # One round: matches that were searched within the threshold are all inliers.

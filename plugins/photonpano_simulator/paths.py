@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano import FloatArray, InputError
-from photonpano.geometry import Camera, apply, camera_matrix, inverse, normalised, rescaling, rotation_matrices
+from photonpano.geometry import Camera, camera_matrix, inverse, normalised, rescaling, rotation_matrices, transform_points
 from photonpano.reading import read_array, read_arrays
 from photonpano_simulator.config import (
     FilePath,
@@ -55,7 +55,7 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
         to_scene = rescaling(config.scene_scale)
         in_frame_px = scene_shape[0] / config.scene_scale, scene_shape[1] / config.scene_scale
         middle = _middle(in_frame_px)
-        target = middle if path.centre is None else apply(inverse(to_scene), np.array([path.centre], np.float64))[0]
+        target = middle if path.centre is None else transform_points(inverse(to_scene), np.array([path.centre], np.float64))[0]
         rotations = _rotations(target - middle + _centres(path, config.n_frames), focal)
         homographies = to_scene @ _intrinsics(in_frame_px, focal) @ rotations @ np.linalg.inv(frame)
     if path.shake is not None:
@@ -85,9 +85,9 @@ def scene_motion(homographies: FloatArray, frame_shape: tuple[int, int], path: o
     """Return how far the scene has moved through the middle of the frame since the first frame: (T, 2) px."""
     middle = _middle(frame_shape)
     if isinstance(path, TurnPath):
-        steps = apply(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
+        steps = transform_points(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
         return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    return np.asarray(apply(inverse(homographies), apply(homographies[0], middle[None]))[:, 0] - middle)
+    return np.asarray(transform_points(inverse(homographies), transform_points(homographies[0], middle[None]))[:, 0] - middle)
 
 
 def _turn(config: SimulationConfig, path: TurnPath, scene_shape: tuple[int, int], seed: int) -> FloatArray:
@@ -242,7 +242,7 @@ def sums_of_sines(
 
 def _require_inside(homographies: FloatArray, frame: FloatArray, scene_shape: tuple[int, int]) -> None:
     """Require that the outline of the frame, (N, 2), lies in the scene."""
-    x, y = np.moveaxis(apply(homographies, frame), -1, 0)
+    x, y = np.moveaxis(transform_points(homographies, frame), -1, 0)
     height, width = scene_shape
     worst = np.stack([-x, x - (width - 1), -y, y - (height - 1)]).max(axis=2)
     # Coordinates of points behind the camera are meaningless.

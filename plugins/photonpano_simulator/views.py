@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photonpano import FloatArray
 from photonpano.compiling import compiled
-from photonpano.geometry import apply, translation
+from photonpano.geometry import transform_points, translation
 from photonpano_simulator.config import SimulationConfig, TurnPath
 from photonpano_simulator.lens import camera, distorts, pixel_grid, undistorted
 
@@ -62,7 +62,7 @@ class Views:
         if self._points is None:
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
             return np.asarray(cv2.warpPerspective(averages, homography, (width, height), flags=flags, borderMode=border))
-        x, y = apply(homography, self._points.reshape(2, -1).T).T.reshape(2, height, width).astype(np.float32)
+        x, y = transform_points(homography, self._points.reshape(2, -1).T).T.reshape(2, height, width).astype(np.float32)
         return np.asarray(cv2.remap(averages, x, y, cv2.INTER_LINEAR, borderMode=border))
 
     def _around(self, averages: NDArray[np.float32], points: FloatArray, homography: FloatArray) -> NDArray[np.float32]:

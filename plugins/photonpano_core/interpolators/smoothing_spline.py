@@ -10,9 +10,9 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded, hadamard, solveh_banded
 
 from photonpano import FloatArray
-from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
+from photonpano.geometry import corners, from_parameters, jacobian, parameters, transform_points
 from photonpano_core.configs import InterpolatorConfig
-from photonpano_core.interpolators.trajectories import ParameterTrajectory, SplinePath, interpolating_spline
+from photonpano_core.interpolators.interpolating import ParameterTrajectory, SplinePath, interpolating_spline
 
 ORDER = 3  # of the derivative that is penalised: parabolas, which fit any three knots, are not
 # Candidates for the scale of the jerk, from a parabola to interpolation. The number of knots averaged grows with the sixth
@@ -73,7 +73,7 @@ class SmoothingSplineInterpolator:
         if information is not None:
             derivatives = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
             covariances = _covariances(information, _TO_MODES @ derivatives)
-        paths = apply(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
+        paths = transform_points(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
         moved = _smoothed_modes(instants, paths, covariances, _QUIET) @ _TO_MODES
         return _from_corners(self._corners, moved.reshape(-1, 4, 2))
 

@@ -16,20 +16,18 @@ from photonpano import (
     FloatArray,
     FrameSpan,
     Group,
-    InputError,
     Response,
     Source,
     Trajectory,
     VirtualExposure,
-    capture_of,
 )
-from photonpano.merging import PhotonSum, divided
+from photonpano.merging import PhotonSum
 from photonpano_core.configs import BurstConfig
-from photonpano_core.dense_motion.frames import WeightedFrames, count_variance, rescaled
-from photonpano_core.dense_motion.patches import Image, PatchGrid, add_patches, search
-from photonpano_core.dense_motion.sub_exposures import smoothed
-from photonpano_core.dense_motion.warping import Frames
-from photonpano_core.photon_mle import exposure_of
+from photonpano_core.mergers.dense_motion.frames import WeightedFrames, count_variance, rescaled
+from photonpano_core.mergers.dense_motion.patches import Image, PatchGrid, add_patches, search
+from photonpano_core.mergers.dense_motion.sub_exposures import smoothed
+from photonpano_core.mergers.dense_motion.warping import Frames
+from photonpano_core.mergers.photon_mle import equal_spans, exposure_of, parts_of, require_plain
 
 _DETAIL_PX = 1.0  # blur of blocks before they are compared, in px
 _LEVELS = 4  # levels of the pyramid, each of half the size of the one before
@@ -53,11 +51,7 @@ class BurstMerger:
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
         """Merge a group; see `photonpano.Merger`. Raises an `InputError` if the lens distorts, or the light changes."""
         del trajectory
-        capture = capture_of(source)
-        if capture.camera is not None and capture.camera.distorts:
-            raise InputError("merge.use: burst does not warp through a lens that distorts; use photon-mle")
-        if capture.light is not None:
-            raise InputError("merge.use: burst does not divide by light that changes; use photon-mle")
+        require_plain(source, "burst", "photon-mle")
         burst = _Burst(source, group, self._config)
         photons = burst.merged(burst.motion())
         return exposure_of(photons if scale == 1 else rescaled(photons, scale), source, group, scale)
@@ -69,11 +63,9 @@ class _Burst:
     def __init__(self, source: Source, group: Group, config: BurstConfig) -> None:
         self._source, self._group, self._config = source, group, config
         self._counts = WeightedFrames(source)
-        self._weights = self._counts.worth if self._counts.worth.size else np.ones(source.info.frame_shape, np.float32)
-        start = group.span.start
-        parts = divided(len(group.span), max(1, round(len(group.span) / config.block_frames)))
-        self._spans = [FrameSpan(start + part.start, start + part.stop) for part in parts]
-        self._reference = next(place for place, span in enumerate(self._spans) if group.reference < span.stop)
+        weights = self._counts.weights
+        self._weights = weights if weights.size else np.ones(source.info.frame_shape, np.float32)
+        self._spans, self._reference = parts_of(group, round(len(group.span) / config.block_frames))
         self._grid = PatchGrid(source.info.frame_shape, config.patch_px)
 
     def motion(self) -> FloatArray:
@@ -111,8 +103,7 @@ class _Burst:
         for place, span in enumerate(self._spans):
             way = at_instant(middles, motion, span.stop - 1) - at_instant(middles, motion, span.start)
             way_px = float(np.percentile(np.hypot(*np.moveaxis(way, -1, 0)), 90))
-            for part in divided(len(span), max(1, math.ceil(way_px / self._config.tolerance_px))):
-                chunk = FrameSpan(span.start + part.start, span.start + part.stop)
+            for chunk in equal_spans(span, math.ceil(way_px / self._config.tolerance_px)):
                 shifts = at_instant(middles, motion, chunk.centre) - there
                 summed = Frames(self._counts(chunk), self._weights, float(len(chunk)))
                 add_patches(summed, shifts, self._grid.step, counts[place], weight[place])

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from photonpano import BoolArray
 from photonpano.merging import PhotonSum
-from photonpano_core.dense_motion.field import Image, MotionField
-from photonpano_core.dense_motion.polynomials import add_moments, fit_each
-from photonpano_core.dense_motion.sub_exposures import SCALE, Smoothed, SubExposures, blurred
+from photonpano_core.mergers.dense_motion.field import Image, MotionField, add_moments, fit_each
+from photonpano_core.mergers.dense_motion.frames import blurred
+from photonpano_core.mergers.dense_motion.sub_exposures import SCALE, Smoothed, SubExposures
 
 # Sub-exposures of each round. Parallax of a camera in the hand changes its speed too often for fewer in the last.
 _ROUNDS = 3, 9, 17

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-from photonpano_core.dense_motion.warping import Frames
+from photonpano_core.mergers.dense_motion.warping import Frames
 
 Image = NDArray[np.float32]
 

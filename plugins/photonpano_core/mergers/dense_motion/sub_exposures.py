@@ -14,10 +14,10 @@ import numpy as np
 from photonpano import BoolArray, FloatArray, FrameSpan, Group, Response, Source, Trajectory
 from photonpano.geometry import inverse, rescaling, transform_points, translation
 from photonpano.merging import Chunk, PhotonSum, chunks_of, clipped, divided
-from photonpano_core.dense_motion.field import Image, MotionField
-from photonpano_core.dense_motion.frames import WeightedFrames
-from photonpano_core.dense_motion.warping import Frames, Moved, Sums, add_along, mean_of_seen
-from photonpano_core.photon_mle import to_exposure
+from photonpano_core.mergers.dense_motion.field import Image, MotionField
+from photonpano_core.mergers.dense_motion.frames import WeightedFrames, blurred
+from photonpano_core.mergers.dense_motion.warping import Frames, Moved, Sums, add_along, mean_of_seen
+from photonpano_core.mergers.photon_mle import equal_spans, parts_of, to_exposure
 
 SCALE = 0.5  # pixels of the grid per pixel of a frame
 _TOLERANCE_PX = 1.5  # motion within which frames are summed before they are warped, in px of a frame
@@ -70,7 +70,7 @@ class SubExposures:
         """Merge `n` sub-exposures along the global motion; fewer if the group has fewer frames."""
         self._group, self._trajectory = group, trajectory
         self._frames = WeightedFrames(source)
-        self._weights = halved(self._frames.worth) if self._frames.worth.size else self._frames.worth
+        self._weights = halved(self._frames.weights) if self._frames.weights.size else self._frames.weights
         self._onto = to_exposure(group, trajectory, SCALE)
         height, width = source.info.frame_shape
         self.shape, self.response = (height // 2, width // 2), source.response
@@ -83,9 +83,7 @@ class SubExposures:
 
     def _divide(self, n: int) -> None:
         """Merge `n` sub-exposures along the global motion."""
-        start = self._group.span.start
-        self.spans = [FrameSpan(start + part.start, start + part.stop) for part in divided(len(self._group.span), n)]
-        self.reference = next(place for place, span in enumerate(self.spans) if self._group.reference < span.stop)
+        self.spans, self.reference = parts_of(self._group, n)
         nothing = PhotonSum(*np.zeros((2, *self.shape), np.float32))
         self.sums = [nothing] * len(self.spans)
         self.sums = self.along(MotionField.zero(self.shape), np.ones(self.shape, np.bool_))
@@ -153,9 +151,8 @@ class SubExposures:
         """
         finer: list[Chunk] = []
         for chunk in chunks:
-            start, way_px = chunk.span.start, fastest_px * abs(self.elapsed(chunk.span.stop) - self.elapsed(chunk.span.start))
-            parts = divided(len(chunk.span), max(1, math.ceil(way_px / tolerance_px)))
-            spans = [FrameSpan(start + part.start, start + part.stop) for part in parts]
+            way_px = fastest_px * abs(self.elapsed(chunk.span.stop) - self.elapsed(chunk.span.start))
+            spans = equal_spans(chunk.span, math.ceil(way_px / tolerance_px))
             homographies = self._trajectory.at([span.centre for span in spans]) if len(spans) > 1 else [chunk.homography]
             finer += map(Chunk, spans, homographies)
         times = [self.elapsed(chunk.span.centre) for chunk in finer]
@@ -217,8 +214,3 @@ def noise_area_px2(blur_px: float, scale: float, spread: float) -> float:
     kernel = cv2.getGaussianKernel(2 * math.ceil(_REACH * blur_px * scale) + 1, blur_px * scale)[:, 0]
     squares, products = float(kernel @ kernel), float(kernel[1:] @ kernel[:-1])
     return float((squares - 2 * spread * (squares - products)) * scale) ** -2
-
-
-def blurred(image: Image, blur_px: float) -> Image:
-    """Blur with a Gaussian; the image is 0 outside of its border."""
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px, borderType=cv2.BORDER_CONSTANT), np.float32)

@@ -18,9 +18,9 @@ from photonpano import (
     capture_of,
 )
 from photonpano.compiling import compiled
-from photonpano.geometry import apply, corners, inverse, visible_columns
+from photonpano.geometry import corners, inverse, transform_points, visible_columns
 from photonpano.merging import PhotonSum, gain_image
-from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
+from photonpano_core.mergers.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
 
 Frames = NDArray[np.unsignedinteger[Any]]
 
@@ -92,7 +92,7 @@ def _weight(valid: NDArray[np.bool_], to_grid: FloatArray, shape: tuple[int, int
 def _rigid(to_grid: FloatArray, frame_shape: tuple[int, int]) -> bool:
     """Return whether the pixels of all frames stay 1 px apart, so that weights need not be splatted."""
     neighbours = corners(frame_shape)[:, None] + np.array([[0, 0], [1, 0], [0, 1]])
-    placed = apply(to_grid, neighbours.reshape(-1, 2)).reshape(len(to_grid), 4, 3, 2)
+    placed = transform_points(to_grid, neighbours.reshape(-1, 2)).reshape(len(to_grid), 4, 3, 2)
     return bool(np.abs(placed[:, :, 1:] - placed[:, :, :1] - np.eye(2)).max() < _RIGID)
 
 

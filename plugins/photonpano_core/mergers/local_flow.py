@@ -8,18 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import BoolArray, FrameSpan, Group, InputError, Source, Trajectory, VirtualExposure, capture_of
+from photonpano import BoolArray, FrameSpan, Group, Source, Trajectory, VirtualExposure
 from photonpano.geometry import inverse
 from photonpano.merging import PhotonSum, accumulate, chunks_of, clipped
 from photonpano_core.configs import LocalFlowConfig
-from photonpano_core.dense_motion.flow import estimate_field
-from photonpano_core.dense_motion.frames import WeightedFrames, rescaled
-from photonpano_core.dense_motion.ghosts import GhostMap, compared
-from photonpano_core.dense_motion.robust_sum import weighted
-from photonpano_core.dense_motion.sharpening import sharpened
-from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures
-from photonpano_core.dense_motion.warping import Frames, Moved, Sums, add_along
-from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
+from photonpano_core.mergers.dense_motion.flow import estimate_field
+from photonpano_core.mergers.dense_motion.frames import WeightedFrames, rescaled, sharpened
+from photonpano_core.mergers.dense_motion.ghosts import GhostMap, compared, weighted
+from photonpano_core.mergers.dense_motion.sub_exposures import SCALE, SubExposures
+from photonpano_core.mergers.dense_motion.warping import Frames, Moved, Sums, add_along
+from photonpano_core.mergers.photon_mle import exposure_of, exposure_shape, require_plain, to_exposure, unwarped_sum
 
 # Numbers of sub-exposures that are tried for a group, with the photons per pixel that each must have.
 _NUMBERS = {33: 8.0, 17: 8.0, 9: 2.0, 5: 2.0, 3: 2.0}
@@ -59,11 +57,7 @@ class LocalFlowMerger:
         return GhostMap(enlarged(found.significance, shape), enlarged(found.moving, shape))
 
     def _divided(self, source: Source, group: Group, trajectory: Trajectory) -> SubExposures:
-        capture = capture_of(source)
-        if capture.camera is not None and capture.camera.distorts:
-            raise InputError("merge.use: local-flow does not warp through a lens that distorts; use robust-merge or photon-mle")
-        if capture.light is not None:
-            raise InputError("merge.use: local-flow does not divide by light that changes; use robust-merge or photon-mle")
+        require_plain(source, "local-flow", "robust-merge or photon-mle")
         wanted = self._config.sub_exposures
         number = min(number_of(source, group), _USUAL) if wanted == "auto" else wanted
         return SubExposures(source, group, trajectory, number)
@@ -97,7 +91,7 @@ class LocalFlowMerger:
         for span, trust in zip(parts.spans, best.trusts, strict=True):
             for chunk, motion in parts.moving(clipped(chunks, span, trajectory), best.field, fastest_px, tolerance_px):
                 to_image = inverse(onto @ chunk.homography)
-                summed = Frames(frames(chunk.span), frames.worth, float(len(chunk.span)))
+                summed = Frames(frames(chunk.span), frames.weights, float(len(chunk.span)))
                 add_along(summed, to_image, Moved(inside, cells, motion, trust), sums)
         photons = PhotonSum(sums.counts, sums.weight)
         if scale > 1:
