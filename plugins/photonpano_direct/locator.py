@@ -23,8 +23,7 @@ from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.majority import JUDGED, masked, part_following, shifts_between
 from photonpano_direct.moments import Layer
-from photonpano_direct.pyramid import Pyramid, pyramid_of
-from photonpano_direct.similarity import similarity_under
+from photonpano_direct.pyramid import Pyramid, pyramid_of, similarity_under
 from photonpano_direct.small_matrices import rescaled
 
 _EXACT_PX = 0.1  # expected corner error below which coarser layers are not considered

@@ -25,8 +25,7 @@ from photonpano.locating import (
     stabilised_8_bit,
 )
 from photonpano_kornia.configs import KorniaFeaturesConfig, KorniaLoftrConfig
-from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
-from photonpano_kornia.weights import loftr_from
+from photonpano_kornia.runtime import device_of, images_on, loftr_from, one_thread, seeded
 
 _FAR = 1e3  # descriptor distance of keypoints beyond the search radius; true ones are at most 2
 _SMALLEST_SIDE = 32  # px: four of the cells that LoFTR matches first

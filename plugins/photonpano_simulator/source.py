@@ -10,13 +10,12 @@ from photonpano.geometry import corner_displacements, corners, inverse
 from photonpano.reading import SingleFrameSource
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig, TurnPath
 from photonpano_simulator.lens import camera, distorts, transmission, undistorted
-from photonpano_simulator.objects import DrawnObject
 from photonpano_simulator.paths import camera_path, camera_rotations, scene_motion
 from photonpano_simulator.recording import delivered
 from photonpano_simulator.scenes import brightness, scene_flux, shares
 from photonpano_simulator.sensor import Draw, IntensityCamera, SpadSensor, bayer_of, filter_array, generator
 from photonpano_simulator.travel_config import TravelConfig
-from photonpano_simulator.views import Views
+from photonpano_simulator.views import DrawnObject, Views
 
 
 class SimulatedSource(SingleFrameSource):

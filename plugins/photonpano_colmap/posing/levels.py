@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from photonpano import BoolArray, FloatArray, FrameSpan, Group, LocationError, Source
 from photonpano_colmap.posing.adjustment import Adjusted, Observations, adjust
-from photonpano_colmap.posing.depth import inverse_depth_of
-from photonpano_colmap.posing.merging import PosedExposure, merge_through_depth
+from photonpano_colmap.posing.merging import PosedExposure, inverse_depth_of, merge_through_depth
 from photonpano_colmap.posing.patches import Found, find_patches, patches_of, stabilised
 from photonpano_colmap.posing.path import Path, between, exceeding_noise_of_poses, moves
 from photonpano_colmap.posing.tremor import Tremor, find_tremor

@@ -12,7 +12,7 @@ import numpy as np
 from av import VideoFrame
 
 from photonpano import FrameSpan, InputError, SourceContext
-from photonpano_sensors.intensity.configs import VideoConfig
+from photonpano_sensors.intensity.contributions import VideoConfig
 from photonpano_sensors.intensity.source import IntensitySource, Levels
 from photonpano_sensors.intensity.video_index import VideoIndex, index_of, open_video
 

@@ -34,12 +34,12 @@ from numpy.typing import NDArray
 from photonpano import FloatArray
 from photonpano.photometry import srgb_to_linear
 from photonpano_simulator.drawing import Chance, Drawing, Names, pictures_of, read_scene
-from photonpano_simulator.objects import texture_of
 from photonpano_simulator.scenes import photograph
 from photonpano_simulator.sensor import Draw, generator
 from photonpano_simulator.travel.lighting import Lighting, light_on
 from photonpano_simulator.travel.planes import Planes, Scene
 from photonpano_simulator.travel_config import TravelConfig, WorldObject
+from photonpano_simulator.views import texture_of
 
 _NEAREST_M = 0.6  # textures are as fine as pixels at the distance of their plane, but not finer than pixels at this distance
 _MOST_TEXELS = 24_000_000  # beyond, all textures are coarser; texels take 2 bytes each in the truth
