@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import photonpano_colmap as plugin
-from photonpano import LocatorContribution, PoseEstimatorContribution, Requirement, hookimpl
+from photonpano import LocatorContribution, PoseEstimatorContribution, Requirement, StreamInfo, hookimpl
 from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, PycolmapTwoViewConfig, StratifiedPoseConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from photonpano import StreamInfo
 
 _REQUIRES = (Requirement("pycolmap", "photonpano[colmap]"),)
 

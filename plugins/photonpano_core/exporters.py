@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import FinishedPanorama
-    from photonpano_core.configs import ExrConfig
+from photonpano import FinishedPanorama
+from photonpano_core.configs import ExrConfig
 
 _BLOCK_ROWS = 256
 _COMPRESSIONS = {"none": "NO_COMPRESSION", "zip": "ZIP_COMPRESSION", "zips": "ZIPS_COMPRESSION"}

@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 import photonpano_core as plugin
 from photonpano import (
+    Executor,
+    ExecutorContext,
     ExecutorContribution,
     ExporterContribution,
     InterpolatorContribution,
     MergerContribution,
     RefinerContribution,
+    Renderer,
     RendererContribution,
     Requirement,
+    Resampler,
     ResamplerContribution,
     SourceContribution,
+    StageContext,
+    StreamInfo,
     hookimpl,
 )
 from photonpano_core import configs
 from photonpano_core.resamplers import shortest_of, too_short
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from photonpano import Executor, ExecutorContext, Renderer, Resampler, StageContext, StreamInfo
 
 Grouped = TypeVar("Grouped", bound=configs.GroupedConfig)
 

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from photonpano import BoolArray, Homography
 from photonpano.geometry import translation
 from photonpano.locating import Follows, follows
 from photonpano_direct.alignment import buffers_of
-from photonpano_direct.moments import residuals_and_moments
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import BoolArray, Homography
-    from photonpano_direct.moments import Layer
-    from photonpano_direct.pyramid import Pyramid
+from photonpano_direct.moments import Layer, residuals_and_moments
+from photonpano_direct.pyramid import Pyramid
 
 JUDGED = 1  # layer on which parts are compared: coarse, so that noise and small errors of the motion do not matter
 _DIFFERENT = 0.5  # cap on the residual of a pixel in a search for shifts, relative to its usual one

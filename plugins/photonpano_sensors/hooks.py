@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 from photonpano import SourceContribution, hookimpl
 from photonpano_sensors.bin_files import SPAD512, SWISSSPAD_FULL, SWISSSPAD_HALF
@@ -11,9 +11,6 @@ from photonpano_sensors.mat_parts import MAT_PARTS
 from photonpano_sensors.spad512_sparse import SPAD512_SPARSE
 from photonpano_sensors.ubicept import UBICEPT_H5
 from photonpano_sensors.visionsim import VISIONSIM
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @hookimpl

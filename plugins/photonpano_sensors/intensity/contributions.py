@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import Annotated, Literal, Self
 
-from photonpano import Requirement, SourceContribution
+from pydantic import Field, model_validator
+
+from photonpano import Config, Requirement, SourceContribution, SpecPath
 from photonpano.reading import missing_file, objections
 from photonpano_sensors import intensity
 from photonpano_sensors.intensity.recognition import (
@@ -15,14 +18,6 @@ from photonpano_sensors.intensity.recognition import (
     recognise_video,
     refuse_mdat,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-from typing import Annotated, Literal, Self
-
-from pydantic import Field, model_validator
-
-from photonpano import Config, SpecPath
 
 Gamma = Annotated[float, Field(gt=0, le=10)]
 

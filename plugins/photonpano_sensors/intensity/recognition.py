@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from photonpano import InputError, Recognised
 from photonpano.reading import natural_order, read_start
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 PICTURES = (".png", ".tif", ".tiff")
 _CONTAINERS = (

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import InputError, SourceContext
-from photonpano_simulator.recording import delivered
+from photonpano import FloatArray, SourceContext
 from photonpano_simulator.source import SimulatedSource
 from photonpano_simulator.travel.paths import matrix_of, poses_of, require_free
 from photonpano_simulator.travel.rendering import View, atlas_of
@@ -22,9 +21,7 @@ class TravelSource(SimulatedSource):
 
     def __init__(self, config: TravelConfig, context: SourceContext) -> None:
         super().__init__(config, context)
-        stage, matrix = Stage(config), matrix_of(config)
-        poses = poses_of(config, stage.middle, self._seed)
-        require_free(poses, matrix, config.frame_shape, stage.planes, stage.free)
+        (stage, poses), matrix = placed(config, self._seed), matrix_of(config)
         scene = stage.drawn(context.threads)
         metered = View(scene.planes, atlas_of(scene.textures), matrix, config.frame_shape)
         frames = np.linspace(0, len(poses) - 1, _METERED).astype(int)
@@ -70,19 +67,9 @@ class TravelSource(SimulatedSource):
         return sharp_view(self._truth, frame)
 
 
-def problems_of(config: TravelConfig) -> list[str]:
-    """Return what is wrong with drops, repeats, or the path, without its tremor, which depends on the seed of the run."""
-    problems = []
-    try:
-        delivered(config.n_frames, config.drops, config.repeats)
-    except InputError as error:
-        problems.append(str(error))
-    still = config.model_copy(
-        update={"path": config.path.model_copy(update={"tremor": None}), "n_frames": min(config.n_frames, 5000)}
-    )
-    try:
-        stage = Stage(still)
-        require_free(poses_of(still, stage.middle, 0), matrix_of(still), still.frame_shape, stage.planes, stage.free)
-    except InputError as error:
-        problems.append(str(error))
-    return problems
+def placed(config: TravelConfig, seed: int) -> tuple[Stage, FloatArray]:
+    """Place the scene and the poses of all frames, (T, 3, 4); raises an `InputError` if they do not suit each other."""
+    stage = Stage(config)
+    poses = poses_of(config, stage.middle, seed)
+    require_free(poses, matrix_of(config), config.frame_shape, stage.planes, stage.free)
+    return stage, poses

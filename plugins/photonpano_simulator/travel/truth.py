@@ -22,6 +22,15 @@ from photonpano_simulator.lens import pixel_grid
 from photonpano_simulator.travel.planes import Planes, Scene, trace
 from photonpano_simulator.travel.rendering import View, atlas_of
 
+# Names of arrays in a truth file: the fields of `Planes`, and the others.
+_PLANES = {
+    "plane_corners": "corner",
+    "plane_along": "along",
+    "plane_down": "down",
+    "plane_velocities": "velocity",
+    "plane_is_disc": "is_disc",
+}
+_ARRAYS = ["camera_from_world", "camera_matrix", "frame_shape", "taken", "light", "textures", "texture_shapes", "texture_flux"]
 _SAME = 1e-6  # inverse depths that differ by less, relative to each other, are those of one point
 
 
@@ -51,11 +60,7 @@ class TravelTruth:
             "frame_shape": np.array(self.frame_shape),
             "taken": self.taken,
             "light": self.light,
-            "plane_corners": planes.corner,
-            "plane_along": planes.along,
-            "plane_down": planes.down,
-            "plane_velocities": planes.velocity,
-            "plane_is_disc": planes.is_disc,
+            **{name: getattr(planes, field) for name, field in _PLANES.items()},
             "textures": np.concatenate([each.ravel() for each in textures]),
             "texture_shapes": np.array([each.shape for each in textures]),
             "texture_flux": np.array(self.flux),
@@ -81,18 +86,7 @@ def read_truth(path: Path | str) -> TravelTruth:
 
 def truth_of(arrays: Mapping[str, NDArray[Any]], name: str = "the truth") -> TravelTruth:
     """Return the truth from its arrays; raises an `InputError` if one is missing."""
-    wanted = (
-        "camera_from_world",
-        "camera_matrix",
-        "frame_shape",
-        "taken",
-        "light",
-        "textures",
-        "texture_shapes",
-        "texture_flux",
-    )
-    planes = ("plane_corners", "plane_along", "plane_down", "plane_velocities", "plane_is_disc")
-    missing = [each for each in (*wanted, *planes) if each not in arrays]
+    missing = [each for each in (*_ARRAYS, *_PLANES) if each not in arrays]
     if missing:
         why = "is the truth of a scene without depth" if "homographies" in arrays else "is no truth of travel-simulator"
         raise InputError(f"{name} {why}: it lacks {missing[0]}")
@@ -106,14 +100,14 @@ def truth_of(arrays: Mapping[str, NDArray[Any]], name: str = "the truth") -> Tra
         (height, width),
         arrays["taken"],
         arrays["light"],
-        Scene(Planes(*(arrays[each] for each in planes)), textures),
+        Scene(Planes(**{field: arrays[name] for name, field in _PLANES.items()}), textures),
         float(arrays["texture_flux"]),
     )
 
 
 def depth(truth: TravelTruth, frame: int) -> FloatArray:
     """Return the depth of what a frame shows at its pixel centres: (H, W), along the optical axis in m; inf for nothing."""
-    _, inverse_depth = _traced(truth, _require(truth, frame), _pixels(truth))
+    _, inverse_depth = _traced(truth, _require(truth, frame), pixel_grid(truth.frame_shape).reshape(-1, 2))
     with np.errstate(divide="ignore"):
         return np.asarray((1 / inverse_depth).reshape(truth.frame_shape))
 
@@ -121,7 +115,7 @@ def depth(truth: TravelTruth, frame: int) -> FloatArray:
 def flow(truth: TravelTruth, from_frame: int, to_frame: int) -> Flow:
     """Return where the points that a frame shows at its pixel centres are in another frame."""
     start, end = _require(truth, from_frame), _require(truth, to_frame)
-    pixels = _pixels(truth)
+    pixels = pixel_grid(truth.frame_shape).reshape(-1, 2)
     owner, inverse_depth = _traced(truth, start, pixels)
     shown = owner >= 0
     matrix, planes = truth.camera_matrix, truth.scene.planes
@@ -153,10 +147,6 @@ def _require(truth: TravelTruth, frame: int) -> int:
     if not 0 <= frame <= last:
         raise InputError(f"there is no frame {frame}; the capture has the frames 0 to {last}")
     return frame
-
-
-def _pixels(truth: TravelTruth) -> FloatArray:
-    return pixel_grid(truth.frame_shape).reshape(-1, 2)
 
 
 def _traced(truth: TravelTruth, frame: int, points: FloatArray) -> tuple[NDArray[np.int32], FloatArray]:
