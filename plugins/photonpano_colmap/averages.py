@@ -325,7 +325,7 @@ def _picture(exposure: VirtualExposure) -> tuple[NDArray[np.uint8], NDArray[np.u
 
 
 def _between(frames: FloatArray, instants: FloatArray, std: FloatArray, apart: FloatArray, located: BoolArray) -> FloatArray:
-    """Return the expected error of each frame: that of the poses, and what a spline between them misses; NaN if not located."""
+    """Return the expected error of each frame, from poses and interpolation between them; NaN if not located."""
     at_poses = np.interp(frames, instants, std)
     # Distances of poses from the spline through the others hold the noise of the poses as well.
     missed = max(0.0, float(np.mean(apart**2)) - 2 * float(np.mean(std**2))) if len(apart) else 0.0

@@ -1,4 +1,4 @@
-"""The expected errors of poses that bundle adjustment found: the covariance of cameras, with origin, axes and scale aligned.
+"""Expected errors of poses from bundle adjustment: the covariance of cameras with origin, axes and scale aligned.
 
 Convention:
     X_c = R (X - c) for the position c of a camera. A pose is perturbed by a rotation vector of its camera, exp(w) R, and by a

@@ -1,4 +1,4 @@
-"""Hooks: the components that this plugin offers."""
+"""Hooks of the plugin."""
 
 from __future__ import annotations
 

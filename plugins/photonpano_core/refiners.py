@@ -117,7 +117,7 @@ def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatAr
     """Filter one mode, (S,) steps in px, where the light goes out.
 
     The motion in the dark follows from that before and after, not from the steps, which vanish there once the trajectory is
-    right. So the wiggles of the trajectory, its motion beyond a smooth one, are part of what is filtered.
+    right. So the high-frequency part of the trajectory, `wiggles`, is added before filtering, and subtracted after.
     """
     size = min(WINDOW, len(steps))
     noise = variances + SYSTEMATIC_PX**2
@@ -126,7 +126,7 @@ def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatAr
 
 
 def _wiggles(trajectory: Trajectory, instants: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
-    """Return by which steps a trajectory differs from a smooth one: (S, 4), shift in px, roll in radians, and zoom."""
+    """Return the high-frequency part of a trajectory as steps: (S, 4), shift in px, roll in radians, and zoom."""
     homographies = trajectory.at(instants)
     middle = corners(frame_shape).mean(axis=0)
     points = transform_points(homographies, middle + np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0]]))

@@ -10,14 +10,10 @@ import numpy as np
 
 from photonpano import FloatArray, Homography, NotLocated
 from photonpano.geometry import corners, generators, slopes, unit_coordinates, why_implausible
-from photonpano.locating import NO_TEXTURE, PRIOR_STD, information_on_turn
+from photonpano.locating import NO_TEXTURE, information_on_turn
 from photonpano_direct import descent
-from photonpano_direct.curvature import information_of
+from photonpano_direct.curvature import Coordinates, information_of
 from photonpano_direct.moments import Buffers, Layer
-
-# (8, 8) inverse covariance of p1..p8 in unit coordinates: between two exposures a camera shifts the image by any amount, but
-# rolls by 1 or 2 degrees and changes the perspective by little.
-_PRIOR = np.diag(np.array([PRIOR_STD, PRIOR_STD, PRIOR_STD, PRIOR_STD, np.inf, np.inf, PRIOR_STD, PRIOR_STD]) ** -2.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,9 +56,7 @@ class Aligned:
             self.pixels,
             self.weights,
             noise_ratio,
-            _PRIOR,
-            np.array(generators(shape)),
-            _to_corners(shape),
+            _coordinates(shape),
         )
         if camera_matrix is not None and np.isfinite(std_px):
             information, std_px = information_on_turn(information, self.homography, camera_matrix, shape)
@@ -90,10 +84,8 @@ def align(
         fixed,
         homography,
         prior_mean,
-        _PRIOR,
-        np.array(unit_coordinates(shape)),
+        _coordinates(shape),
         basis,
-        _to_corners(shape),
         tolerance_px,
         max_steps,
         buffers,
@@ -108,10 +100,10 @@ def align(
 
 
 @cache
-def _to_corners(shape: tuple[int, int]) -> FloatArray:
-    """Return the derivatives of the corners of an image with respect to p1..p8: (8, 8)."""
+def _coordinates(shape: tuple[int, int]) -> Coordinates:
     homogeneous = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
-    return np.ascontiguousarray(slopes(homogeneous, generators(shape) @ homogeneous))
+    to_corners = np.ascontiguousarray(slopes(homogeneous, generators(shape) @ homogeneous))
+    return Coordinates(np.array(unit_coordinates(shape)), np.array(generators(shape)), to_corners)
 
 
 _of_thread = local()

@@ -7,12 +7,14 @@ Parameters are p1..p8 in unit coordinates, which run from -1 to 1 along the long
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
-from photonpano.locating import MIN_COMMON_CURVATURE
+from photonpano.locating import MIN_COMMON_CURVATURE, PRIOR_STD
 from photonpano_direct.moments import Buffers, Layer, derivative_moments, differentiate
 from photonpano_direct.small_matrices import cholesky, dot, product, solve_lower, transposed
 
@@ -48,6 +50,19 @@ def _moments_of_products() -> FloatArray:
 # Coefficients of moments: (8, 9) of those of `residuals_and_moments` along x and y in the derivative by a parameter, and (64,
 # 75) of those of `derivative_moments` in the second derivative by two parameters.
 MOMENTS_X, MOMENTS_Y, _MOMENTS_OF_PRODUCTS = _X.reshape(8, 9), _Y.reshape(8, 9), _moments_of_products()
+
+
+# (8, 8) inverse covariance of p1..p8 in unit coordinates: between two exposures a camera shifts the image by any amount, but
+# rolls by 1 or 2 degrees and changes the perspective by little.
+PRIOR = np.diag(np.array([PRIOR_STD, PRIOR_STD, PRIOR_STD, PRIOR_STD, np.inf, np.inf, PRIOR_STD, PRIOR_STD]) ** -2.0)
+
+
+class Coordinates(NamedTuple):
+    """Unit coordinates of an image of some shape."""
+
+    unit: FloatArray  # (3, 3), pixels to unit coordinates
+    generators: FloatArray  # (8, 3, 3), see `photonpano.geometry.generators`
+    to_corners: FloatArray  # (8, 8), derivatives of the corners with respect to p1..p8, in px
 
 
 @compiled
@@ -121,22 +136,12 @@ def information_of(
     pixels: int,
     weights: float,
     noise_ratio: float,
-    prior: FloatArray,
-    generators: FloatArray,
-    to_corners: FloatArray,
+    coordinates: Coordinates,
 ) -> tuple[FloatArray, float]:
     """Return the inverse covariance of p1..p8, (8, 8), and the expected error of a corner in px, infinite without texture.
 
-    Args:
-        moving: the template.
-        buffers: residual and weight from `residuals_and_moments`; all are overwritten.
-        homography: (3, 3), pixels of the template to pixels of the fixed image.
-        pixels: number of pixels that both see.
-        weights: the sum of their weights.
-        noise_ratio: mean squared residual relative to that of photon noise.
-        prior: (8, 8) inverse covariance of the prior.
-        generators: (8, 3, 3), see `photonpano.geometry.generators`.
-        to_corners: (8, 8) derivatives of the corners of the template with respect to the parameters, in px.
+    Residual and weight of the buffers come from `residuals_and_moments`, and all are overwritten. `noise_ratio` is the mean
+    squared residual relative to that of photon noise.
     """
     _, hessian = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
     # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights and positions
@@ -148,17 +153,17 @@ def information_of(
             row[t] *= row[t] * per_pixel
     scatter, root = _hessian(moving.smoothed, moving.smoothed, buffers.weight), np.zeros((8, 8))
     if not cholesky(scatter, root):
-        return prior, np.inf
+        return PRIOR.copy(), np.inf
     solve_lower(root, hessian)
     information = product(transposed(hessian), hessian)
     for i in range(8):
         for j in range(8):
-            information[i, j] = information[i, j] / max(1.0, noise_ratio) + prior[i, j]
-    std_px = expected_px(information, np.eye(8), to_corners)
+            information[i, j] = information[i, j] / max(1.0, noise_ratio) + PRIOR[i, j]
+    std_px = expected_px(information, np.eye(8), coordinates.to_corners)
     # From steps in unit coordinates of the template to p1..p8 of the homography, with h33 = 1.
     to_parameters = np.empty((8, 8))
     for k in range(8):
-        changed = product(homography, generators[k])
+        changed = product(homography, coordinates.generators[k])
         for i in range(8):
             row_i, column_i = (i % 2, i // 2) if i < 6 else (2, i - 6)
             to_parameters[i, k] = changed[row_i, column_i] - homography[row_i, column_i] * changed[2, 2]

@@ -7,7 +7,7 @@ import numpy as np
 from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
 from photonpano.geometry import violation
-from photonpano_direct.curvature import MOMENTS_X, MOMENTS_Y, chance_level, curvatures, expected_px
+from photonpano_direct.curvature import MOMENTS_X, MOMENTS_Y, PRIOR, Coordinates, chance_level, curvatures, expected_px
 from photonpano_direct.moments import Buffers, Layer, residuals_and_moments
 from photonpano_direct.small_matrices import applied, dot, inverse_homography, product, scaled_to_one, solve, transposed
 
@@ -27,10 +27,8 @@ def descend(
     fixed: Layer,
     homography: Homography,
     prior_mean: Homography,
-    prior: FloatArray,
-    unit: Homography,
+    coordinates: Coordinates,
     basis: FloatArray,
-    to_corners: FloatArray,
     tolerance_px: float,
     max_steps: int,
     buffers: Buffers,
@@ -42,10 +40,8 @@ def descend(
         fixed: the other image.
         homography: (3, 3) initial map, pixels of the template to pixels of the fixed image.
         prior_mean: (3, 3) prior mean of the homography.
-        prior: (8, 8) inverse covariance of the prior, for small changes in unit coordinates of the template.
-        unit: (3, 3), pixels to unit coordinates.
+        coordinates: of the template.
         basis: (8, K) small changes in unit coordinates of the template that are estimated.
-        to_corners: (8, 8) derivatives of the corners of the template with respect to p1..p8, in px.
         tolerance_px: converged when the next step is expected to move no corner further.
         max_steps: step limit.
         buffers: filled by `residuals_and_moments` at the start of the last step.
@@ -55,6 +51,7 @@ def descend(
     """
     height, width = moving.image.shape
     half = max(height, width) / 2
+    unit = coordinates.unit
     from_unit, to_prior_mean = inverse_homography(unit), product(unit, inverse_homography(prior_mean))
     moments_x, moments_y = np.empty((3, 3)), np.empty((3, 3))
     own, hessian = np.zeros((8, 8)), np.zeros((8, 8))
@@ -71,10 +68,10 @@ def descend(
             own, hessian = curvatures(moving, buffers, 0.0, floor)
             for i in range(8):
                 for j in range(8):
-                    hessian[i, j] += prior[i, j]
-            std_px, hessian_is_current = expected_px(hessian, basis, to_corners), True
+                    hessian[i, j] += PRIOR[i, j]
+            std_px, hessian_is_current = expected_px(hessian, basis, coordinates.to_corners), True
         deviation = _parameters(product(product(to_prior_mean, homography), from_unit))
-        prior_gradient = applied(prior, deviation)
+        prior_gradient = applied(PRIOR, deviation)
         cost = (squares + dot(deviation, prior_gradient)) / pixels
         for k in range(8):
             image_gradient = dot(MOMENTS_X[k], moments_x.reshape(-1)) + dot(MOMENTS_Y[k], moments_y.reshape(-1))

@@ -1,4 +1,4 @@
-"""Restrict an alignment to the part of an image that follows one motion: that of the camera, and not that of an object."""
+"""Restrict an alignment to the part of an image that follows the motion of the camera, not that of an object."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ _AGAIN = "write it again with photonpano convert"
 
 
 class Attributes(BaseModel):
-    """What an array contains, so that it opens without further keys."""
+    """Description of the capture in an array, so that it opens without further keys."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -37,7 +37,7 @@ class _Named(BaseModel):
 
 
 class Metadata(BaseModel):
-    """An array of zarr version 3, as far as captures need it."""
+    """The metadata of an array of zarr version 3 that captures need."""
 
     zarr_format: Literal[3]
     node_type: Literal["array"]
@@ -47,7 +47,7 @@ class Metadata(BaseModel):
     chunk_key_encoding: _Named  # how the chunks are named
     fill_value: Any = 0
     codecs: tuple[_Named, ...]  # how the bytes of a chunk are stored, in the order of writing
-    attributes: dict[str, Any] = {}  # what its writer says about it
+    attributes: dict[str, Any] = {}  # added by the writer
 
     @property
     def chunk_shape(self) -> tuple[int, int, int]:

@@ -60,11 +60,11 @@ class PosedLevel:
     observations: Observations  # of these points, in the located exposures
     exposures: Sequence[PosedExposure]
     path: Path
-    tremor: Tremor | None  # what was found last before the exposures were located
+    tremor: Tremor | None  # the last one before the exposures were located
 
     @property
     def scene(self) -> Scene:
-        """What the next level begins with."""
+        """Path, located frames and points for the next level."""
         located = np.zeros(len(self.path.poses), np.bool_)
         for group, is_located in zip(self.groups, self.is_located, strict=True):
             located[group.span.start : group.span.stop] = is_located

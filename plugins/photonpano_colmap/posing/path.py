@@ -42,7 +42,7 @@ class PoseSpline:
 
 
 def left_out(instants: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far each inner pose is from the spline through the others: distances and angles in radians, (N - 2,) each."""
+    """Return leave-one-out errors of the spline at inner poses: distances and angles in radians, (N - 2,) each."""
     apart, angles = [], []
     for place in range(1, len(instants) - 1):
         others = np.delete(np.arange(len(instants)), place)

@@ -41,11 +41,11 @@ _LEAST_INFORMATION = 1e-2  # modes with a standard error above 10 px are unknown
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tremor:
-    """What the camera does faster than its path."""
+    """Motion of the camera at higher frequencies than its path."""
 
     rotations: FloatArray  # (T, 3) small rotation vectors of the camera at each frame
     std: FloatArray  # (T,) their noise, in radians
-    rms_px: float  # root mean square of what they move in the image
+    rms_px: float  # root mean square of the displacement in the image
     shift: float  # root mean square of the shifts within groups, which are not corrected, in units of the world
 
 
@@ -95,7 +95,7 @@ def _beyond_noise(shifts: FloatArray) -> float:
 
 
 class _Prediction(NamedTuple):
-    """What a frame of a group is expected to show, as its reference instant sees it."""
+    """Expected counts of a frame of a group, seen from its reference instant."""
 
     mean: NDArray[np.float32]  # (H, W) expected count of a frame
     slope_x: NDArray[np.float32]  # (H, W) its slope along x, divided by the variance of a frame; 0 where it is not known

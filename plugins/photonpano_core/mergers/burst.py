@@ -32,7 +32,7 @@ from photonpano_core.mergers.photon_mle import equal_spans, exposure_of, parts_o
 _DETAIL_PX = 1.0  # blur of blocks before they are compared, in px
 _LEVELS = 4  # levels of the pyramid, each of half the size of the one before
 _RADIUS = 4, 2  # search around the start, in px: at the coarsest level, and at each other
-_RESTS = 2.5  # a block rests if no patch agrees better elsewhere by this much, in units of the photon noise
+_RESTS = 2.5  # a block is static if no patch agrees better elsewhere by this much, in units of the photon noise
 _TOLERANCE = 8.0  # squared difference of a frequency that costs half of its weight, in units of its photon noise
 
 

@@ -23,10 +23,10 @@ from photonpano_core.mergers.photon_mle import exposure_of, exposure_shape, requ
 _NUMBERS = {33: 8.0, 17: 8.0, 9: 2.0, 5: 2.0, 3: 2.0}
 _USUAL = 17  # sub-exposures, at most, unless something moves fast
 _COMPARED = 9  # sub-exposures, at most, whose differences show what moves: fewer have more light each
-_SAMPLED = 16  # frames from which the light of a group is measured
-_AROUND_PX = 6  # surroundings of what moves that are merged along the field as well, in px of a frame
-_SWEPT_PX = 6.0  # way of an outline within a sub-exposure, in px of a frame, from which on more of them are weighted
-_MARGIN_PX = 32  # surroundings of these in which flow is estimated, in px of a frame
+_SAMPLED = 16  # frames that are sampled for the mean flux of a group
+_AROUND_PX = 6  # dilation of the moving pixels that are merged along the field, in px of a frame
+_SWEPT_PX = 6.0  # motion within a sub-exposure, in px of a frame, above which a group is divided into more of them
+_MARGIN_PX = 32  # margin around these in which flow is estimated, in px of a frame
 
 
 class LocalFlowMerger:

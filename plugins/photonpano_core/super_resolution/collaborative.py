@@ -94,20 +94,20 @@ def find_similar(image: NDArray[np.float32], patches: Patches) -> None:
 
 
 @compiled
-def _transformed(patch: NDArray[np.float32], matrix: NDArray[np.float32], room: NDArray[np.float32]) -> None:
+def _transformed(patch: NDArray[np.float32], matrix: NDArray[np.float32], scratch: NDArray[np.float32]) -> None:
     """Multiply a patch with a matrix from the left and with its transpose from the right, in place."""
     for i in range(PATCH):
         for j in range(PATCH):
-            room[i, j] = np.float32(0)
+            scratch[i, j] = np.float32(0)
         for k in range(PATCH):
-            weight, row, out = matrix[i, k], patch[k], room[i]
+            weight, row, out = matrix[i, k], patch[k], scratch[i]
             for j in range(PATCH):
                 out[j] += weight * row[j]
     for i in range(PATCH):
         for j in range(PATCH):
             patch[i, j] = np.float32(0)
         for k in range(PATCH):
-            weight, out = room[i, k], patch[i]
+            weight, out = scratch[i, k], patch[i]
             for j in range(PATCH):
                 out[j] += weight * matrix[j, k]
 
@@ -146,7 +146,7 @@ def filter_groups(
     rows, columns, found = patches
     stack = np.empty((GROUP, PATCH, PATCH), np.float32)
     flat = stack.reshape(GROUP, PATCH * PATCH)
-    room = np.empty((PATCH, PATCH), np.float32)
+    scratch = np.empty((PATCH, PATCH), np.float32)
     forth, back = _DCT, np.ascontiguousarray(_DCT.T)
     half = PATCH // 2
     for r in range(len(rows)):
@@ -157,7 +157,7 @@ def filter_groups(
                 for i in range(PATCH):
                     for j in range(PATCH):
                         stack[k, i, j] = image[y + i, x + j]
-                _transformed(stack[k], forth, room)
+                _transformed(stack[k], forth, scratch)
             _mixed(flat)
             sigma = noise[rows[r] + half, columns[c] + half]
             limit, kept = _THRESHOLD * sigma, 0
@@ -171,7 +171,7 @@ def filter_groups(
             _mixed(flat)
             weight = np.float32(1) / (np.float32(kept) * sigma * sigma)
             for k in range(GROUP):
-                _transformed(stack[k], back, room)
+                _transformed(stack[k], back, scratch)
                 y, x = places[k, 0], places[k, 1]
                 for i in range(PATCH):
                     for j in range(PATCH):

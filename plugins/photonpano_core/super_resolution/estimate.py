@@ -17,7 +17,7 @@ STRENGTHS = (4.0, 3.0, 2.25, 1.7, 1.27, 0.95)
 _STEPS = 6  # steps of expectation-maximisation in a round
 _MATCHED_ROUNDS = 3  # rounds for which similar patches are looked for once
 _FEWEST_FRAMES = 0.25  # frames of a cell, smoothed, below which its noise grows no more
-_KEPT_PX = 8.0  # denoising keeps the photons of surroundings of this width, the standard deviation of a Gaussian
+_KEPT_PX = 8.0  # standard deviation of the Gaussian over which denoising preserves the mean flux
 _DARKEST = 1e-5  # the flux stays above this share of its mean: expectation-maximisation cannot leave 0
 _BRIGHTEST = 1.55  # largest value on the stabilised scale, below pi / 2: a flux of 7.7 photons per frame
 
@@ -96,17 +96,17 @@ def rounds_of(observed: Observations, n_rounds: int) -> list[FluxImage]:
     """
     seen = observed.weight()
     noise = 0.5 / np.sqrt(np.maximum(cv2.blur(seen, (PATCH, PATCH)), _FEWEST_FRAMES))
-    flux = _started(observed)
+    flux = _initial_flux(observed)
     floor = np.float32(_DARKEST * max(float(flux.mean()), 1e-9))
     patches, results = Patches.over(flux.shape), []
     for number, strength in enumerate(STRENGTHS[:n_rounds]):
-        flux = _likelier(flux, seen, floor, observed)
+        flux = _em_steps(flux, seen, floor, observed)
         stabilised = _stabilised(flux, observed.binary)
         if number % _MATCHED_ROUNDS == 0:
             find_similar(stabilised, patches)
         total, weights = np.zeros_like(flux), np.zeros_like(flux)
         filter_groups(stabilised, np.asarray(strength * noise, np.float32), patches, total, weights)
-        flux = _as_bright(np.maximum(_flux_of(total / weights, observed.binary), floor), flux)
+        flux = _mean_preserved(np.maximum(_flux_of(total / weights, observed.binary), floor), flux)
         results.append(flux)
     return results
 
@@ -117,19 +117,19 @@ def _averaged(image: FluxImage, observed: Observations) -> FluxImage:
     return found
 
 
-def _likelier(flux: FluxImage, seen: FluxImage, floor: np.float32, observed: Observations) -> FluxImage:
-    mean, ratio, room = np.empty_like(flux), np.empty_like(flux), np.empty_like(flux)
+def _em_steps(flux: FluxImage, seen: FluxImage, floor: np.float32, observed: Observations) -> FluxImage:
+    mean, ratio, scratch = np.empty_like(flux), np.empty_like(flux), np.empty_like(flux)
     known = seen > 1e-3 * max(float(seen.max()), 1e-9)
     per_frame = np.divide(1, seen, out=np.zeros_like(seen), where=known)
     for _ in range(_STEPS):
-        expected(flux, observed.kernel, room, mean)
+        expected(flux, observed.kernel, scratch, mean)
         observed.photon_ratio(mean, ratio)
-        expected(ratio, observed.kernel, room, mean)
+        expected(ratio, observed.kernel, scratch, mean)
         flux = np.maximum(np.where(known, flux * mean * per_frame, flux), floor)
     return flux
 
 
-def _started(observed: Observations) -> FluxImage:
+def _initial_flux(observed: Observations) -> FluxImage:
     """Return the flux of smoothed sums; where nothing was seen, that of the surroundings."""
     sigma = 0.25 * len(observed.kernel)
     lit = cv2.GaussianBlur(observed.lit, (0, 0), sigma) + 1e-3 * cv2.GaussianBlur(observed.lit, (0, 0), 8 * sigma)
@@ -143,7 +143,7 @@ def _started(observed: Observations) -> FluxImage:
     return np.asarray(-np.log1p(-lit_share) / gain, np.float32)
 
 
-def _as_bright(flux: FluxImage, before: FluxImage) -> FluxImage:
+def _mean_preserved(flux: FluxImage, before: FluxImage) -> FluxImage:
     """Return flux as bright as before, on average around each pixel: denoising on the stabilised scale lowers the mean."""
     wanted, found = (cv2.GaussianBlur(each, (0, 0), _KEPT_PX) for each in (before, flux))
     return np.asarray(flux * (wanted / found), np.float32)

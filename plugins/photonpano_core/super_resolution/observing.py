@@ -54,17 +54,17 @@ def add_observations(
 
 @compiled
 def expected(
-    flux: NDArray[np.float32], kernel: NDArray[np.float32], room: NDArray[np.float32], into: NDArray[np.float32]
+    flux: NDArray[np.float32], kernel: NDArray[np.float32], scratch: NDArray[np.float32], into: NDArray[np.float32]
 ) -> None:
     """Average the flux, (H, W), over the areas of pixels that are centred at each cell; the border is repeated.
 
-    `kernel` (2 r + 1,) are symmetric weights along x and y with the sum 1, so that this is its own adjoint; `room` is
+    `kernel` (2 r + 1,) are symmetric weights along x and y with the sum 1, so that this is its own adjoint; `scratch` is
     overwritten.
     """
     height, width = flux.shape
     radius = len(kernel) // 2
     for y in range(height):
-        row, out = flux[y], room[y]
+        row, out = flux[y], scratch[y]
         for x in range(width):
             if radius <= x < width - radius:
                 continue
@@ -84,7 +84,7 @@ def expected(
         for x in range(width):
             out[x] = np.float32(0)
         for i in range(-radius, radius + 1):
-            weight, part = kernel[i + radius], room[min(max(y + i, 0), height - 1)]
+            weight, part = kernel[i + radius], scratch[min(max(y + i, 0), height - 1)]
             for x in range(width):
                 out[x] += weight * part[x]
 

@@ -32,16 +32,16 @@ _PROBE_PX = 160  # side of the squares on which frames are held out, without the
 _PROBES = (0.25, 0.5, 0.75)  # where these squares lie: in the middles of the frames at these shares of the span
 _HELD_OUT = 8  # one chunk of frames in 8 is held out
 _FEWEST_FRAMES = 1.0  # pixels that fewer frames saw are unknown
-_GATHERING = 5  # one part in 5 of the time is spent on sorting photons, about
-# The first round that reaches this share of the largest gain is the last: the area of pixels hides the noise of fine detail
-# from frames held out, so that the most likely round is a noisy one.
+_GATHERING = 5  # sorting photons takes about one fifth of the time
+# The first round that reaches this fraction of the largest gain is the last: the blur by the area of pixels hides noise of fine
+# detail from held-out frames, so that the most likely round is a noisy one.
 _ENOUGH = 0.93
 _SIGNIFICANT = 2.0  # held-out frames show detail if they are likelier with it than without by this many standard errors
 
 
 @dataclass(frozen=True, slots=True)
 class _Chosen:
-    """What frames held out have shown for a motion: the number of rounds."""
+    """The number of rounds that held-out frames support for a motion."""
 
     trajectory: Trajectory
     span: FrameSpan
@@ -186,7 +186,7 @@ class SuperResolutionRenderer:
 
 
 class _Shares:
-    """Turns shares of the work into whole frames for `advance`."""
+    """Reports fractions of the work to `advance` as whole frames."""
 
     def __init__(self, advance: Callable[[int], None], n_frames: int) -> None:
         self._advance, self._n_frames = advance, n_frames

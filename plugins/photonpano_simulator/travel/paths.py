@@ -17,7 +17,7 @@ from photonpano_simulator.travel.planes import Planes, trace
 from photonpano_simulator.travel_config import TravelConfig, TravelPath
 
 _CHECKED = 2000  # frames at which a path is checked, at most
-_LOOKED = 60  # frames of which it is checked that they see the scene everywhere, at most
+_LOOKED = 60  # largest number of frames that are checked for rays that miss the scene
 _GRID = 9  # points along each side of such a frame
 _REACH = (1.0, 0.45, 0.6)  # how far a random path reaches along x, y and z, relative to each other
 

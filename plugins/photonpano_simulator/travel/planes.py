@@ -1,4 +1,4 @@
-"""Rectangles in space, and what lies on the ray of a pixel.
+"""Rectangles in space, and casting of rays on them.
 
 Convention:
     Points of the world are (x, y, z) in m: x right, y down, z ahead. A pose (3, 4) maps them to points of the camera,

@@ -22,8 +22,8 @@ from photonpano_simulator.travel.planes import Planes
 _PARTS = 4  # parts of a pixel along each axis, for the edges of planes
 _SAMPLES = 16  # samples of a texture along the longer axis of the area of a pixel, at most
 _LEVELS = 16  # levels of a texture, at most: each has half the size of the one before
-_STRETCH = 0.3  # by how much the area of a sample may be longer than wide
-_BLOCK = 16  # pixels of a row that are averaged in the same way
+_STRETCH = 0.3  # largest aspect ratio of the area of a sample, less 1
+_BLOCK = 16  # pixels of a row that share the level and the steps of their samples
 _SMALLEST = 1e-9  # inverse depth of the furthest point that is seen, in 1 / m
 
 
@@ -59,7 +59,7 @@ def atlas_of(textures: tuple[NDArray[np.float16], ...], gain: float = 1.0) -> At
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What renders the frames of one camera."""
+    """Renders the frames of one camera."""
 
     planes: Planes
     atlas: Atlas  # their flux

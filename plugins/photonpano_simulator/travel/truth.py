@@ -31,7 +31,7 @@ _PLANES = {
     "plane_is_disc": "is_disc",
 }
 _ARRAYS = ["camera_from_world", "camera_matrix", "frame_shape", "taken", "light", "textures", "texture_shapes", "texture_flux"]
-_SAME = 1e-6  # inverse depths that differ by less, relative to each other, are those of one point
+_SAME = 1e-6  # relative difference below which two inverse depths are of the same point
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class TravelTruth:
 
     @cached_property
     def view(self) -> View:
-        """What renders frames."""
+        """The renderer of frames."""
         return View(self.scene.planes, atlas_of(self.scene.textures, self.flux), self.camera_matrix, self.frame_shape)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:

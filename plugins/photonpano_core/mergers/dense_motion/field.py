@@ -14,7 +14,7 @@ from photonpano.compiling import compiled
 
 Image = NDArray[np.float32]
 
-_STEPS = 8  # straight lines by which a path is measured
+_STEPS = 8  # line segments that approximate the path of a pixel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +41,7 @@ class MotionField:
 
     @property
     def way_px(self) -> Image:
-        """How far each pixel moves in a unit of time, on average over two: (H, W), in px of the grid."""
+        """Length of the path of each pixel per unit of time, from -1 to 1: (H, W), in px of the grid."""
         places = [self.at(elapsed) for elapsed in np.linspace(-1, 1, _STEPS + 1)]
         ways = (after - before for before, after in pairwise(places))
         return np.asarray(sum(np.sqrt(way[..., 0] ** 2 + way[..., 1] ** 2) for way in ways) / 2, np.float32)

@@ -18,15 +18,15 @@ from photonpano_core.mergers.dense_motion.sub_exposures import SCALE, SubExposur
 _DETAIL_PX = 1.2  # blur of sub-exposures before they are compared: the finest detail that is seen, in px of a frame
 _WINDOW_PX = 2.0  # standard deviation of the window over which differences are summed up, in px of a frame
 _SMALLEST_PX = 16  # fewer connected pixels, of a frame, are a false alarm: less than the window
-_WEAKER = 0.6  # share of the threshold from which on a pixel moves if it is connected with one that exceeds the threshold
+_WEAKER = 0.6  # hysteresis: fraction of the threshold above which pixels connected with a moving one move, too
 # Radius of the disc by which gaps are closed, in px of a frame: where texture is missing, nothing shows that it moves.
 _GAP_PX = 6
 _FEWEST = 0.5  # fewest degrees of freedom, on average over the window, of a pixel that is tested
 # The same two for differences from the reference, by which sub-exposures are weighted.
 _WEIGHTED_DETAIL_PX, _WEIGHTED_WINDOW_PX = 0.9, 1.2
 _TOLERATED = 1.5  # squared difference, in units of the photon noise, that costs no weight
-_EXPLAINED = 0.8  # share of the frames that must agree, or other motions are tried
-_MOVES_PX = 1.0  # motion within a group that a neighbour takes over, in px of a frame
+_EXPLAINED = 0.8  # fraction of the frames that must agree, or other motions are tried
+_MOVES_PX = 1.0  # minimum motion within a group that is propagated to neighbours, in px of a frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +100,7 @@ class Weighted:
     explained: Image  # (H, W), share of the frames of a pixel that remain
 
     def improved(self, other: Weighted, where: BoolArray) -> Weighted:
-        """Return what takes, within `where`, each pixel from the one that explains more frames."""
+        """Return, within `where`, the motion and weights of the one that explains more frames of a pixel."""
         better = where & (other.explained > self.explained)
         return Weighted(
             MotionField(np.where(better[..., None], other.field.coefficients, self.field.coefficients)),

@@ -21,11 +21,11 @@ from photonpano_core.mergers.photon_mle import equal_spans, parts_of, to_exposur
 
 SCALE = 0.5  # pixels of the grid per pixel of a frame
 _TOLERANCE_PX = 1.5  # motion within which frames are summed before they are warped, in px of a frame
-_PLACES = 5  # places along an axis, about, at which the blur of interpolation is looked at
+_PLACES = 5  # about how many samples along an axis give the mean blur of interpolation
 _CACHE_BYTES = 64 * 1024**2  # memory for halved sums of frames, which are warped again in each round
-# Largest displacement, by uneven weights, of what a smoothed pixel shows, in px of a frame; less at a smaller scale.
+# Largest shift of the centroid of a smoothed pixel by uneven weights, in px of a frame; less at a smaller scale.
 _SHIFT_PX = 0.2
-_MOST = 95.0  # percentile of the speeds of a field by which frames are summed
+_MOST = 95.0  # percentile of the speeds of a field that limits how many frames are summed before they are warped
 _SAMPLED = 3  # step, along each axis, of the pixels whose speeds are compared
 _REACH = 4  # standard deviations at which a Gaussian ends
 _SEEN = 0.1  # a pixel is seen by a sub-exposure if this share of its frames, smoothed, shows it
@@ -137,7 +137,7 @@ class SubExposures:
 
     @staticmethod
     def fastest_px(field: MotionField, where: BoolArray) -> float:
-        """Return the speed of nearly the fastest pixels, of some (H, W), in px of a frame per unit of time."""
+        """Return the 95th percentile of the speeds of some pixels, (H, W), in px of a frame per unit of time."""
         step = _SAMPLED if where[::_SAMPLED, ::_SAMPLED].any() else 1
         sample = MotionField(field.coefficients[:, ::step, ::step])
         return float(np.percentile(sample.way_px[where[::step, ::step]], _MOST)) / SCALE
