@@ -29,7 +29,7 @@ from photonpano import (
 )
 from photonpano.geometry import Camera, camera_matrix
 from photonpano.locating import blur_against_noise, stabilised_8_bit
-from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig
+from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, counted, too_few_averages
 from photonpano_colmap.pose_noise import PoseNoise, pose_noise
 from photonpano_colmap.posing.merging import lit_counts
 from photonpano_colmap.posing.path import PoseSpline, left_out, positions_of
@@ -50,6 +50,7 @@ _FOCAL_SHARE = 0.02  # relative standard error of an estimated focal length abov
 _FOCAL_BIAS = 0.01
 _PLANE = 0.01  # points lie in a plane if their smallest extent is below this fraction of the largest
 _SHOWN_PIECES = 4
+_MISSED_SHARE = 0.5  # interpolation error of the spline, as a fraction of the variance of leave-one-out errors
 
 
 class AveragesEstimator:
@@ -92,11 +93,8 @@ class AveragesEstimator:
         else:
             starts = list(range(0, n_frames - size + 1, self._config.step))
         spans = [FrameSpan(start, start + size) for start in starts if n_frames >= size]
-        if len(spans) < MIN_AVERAGES:
-            raise LocationError(
-                f"{n_frames} frames are {len(spans)} averages of {size}; at least {MIN_AVERAGES} are needed: choose a smaller "
-                "pose.with.group_size, or record longer"
-            )
+        if problem := too_few_averages(n_frames, len(spans), size):
+            raise LocationError(problem)
         return spans
 
     def _chosen(self, found: Reconstruction, spans: Sequence[FrameSpan]) -> Piece:
@@ -221,7 +219,7 @@ class _Assembly:
                 reason = f"their averages belong to piece {others[elsewhere[0]]}, which is not connected to the largest"
             elif inside:
                 matches = int(self.found.n_matches[inside].max())
-                reason = f"COLMAP found no pose for {_counted(inside)}, with at most {matches} matching keypoints"
+                reason = f"COLMAP found no pose for {counted(len(inside))}, with at most {matches} matching keypoints"
             else:
                 reason = "they are fewer than an average"
             lost.append(LostFrames(FrameSpan(start, stop), reason))
@@ -332,10 +330,6 @@ def _between(frames: FloatArray, instants: FloatArray, std: FloatArray, apart: F
     return np.where(located, np.sqrt(at_poses**2 + _MISSED_SHARE * missed), np.nan)
 
 
-# Interpolation error of the spline between poses, as a fraction of the variance of leave-one-out errors.
-_MISSED_SHARE = 0.5
-
-
 def _require_texture(found: Reconstruction) -> None:
     keypoints, matches = (float(np.median(each)) for each in (found.n_keypoints, found.n_matches))
     if keypoints < _TEXTURE[0] or matches < _TEXTURE[1]:
@@ -352,7 +346,3 @@ def _described(piece: Piece, spans: Sequence[FrameSpan]) -> str:
     named = " and ".join(f"{spans[run[0]].start} to {spans[run[-1]].stop - 1}" for run in runs[:3])
     more = f" and {len(runs) - 3} more spans" if len(runs) > 3 else ""
     return f"frames {named}{more} ({len(images)} averages)"
-
-
-def _counted(numbers: Sequence[int]) -> str:
-    return "1 average" if len(numbers) == 1 else f"{len(numbers)} averages"

@@ -154,15 +154,10 @@ def _decoder(array: Location, name: str, configuration: dict[str, Any]) -> Any:
     if name == "gzip":
         return lambda data: zlib.decompress(data, wbits=31)
     if name == "crc32c":
-        return _without_checksum
+        return lambda data: memoryview(data)[:-4]  # without the checksum, which no small library computes
     library("numcodecs", "photonpano[zarr]", f"{array}, compressed with {name},")
     import numcodecs.blosc
     import numcodecs.zstd
 
     del configuration  # the compressed data contain it
     return numcodecs.blosc.Blosc().decode if name == "blosc" else numcodecs.zstd.Zstd().decode
-
-
-def _without_checksum(data: Any) -> Any:
-    """Return data without the four bytes of their checksum, which no small library computes."""
-    return memoryview(data)[:-4]

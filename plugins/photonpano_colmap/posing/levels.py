@@ -133,7 +133,9 @@ def locate(
         found = [
             (other, find_patches(patches, (here, views[key]), (exposures[other], views[other]), camera_matrix))
             for other in range(number)
-            if other != key and _near(key, other) and _overlap(here, exposures[other], camera_matrix)
+            if other != key
+            and (abs(other - key) <= _NEIGHBOURS or (other - key) % _FURTHER == 0)
+            and _overlap(here, exposures[other], camera_matrix)
         ]
         rays = np.concatenate([patches.pixels, np.ones((len(patches.pixels), 1))], axis=1) @ np.linalg.inv(camera_matrix).T
         return (rays / patches.inverse_depth[:, :1] - here.pose[:, 3]) @ here.pose[:, :3], found
@@ -186,10 +188,6 @@ def _borders(groups: Sequence[Group]) -> FloatArray:
     """Return where groups begin and end in time, in frames; where some are left out between them, halfway."""
     between = [(before.span.stop + after.span.start - 1) / 2 for before, after in pairwise(groups)]
     return np.array([groups[0].span.start - 0.5, *between, groups[-1].span.stop - 0.5])
-
-
-def _near(key: int, other: int) -> bool:
-    return abs(other - key) <= _NEIGHBOURS or (other - key) % _FURTHER == 0
 
 
 def _overlap(here: PosedExposure, there: PosedExposure, camera_matrix: FloatArray) -> bool:

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Iterable
 from pathlib import Path
 from threading import Lock
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -40,26 +40,11 @@ class _Form(NamedTuple):
         return f"{self.height}x{self.width} pixels of {self.bits} bits"
 
 
-class _Pictures(Protocol):
-    """Frames that are pictures."""
-
-    n_frames: int
-    form: _Form  # size and bits of each
-
-    def read(self, index: int) -> Image:
-        """Return a frame: (H, W)."""
-        ...
-
-    def close(self) -> None:
-        """Close files."""
-        ...
-
-
 class ImageFolderSource(IntensitySource):
     """Pictures of grey levels of 8 or 16 bits, all of one size; anything else raises an `InputError`."""
 
     def __init__(self, config: ImageFolderConfig) -> None:
-        self._pictures: _Pictures = _Folder(config.path) if config.path.is_dir() else _Pages(config.path)
+        self._pictures: _Folder | _Pages = _Folder(config.path) if config.path.is_dir() else _Pages(config.path)
         form = self._pictures.form
         shape = self._pictures.n_frames, form.height, form.width
         super().__init__(config, shape, None, Encoding.full(form.bits))

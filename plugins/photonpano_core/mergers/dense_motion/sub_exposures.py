@@ -11,7 +11,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from photonpano import BoolArray, FloatArray, FrameSpan, Group, Response, Source, Trajectory
+from photonpano import BoolArray, FloatArray, Group, Response, Source, Trajectory
 from photonpano.geometry import inverse, rescaling, transform_points, translation
 from photonpano.merging import Chunk, PhotonSum, chunks_of, clipped, divided
 from photonpano_core.mergers.dense_motion.field import Image, MotionField
@@ -74,7 +74,7 @@ class SubExposures:
         self._onto = to_exposure(group, trajectory, SCALE)
         height, width = source.info.frame_shape
         self.shape, self.response = (height // 2, width // 2), source.response
-        self._halved = lru_cache(max(1, _CACHE_BYTES // (height * width)))(self._summed)
+        self._halved = lru_cache(max(1, _CACHE_BYTES // (height * width)))(lambda span: halved(self._frames(span)))
         self._chunks = chunks_of(group.span, trajectory, source.info.frame_shape, _TOLERANCE_PX)
         self._trusted = np.ones(self.shape, np.float32)
         self._divide(n)
@@ -165,9 +165,6 @@ class SubExposures:
     def _to_image(self, homographies: FloatArray) -> FloatArray:
         """Return the maps of pixels of the grid to halved frames."""
         return rescaling(SCALE) @ inverse(self._onto @ homographies)
-
-    def _summed(self, span: FrameSpan) -> Image:
-        return halved(self._frames(span))
 
 
 def halved(image: Image) -> Image:
