@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import FloatArray, FluxImage
+from photonpano.compiling import compiled
 from photonpano.merging import LitFrames
 from photonpano_core.super_resolution.collaborative import PATCH, Patches, filter_groups, find_similar
-from photonpano_core.super_resolution.observing import counts_in_light, expected, log_likelihood, photon_ratio
 
 # Noise that each round removes, in standard deviations of the photon noise of a cell: details come in from round to round.
 STRENGTHS = (4.0, 3.0, 2.25, 1.7, 1.27, 0.95)
@@ -171,3 +172,106 @@ def gain_of(better: FluxImage, worse: FluxImage) -> tuple[float, float]:
     """Return the sum of the differences of two log-likelihoods, cell by cell, and its standard error."""
     apart: FloatArray = better.astype(np.float64) - worse
     return float(apart.sum()), float(np.sqrt((apart**2).sum()))
+
+
+@compiled
+def expected(
+    flux: NDArray[np.float32], kernel: NDArray[np.float32], scratch: NDArray[np.float32], into: NDArray[np.float32]
+) -> None:
+    """Average the flux, (H, W), over the areas of pixels that are centred at each cell; the border is repeated.
+
+    `kernel` (2 r + 1,) are symmetric weights along x and y with the sum 1, so that this is its own adjoint; `scratch` is
+    overwritten.
+    """
+    height, width = flux.shape
+    radius = len(kernel) // 2
+    for y in range(height):
+        row, out = flux[y], scratch[y]
+        for x in range(width):
+            if radius <= x < width - radius:
+                continue
+            total = np.float32(0)
+            for i in range(-radius, radius + 1):
+                total += kernel[i + radius] * row[min(max(x + i, 0), width - 1)]
+            out[x] = total
+        inner = out[radius : width - radius]
+        for t in range(len(inner)):
+            inner[t] = np.float32(0)
+        for i in range(2 * radius + 1):
+            weight, part = kernel[i], row[i : i + len(inner)]
+            for t in range(len(inner)):
+                inner[t] += weight * part[t]
+    for y in range(height):
+        out = into[y]
+        for x in range(width):
+            out[x] = np.float32(0)
+        for i in range(-radius, radius + 1):
+            weight, part = kernel[i + radius], scratch[min(max(y + i, 0), height - 1)]
+            for x in range(width):
+                out[x] += weight * part[x]
+
+
+@compiled
+def _lit_share(light: np.float32) -> np.float32:
+    """Return `1 - exp(-light)`, exact in float32 for a faint light too."""
+    half = np.float32(0.5)
+    return light - half * light * light if light < np.float32(2e-3) else np.float32(1) - np.exp(-light)
+
+
+@compiled
+def photon_ratio(
+    lit: NDArray[np.float32], seen: NDArray[np.float32], mean: NDArray[np.float32], binary: bool, into: NDArray[np.float32]
+) -> None:
+    """Write `k / (1 - exp(-mean))` of the counts k of each cell, (H, W), or k / mean of counts that are not binary."""
+    least = np.float32(1e-9)
+    for y in range(lit.shape[0]):
+        k, n, m, out = lit[y], seen[y], mean[y], into[y]
+        for x in range(len(k)):
+            light = max(m[x], least)
+            if k[x] <= 0 or n[x] <= 0:
+                out[x] = np.float32(0)
+            elif binary:
+                out[x] = k[x] / _lit_share(light)
+            else:
+                out[x] = k[x] / light
+
+
+@compiled
+def log_likelihood(
+    lit: NDArray[np.float32], seen: NDArray[np.float32], mean: NDArray[np.float32], binary: bool, into: NDArray[np.float32]
+) -> None:
+    """Return the log-likelihood of the counts of each cell, but for a constant: see `photon_ratio` for the arguments."""
+    least = np.float32(1e-9)
+    for y in range(lit.shape[0]):
+        k, n, m, out = lit[y], seen[y], mean[y], into[y]
+        for x in range(len(k)):
+            light = max(m[x], least)
+            if n[x] <= 0:
+                out[x] = np.float32(0)
+            elif binary:
+                out[x] = k[x] * np.log(_lit_share(light)) - (n[x] - k[x]) * light
+            else:
+                out[x] = k[x] * np.log(light) - n[x] * light
+
+
+@compiled
+def counts_in_light(
+    mean: NDArray[np.float32],
+    frames: NDArray[np.float32],
+    gains: NDArray[np.float32],
+    lit: NDArray[np.float32],
+    dark: NDArray[np.float32],
+) -> None:
+    """Write the expected frames of each cell with and without photons in changing light, (H, W), from the mean flux.
+
+    `frames` and `gains` are (C, H, W): the frames of each class of light, and the sums of their gains.
+    """
+    for y in range(mean.shape[0]):
+        for x in range(mean.shape[1]):
+            lit[y, x] = dark[y, x] = np.float32(0)
+            for c in range(len(frames)):
+                n = frames[c, y, x]
+                if n > 0:
+                    share = _lit_share(gains[c, y, x] / n * mean[y, x])
+                    lit[y, x] += n * share
+                    dark[y, x] += n * (np.float32(1) - share)

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from photonpano import FrameSpan, InputError
 from photonpano.compiling import compiled
 from photonpano.reading import OpenFiles, missing_file, reading
-from photonpano_sensors.intensity.contributions import FastcamMrawConfig
-from photonpano_sensors.intensity.recognition import header_beside, mraw_beside, refuse_mdat
+from photonpano_sensors.intensity.contributions import FastcamMrawConfig, header_beside, mraw_beside, refuse_mdat
 from photonpano_sensors.intensity.source import Encoding, IntensitySource, Levels
 
 _MOST_BYTES = 4 * 1024**2  # headers have a few kB; larger files are something else

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError
 from photonpano.reading import look_first, read_picture, reading, require_readable
-from photonpano_sensors.intensity.contributions import ImageFolderConfig
-from photonpano_sensors.intensity.recognition import pictures_in
+from photonpano_sensors.intensity.contributions import ImageFolderConfig, pictures_in
 from photonpano_sensors.intensity.source import Encoding, IntensitySource, Levels
 from photonpano_sensors.looks import spread
 

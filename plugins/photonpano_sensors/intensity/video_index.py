@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.reading import look_first, missing_file, reading
-from photonpano_sensors.intensity.recognition import refuse_mdat
+from photonpano_sensors.intensity.contributions import refuse_mdat
 from photonpano_sensors.intensity.source import Encoding
 
 _LUMA_FIRST = re.compile(r"(gray|yuvj?a?4\d\dp|nv\d\d)(\d+le)?")  # pixel formats whose first plane is the luma

@@ -12,8 +12,7 @@ from photonpano.lighting import in_light
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource
 from photonpano_core.configs import BurstConfig, PhotonMleConfig
-from photonpano_core.mergers.burst import BurstMerger, aligned, at_instant, wiener_mean
-from photonpano_core.mergers.dense_motion.patches import PatchGrid
+from photonpano_core.mergers.burst import BurstMerger, PatchGrid, aligned, at_instant, wiener_mean
 from photonpano_core.mergers.photon_mle import PhotonMleMerger
 
 N, HEIGHT, WIDTH = 200, 72, 100
