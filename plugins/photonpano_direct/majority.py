@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano import BoolArray, Homography
 from photonpano.geometry import translation
 from photonpano.locating import Follows, follows
 from photonpano_direct.alignment import buffers_of
-from photonpano_direct.moments import Layer, residuals_and_moments
+from photonpano_direct.moments import Image, Layer, residuals_and_moments
 from photonpano_direct.pyramid import Pyramid
 
 JUDGED = 1  # layer on which parts are compared: coarse, so that noise and small errors of the motion do not matter
@@ -69,7 +68,7 @@ def shifts_between(moving: Layer, fixed: Layer) -> list[Homography]:
 def masked(pyramid: Pyramid, part: BoolArray) -> Pyramid:
     """Return a pyramid of which only a part is used, given on any of its layers."""
 
-    def limited(weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    def limited(weight: Image) -> Image:
         size = weight.shape[1], weight.shape[0]
         return weight * cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
 
@@ -77,5 +76,5 @@ def masked(pyramid: Pyramid, part: BoolArray) -> Pyramid:
     return pyramid._replace(layers=layers, details=pyramid.details._replace(weight=limited(pyramid.details.weight)))
 
 
-def _blur(image: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+def _blur(image: Image, side: int) -> Image:
     return np.asarray(cv2.blur(image, (side, side)), np.float32)

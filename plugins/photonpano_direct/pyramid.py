@@ -7,14 +7,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano import FloatArray, Homography, VirtualExposure
 from photonpano.compiling import compiled
 from photonpano.geometry import run_from, sample_run, visible_columns
 from photonpano.locating import SMALLEST_SIDE, View, view_pyramid
 from photonpano.photometry import Similarity, autocorrelation, similarity_of, without_local_mean
-from photonpano_direct.moments import Layer, differentiate
+from photonpano_direct.moments import Image, Layer, differentiate
 
 _COMPARED = 2  # layer on which aligned images are compared: coarse, so that noise and motion blur hardly matter
 
@@ -22,8 +21,8 @@ _COMPARED = 2  # layer on which aligned images are compared: coarse, so that noi
 class Details(NamedTuple):
     """A layer without its local mean."""
 
-    image: NDArray[np.float32]  # (H, W), the layer without its local mean; 0 at masked pixels
-    weight: NDArray[np.float32]  # (H, W), that of the layer
+    image: Image  # (H, W), the layer without its local mean; 0 at masked pixels
+    weight: Image  # (H, W), that of the layer
     gain: float  # fraction of the variance of white noise that the blur leaves
     autocorrelation: FloatArray
 

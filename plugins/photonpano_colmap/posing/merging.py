@@ -16,6 +16,8 @@ from photonpano.geometry import inverse, scaled_ahead
 from photonpano.merging import PhotonSum, chunks_of
 from photonpano_colmap.posing.path import Path, between
 
+Image = NDArray[np.float32]
+
 _CHUNK_PX = 1.0  # frames that move less than this are summed before they are warped
 _STEP_PX = 8  # spacing of the grid on which depth is interpolated
 _MARGIN = 0.05  # points up to this far outside of the frame are used, in its longer side
@@ -31,11 +33,11 @@ class PosedExposure:
 
     exposure: VirtualExposure  # flux and weight, seen from the reference instant of its group
     pose: FloatArray  # (3, 4) of that instant
-    inverse_depth: NDArray[np.float32]  # (H, W) of its pixels
+    inverse_depth: Image  # (H, W) of its pixels
 
 
 def merge_through_depth(
-    source: Source, group: Group, path: Path, inverse_depth: NDArray[np.float32], camera_matrix: FloatArray
+    source: Source, group: Group, path: Path, inverse_depth: Image, camera_matrix: FloatArray
 ) -> PosedExposure:
     """Merge the frames of a group as its reference instant sees them (paper, section 6: aggregation that is consistent in 3D).
 
@@ -66,20 +68,14 @@ class _Plane:
         return scaled_ahead(inverse(maps))
 
 
-def lit_counts(source: Source, span: FrameSpan) -> NDArray[np.float32]:
+def lit_counts(source: Source, span: FrameSpan) -> Image:
     """Return the sum of the frames of a span, of the flux alone: (H, W)."""
     return capture_of(source).corrected_counts(span).astype(np.float32)
 
 
 @compiled
 def _add(
-    frames: NDArray[np.float32],
-    frame_weight: NDArray[np.float32],
-    inverse_depth: NDArray[np.float32],
-    turn: FloatArray,
-    shift: FloatArray,
-    counts: NDArray[np.float32],
-    weight: NDArray[np.float32],
+    frames: Image, frame_weight: Image, inverse_depth: Image, turn: FloatArray, shift: FloatArray, counts: Image, weight: Image
 ) -> None:
     """Add (H, W) counts and weights of frames to those of a view, interpolated bilinearly; see `path.between`."""
     height, width = frames.shape
@@ -107,9 +103,7 @@ def _add(
             )
 
 
-def inverse_depth_of(
-    pose: FloatArray, points: FloatArray, camera_matrix: FloatArray, shape: tuple[int, int]
-) -> NDArray[np.float32] | None:
+def inverse_depth_of(pose: FloatArray, points: FloatArray, camera_matrix: FloatArray, shape: tuple[int, int]) -> Image | None:
     """Return the inverse depth of the pixels of a view, (H, W), from points of the world; None if it sees fewer than 4.
 
     It is linear between points, as that of a plane is. At the edges of things it is wrong by the width of a triangle; within a

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray
 from photonpano.compiling import compiled
 from photonpano.locating import view_of
-from photonpano_colmap.posing.merging import PosedExposure
+from photonpano_colmap.posing.merging import Image, PosedExposure
 from photonpano_colmap.posing.path import between
 
 _BLUR_PX = 1.0  # standard deviation of the blur against photon noise
@@ -32,7 +32,7 @@ _SLOPE_PX = 3.0  # standard deviation of the blur before slopes of the inverse d
 class Stabilised(NamedTuple):
     """An exposure as an image of uniform noise."""
 
-    image: NDArray[np.float32]  # (H, W), blurred; NaN where it is unknown
+    image: Image  # (H, W), blurred; NaN where it is unknown
     noise: float  # variance of a pixel before the blur
     noise_left: float  # share of this variance that the blur leaves
 
@@ -78,10 +78,7 @@ def patches_of(posed: PosedExposure, view: Stabilised, most: int) -> Patches:
 
 
 def find_patches(
-    patches: Patches,
-    here: tuple[PosedExposure, Stabilised],
-    there: tuple[PosedExposure, Stabilised],
-    camera_matrix: FloatArray,
+    patches: Patches, here: tuple[PosedExposure, Stabilised], there: tuple[PosedExposure, Stabilised], camera_matrix: FloatArray
 ) -> Found:
     """Find the patches of an exposure, `here`, in another one, `there`.
 
@@ -108,8 +105,8 @@ def find_patches(
 
 @compiled
 def _find(
-    template: NDArray[np.float32],
-    image: NDArray[np.float32],
+    template: Image,
+    image: Image,
     middles: FloatArray,
     inverse_depth: FloatArray,
     turn: FloatArray,
@@ -192,7 +189,7 @@ def _find(
 
 
 @compiled
-def _sample(image: NDArray[np.float32], x: float, y: float) -> float:
+def _sample(image: Image, x: float, y: float) -> float:
     """Return an image at a place, interpolated bilinearly; NaN outside."""
     height, width = image.shape
     if not (0 <= x < width - 1 and 0 <= y < height - 1):

@@ -15,14 +15,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from photonpano import FloatArray, FrameSpan, Source
 from photonpano.compiling import compiled
 from photonpano.filtering import exceeding_noise
 from photonpano.photometry import flux_std
-from photonpano_colmap.posing.merging import PosedExposure, lit_counts
+from photonpano_colmap.posing.merging import Image, PosedExposure, lit_counts
 from photonpano_colmap.posing.path import Path, between
 
 _NOISE_PX = 0.1  # standard error of the shift of a span that determines its length, within the limits below
@@ -97,11 +96,11 @@ def _beyond_noise(shifts: FloatArray) -> float:
 class _Prediction(NamedTuple):
     """Expected counts of a frame of a group, seen from its reference instant."""
 
-    mean: NDArray[np.float32]  # (H, W) expected count of a frame
-    slope_x: NDArray[np.float32]  # (H, W) its slope along x, divided by the variance of a frame; 0 where it is not known
-    slope_y: NDArray[np.float32]  # (H, W) the same along y
-    gain: NDArray[np.float32]  # (H, W) the mean, divided by that variance; 0 where the slopes are not known
-    inverse_depth: NDArray[np.float32]  # (H, W)
+    mean: Image  # (H, W) expected count of a frame
+    slope_x: Image  # (H, W) its slope along x, divided by the variance of a frame; 0 where it is not known
+    slope_y: Image  # (H, W) the same along y
+    gain: Image  # (H, W) the mean, divided by that variance; 0 where the slopes are not known
+    inverse_depth: Image  # (H, W)
     mean_depth: float  # inverse depth at which a shift of the camera counts in px
     to_ideal: FloatArray  # (3, 3) pixels to directions
     information: FloatArray  # (7, 7) of one frame that sees all of it
@@ -165,12 +164,7 @@ def _divided(span: FrameSpan, size: int) -> list[FrameSpan]:
 
 
 def _measured(
-    source: Source,
-    span: FrameSpan,
-    turn: FloatArray,
-    shift: FloatArray,
-    posed: PosedExposure,
-    predicted: _Prediction,
+    source: Source, span: FrameSpan, turn: FloatArray, shift: FloatArray, posed: PosedExposure, predicted: _Prediction
 ) -> _Equations:
     """Return the motion of the camera in a span, beyond that along which its group was merged."""
     valid = source.valid.astype(np.float32)
@@ -187,12 +181,7 @@ def _measured(
 
 
 @compiled
-def _add_information(
-    predicted: _Prediction,
-    slope_x: NDArray[np.float32],
-    slope_y: NDArray[np.float32],
-    noise: NDArray[np.float32],
-) -> None:
+def _add_information(predicted: _Prediction, slope_x: Image, slope_y: Image, noise: Image) -> None:
     """Add the upper triangle of the information of one frame, from the slopes (H, W) of the mean count.
 
     `noise` is (H, W), the variance of a slope that is noise, divided by that of a frame.
@@ -222,12 +211,7 @@ def _add_information(
 
 @compiled
 def _add_residuals(
-    frames: NDArray[np.float32],
-    frame_weight: NDArray[np.float32],
-    predicted: _Prediction,
-    turn: FloatArray,
-    shift: FloatArray,
-    sums: FloatArray,
+    frames: Image, frame_weight: Image, predicted: _Prediction, turn: FloatArray, shift: FloatArray, sums: FloatArray
 ) -> None:
     """Add the right-hand side of the equations of a span, and the light that it sees, to the (8,) sums; see `path.between`."""
     height, width = frames.shape

@@ -13,15 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from photonpano import (
-    FloatArray,
-    FrameSpan,
-    Group,
-    Response,
-    Source,
-    Trajectory,
-    VirtualExposure,
-)
+from photonpano import FloatArray, FrameSpan, Group, Response, Source, Trajectory, VirtualExposure
 from photonpano.compiling import compiled
 from photonpano.merging import PhotonSum
 from photonpano_core.configs import BurstConfig

@@ -7,21 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import (
-    FloatArray,
-    FrameSpan,
-    Group,
-    InputError,
-    Source,
-    Trajectory,
-    VirtualExposure,
-    capture_of,
-)
+from photonpano import BoolArray, FloatArray, FrameSpan, Group, InputError, Source, Trajectory, VirtualExposure, capture_of
 from photonpano.compiling import compiled
 from photonpano.geometry import corners, inverse, transform_points, visible_columns
 from photonpano.merging import PhotonSum, gain_image
 from photonpano_core.mergers.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
 
+Image = NDArray[np.float32]
 Frames = NDArray[np.unsignedinteger[Any]]
 
 _WORD = np.uint64
@@ -72,7 +64,7 @@ def _splatted(source: Source, span: FrameSpan, to_grid: FloatArray, shape: tuple
     return PhotonSum(_without_margin(counts), _weight(source.valid, to_grid, shape))
 
 
-def _weight(valid: NDArray[np.bool_], to_grid: FloatArray, shape: tuple[int, int]) -> NDArray[np.float32]:
+def _weight(valid: BoolArray, to_grid: FloatArray, shape: tuple[int, int]) -> Image:
     """Return the sum of splats of the valid pixels of frames of ones: (H, W)."""
     weight = np.zeros(shape, np.float32)
     rigid = _rigid(to_grid, valid.shape)
@@ -96,15 +88,15 @@ def _rigid(to_grid: FloatArray, frame_shape: tuple[int, int]) -> bool:
     return bool(np.abs(placed[:, :, 1:] - placed[:, :, :1] - np.eye(2)).max() < _RIGID)
 
 
-def _with_margin(shape: tuple[int, int]) -> NDArray[np.float32]:
+def _with_margin(shape: tuple[int, int]) -> Image:
     return np.zeros((shape[0] + 2, shape[1] + 2), np.float32)
 
 
-def _without_margin(grid: NDArray[np.float32]) -> NDArray[np.float32]:
+def _without_margin(grid: Image) -> Image:
     return np.ascontiguousarray(grid[1:-1, 1:-1])
 
 
-def splat(frames: Frames, used: NDArray[np.bool_], to_grid: NDArray[np.float64], total: NDArray[np.float32]) -> None:
+def splat(frames: Frames, used: BoolArray, to_grid: FloatArray, total: Image) -> None:
     """Add the (n, h, w) counts of frames to a grid, each with bilinear weights to four pixels, times the area of its pixel.
 
     This is the adjoint of bilinear interpolation. The `to_grid` maps have determinant 1, so that the area is `1 / depth^3` with
@@ -118,13 +110,7 @@ def splat(frames: Frames, used: NDArray[np.bool_], to_grid: NDArray[np.float64],
 
 
 @compiled
-def _splat(
-    frames: Frames,
-    words: NDArray[np.uint64],
-    used: NDArray[np.bool_],
-    to_grid: NDArray[np.float64],
-    total: NDArray[np.float32],
-) -> None:
+def _splat(frames: Frames, words: NDArray[np.uint64], used: BoolArray, to_grid: FloatArray, total: Image) -> None:
     """Splat rows of whole words, and skip words that are 0."""
     n_frames, height, width = frames.shape
     words_a_row = words.shape[2]
@@ -170,9 +156,7 @@ def _splat(
 
 
 @compiled
-def add_coverage(
-    shape: tuple[int, int], to_frame: NDArray[np.float64], total: NDArray[np.float32], steps: NDArray[np.float32]
-) -> None:
+def add_coverage(shape: tuple[int, int], to_frame: FloatArray, total: Image, steps: Image) -> None:
     """Add the sum of splats of frames of ones whose pixels stay 1 px apart, 1 inside a frame and less at its border, to (H, W).
 
     `to_frame` are (n, 3, 3) maps of the grid to frames. `steps` (H, W + 1) are row-wise differences, whose cumulative sums are

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
+Image = NDArray[np.float32]
+
 PATCH = 8  # side of a patch, px
 GROUP = 16  # similar patches that are filtered together; a power of 2
 SEARCH = 10  # similar patches are looked for at this distance at most along x and y, px
@@ -19,7 +21,7 @@ STEP = 4  # distance of reference patches, px
 _THRESHOLD = np.float32(2.7)  # coefficients below this many standard deviations of the noise are set to 0
 
 
-def _dct_matrix() -> NDArray[np.float32]:
+def _dct_matrix() -> Image:
     order, at = np.arange(PATCH)[:, None], np.arange(PATCH)
     matrix = np.cos(np.pi * (at + 0.5) * order / PATCH) * np.sqrt(2 / PATCH)
     matrix[0] /= np.sqrt(2)
@@ -49,7 +51,7 @@ def _places(length: int) -> NDArray[np.int32]:
 
 
 @compiled
-def find_similar(image: NDArray[np.float32], patches: Patches) -> None:
+def find_similar(image: Image, patches: Patches) -> None:
     """Find the patches of an image, (H, W), that differ least from each reference patch."""
     rows, columns, found = patches
     height, width = image.shape
@@ -94,7 +96,7 @@ def find_similar(image: NDArray[np.float32], patches: Patches) -> None:
 
 
 @compiled
-def _transformed(patch: NDArray[np.float32], matrix: NDArray[np.float32], scratch: NDArray[np.float32]) -> None:
+def _transformed(patch: Image, matrix: Image, scratch: Image) -> None:
     """Multiply a patch with a matrix from the left and with its transpose from the right, in place."""
     for i in range(PATCH):
         for j in range(PATCH):
@@ -113,7 +115,7 @@ def _transformed(patch: NDArray[np.float32], matrix: NDArray[np.float32], scratc
 
 
 @compiled
-def _mixed(stack: NDArray[np.float32]) -> None:
+def _mixed(stack: Image) -> None:
     """Apply the orthonormal Walsh-Hadamard transform along the patches of a (GROUP, PATCH * PATCH) stack; it inverts itself."""
     half = 1
     while half < GROUP:
@@ -132,13 +134,7 @@ def _mixed(stack: NDArray[np.float32]) -> None:
 
 
 @compiled
-def filter_groups(
-    image: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    patches: Patches,
-    total: NDArray[np.float32],
-    weights: NDArray[np.float32],
-) -> None:
+def filter_groups(image: Image, noise: Image, patches: Patches, total: Image, weights: Image) -> None:
     """Filter each group of similar patches, and add its patches where they lie, weighted by how few coefficients are left.
 
     `noise` is (H, W), the standard deviation to remove; `total` and `weights`, (H, W), are added to.

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano import FloatArray, FluxImage
 from photonpano.compiling import compiled
@@ -175,9 +174,7 @@ def gain_of(better: FluxImage, worse: FluxImage) -> tuple[float, float]:
 
 
 @compiled
-def expected(
-    flux: NDArray[np.float32], kernel: NDArray[np.float32], scratch: NDArray[np.float32], into: NDArray[np.float32]
-) -> None:
+def expected(flux: FluxImage, kernel: FluxImage, scratch: FluxImage, into: FluxImage) -> None:
     """Average the flux, (H, W), over the areas of pixels that are centred at each cell; the border is repeated.
 
     `kernel` (2 r + 1,) are symmetric weights along x and y with the sum 1, so that this is its own adjoint; `scratch` is
@@ -219,9 +216,7 @@ def _lit_share(light: np.float32) -> np.float32:
 
 
 @compiled
-def photon_ratio(
-    lit: NDArray[np.float32], seen: NDArray[np.float32], mean: NDArray[np.float32], binary: bool, into: NDArray[np.float32]
-) -> None:
+def photon_ratio(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool, into: FluxImage) -> None:
     """Write `k / (1 - exp(-mean))` of the counts k of each cell, (H, W), or k / mean of counts that are not binary."""
     least = np.float32(1e-9)
     for y in range(lit.shape[0]):
@@ -237,9 +232,7 @@ def photon_ratio(
 
 
 @compiled
-def log_likelihood(
-    lit: NDArray[np.float32], seen: NDArray[np.float32], mean: NDArray[np.float32], binary: bool, into: NDArray[np.float32]
-) -> None:
+def log_likelihood(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool, into: FluxImage) -> None:
     """Return the log-likelihood of the counts of each cell, but for a constant: see `photon_ratio` for the arguments."""
     least = np.float32(1e-9)
     for y in range(lit.shape[0]):
@@ -255,13 +248,7 @@ def log_likelihood(
 
 
 @compiled
-def counts_in_light(
-    mean: NDArray[np.float32],
-    frames: NDArray[np.float32],
-    gains: NDArray[np.float32],
-    lit: NDArray[np.float32],
-    dark: NDArray[np.float32],
-) -> None:
+def counts_in_light(mean: FluxImage, frames: FluxImage, gains: FluxImage, lit: FluxImage, dark: FluxImage) -> None:
     """Write the expected frames of each cell with and without photons in changing light, (H, W), from the mean flux.
 
     `frames` and `gains` are (C, H, W): the frames of each class of light, and the sums of their gains.

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonpano import BoolArray, Capture, FluxImage, FrameSpan, Homography, Source, Trajectory, capture_of
+from photonpano import BoolArray, Capture, FloatArray, FluxImage, FrameSpan, Homography, Source, Trajectory, capture_of
 from photonpano.compiling import compiled
 from photonpano.geometry import Canvas, corners, transform_points
 from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
@@ -88,14 +87,14 @@ def sums_on(
     return _photons(source, lit, seen[0], lit_frames)
 
 
-def _summed(capture: Capture, terms: LightTerms | None, chunk: Chunk) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _summed(capture: Capture, terms: LightTerms | None, chunk: Chunk) -> tuple[FluxImage, FluxImage]:
     """Return the counts of a chunk, (h, w), and what a pixel adds to each image of frames and gains, (P,)."""
     amounts = np.array([len(chunk.span)], np.float32) if terms is None else terms.amounts(chunk.span).astype(np.float32)
     return np.ascontiguousarray(capture.corrected_counts(chunk.span), np.float32), amounts
 
 
 def _add(
-    summed: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    summed: Sequence[tuple[FluxImage, FluxImage]],
     to_grid: Sequence[Homography],
     usable: BoolArray,
     lit: FluxImage,
@@ -126,13 +125,7 @@ def _photons(source: Source, lit: FluxImage, seen: FluxImage, light: LitFrames |
 
 @compiled
 def add_observations(
-    counts: NDArray[np.float32],
-    usable: NDArray[np.bool_],
-    amounts: NDArray[np.float32],
-    to_grid: NDArray[np.float64],
-    first: int,
-    lit: NDArray[np.float32],
-    seen: NDArray[np.float32],
+    counts: FluxImage, usable: BoolArray, amounts: FluxImage, to_grid: FloatArray, first: int, lit: FluxImage, seen: FluxImage
 ) -> None:
     """Add the pixels of a sum of frames, (h, w), to the cells that their centres fall into.
 

@@ -57,13 +57,7 @@ class MotionField:
 
 
 @compiled
-def add_moments(
-    time: np.float32,
-    value: NDArray[np.float32],
-    trust: NDArray[np.float32],
-    moments: NDArray[np.float32],
-    right: NDArray[np.float32],
-) -> None:
+def add_moments(time: np.float32, value: Image, trust: Image, moments: Image, right: Image) -> None:
     """Add the values (H, W, 2) of pixels at a time, with weights (H, W), to the sums from which `fit_each` fits polynomials."""
     for row in range(trust.shape[0]):
         weights, xy = trust[row], value[row]
@@ -83,9 +77,7 @@ def add_moments(
 
 
 @compiled
-def fit_each(
-    moments: NDArray[np.float32], right: NDArray[np.float32], prior: float, where: NDArray[np.bool_], found: NDArray[np.float32]
-) -> None:
+def fit_each(moments: Image, right: Image, prior: float, where: BoolArray, found: Image) -> None:
     """Solve a least-squares fit of polynomials without a constant term at each pixel, by Cholesky decomposition.
 
     Args:
@@ -124,7 +116,7 @@ def fit_each(
 
 
 @compiled
-def value_of_each(coefficients: NDArray[np.float32], time: np.float32, found: NDArray[np.float32]) -> None:
+def value_of_each(coefficients: Image, time: np.float32, found: Image) -> None:
     """Evaluate polynomials with coefficients (D, N) of the powers 1 to D of time, by Horner's rule, into `found` (N,)."""
     found[:] = 0
     for degree in range(len(coefficients) - 1, -1, -1):

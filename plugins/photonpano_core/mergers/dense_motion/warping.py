@@ -5,40 +5,41 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photonpano import BoolArray, FloatArray
 from photonpano.compiling import compiled
+from photonpano_core.mergers.dense_motion.field import Image
 
 
 class Frames(NamedTuple):
     """A sum of frames."""
 
-    image: NDArray[np.float32]  # (h, w) sum
-    weights: NDArray[np.float32]  # (h, w) of a frame of each pixel, from 0 to 1; (0, 0) if it is 1 for all
+    image: Image  # (h, w) sum
+    weights: Image  # (h, w) of a frame of each pixel, from 0 to 1; (0, 0) if it is 1 for all
     number: float
 
 
 class Moved(NamedTuple):
     """How the pixels of a grid move beyond a homography, in cells of a coarser or finer grid."""
 
-    where: NDArray[np.bool_]  # (H, W) pixels of the grid that are added to
+    where: BoolArray  # (H, W) pixels of the grid that are added to
     # cells per pixel, and the row and the column of the first cell. Pixels in one cell move alike
     cells: tuple[float, int, int]
-    motion: NDArray[np.float32]  # (h', w', 2), x and y by which cells are displaced, in cells
-    trust: NDArray[np.float32]  # (h', w') weight of the image in each cell
+    motion: Image  # (h', w', 2), x and y by which cells are displaced, in cells
+    trust: Image  # (h', w') weight of the image in each cell
 
 
 class Sums(NamedTuple):
     """What `add_along` adds to."""
 
-    counts: NDArray[np.float32]  # (H, W) sums
-    weight: NDArray[np.float32]  # (H, W) numbers of frames
+    counts: Image  # (H, W) sums
+    weight: Image  # (H, W) numbers of frames
     # (H, W) variances of the blur of interpolation, mean of x and y in px^2, times numbers of frames; (0, 0) for none
-    blur: NDArray[np.float32]
+    blur: Image
 
 
 @compiled
-def add_along(summed: Frames, to_image: NDArray[np.float64], moved: Moved, sums: Sums) -> None:
+def add_along(summed: Frames, to_image: FloatArray, moved: Moved, sums: Sums) -> None:
     """Add a sum of frames to some pixels of a grid, which (3, 3) maps to the image, bilinearly; 0 outside of its border."""
     image, weights, where, trust = summed.image, summed.weights, moved.where, moved.trust
     counts, weight, blur = sums.counts, sums.weight, sums.blur
@@ -86,7 +87,7 @@ def add_along(summed: Frames, to_image: NDArray[np.float64], moved: Moved, sums:
 
 
 @compiled
-def _map(to_image: NDArray[np.float64], us: NDArray[np.float64], vs: NDArray[np.float64]) -> None:
+def _map(to_image: FloatArray, us: FloatArray, vs: FloatArray) -> None:
     """Replace places (x, y) on a grid by those in an image."""
     xx, xy, x1 = to_image[0, 0], to_image[0, 1], to_image[0, 2]
     yx, yy, y1 = to_image[1, 0], to_image[1, 1], to_image[1, 2]
@@ -99,7 +100,7 @@ def _map(to_image: NDArray[np.float64], us: NDArray[np.float64], vs: NDArray[np.
 
 
 @compiled
-def _between(image: NDArray[np.float32], top: int, left: int, a: np.float32, b: np.float32) -> np.float32:
+def _between(image: Image, top: int, left: int, a: np.float32, b: np.float32) -> np.float32:
     """Interpolate between four pixels, at fractions of a pixel to the right and down of the first."""
     upper = image[top, left] + a * (image[top, left + 1] - image[top, left])
     lower = image[top + 1, left] + a * (image[top + 1, left + 1] - image[top + 1, left])
@@ -107,15 +108,7 @@ def _between(image: NDArray[np.float32], top: int, left: int, a: np.float32, b: 
 
 
 @compiled
-def mean_of_seen(
-    counts: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    least: float,
-    steepest: float,
-    area: float,
-    mean: NDArray[np.float32],
-    frames: NDArray[np.float32],
-) -> None:
+def mean_of_seen(counts: Image, weight: Image, least: float, steepest: float, area: float, mean: Image, frames: Image) -> None:
     """Divide counts by weights, (H, W), where these exceed `least`, and their gradient is below `steepest` relative to them.
 
     Writes the mean count of a frame, and the frames of one pixel whose noise equals that of an average over `area` pixels, 1 or
