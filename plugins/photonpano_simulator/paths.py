@@ -28,7 +28,7 @@ from photonpano_simulator.config import (
     SplinePath,
     TurnPath,
 )
-from photonpano_simulator.lens import camera, outline
+from photonpano_simulator.lens import camera, middle_of, outline
 from photonpano_simulator.sensor import Draw, generator
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
     else:
         to_scene = rescaling(config.scene_scale)
         in_frame_px = scene_shape[0] / config.scene_scale, scene_shape[1] / config.scene_scale
-        middle = _middle(in_frame_px)
+        middle = middle_of(in_frame_px)
         target = middle if path.centre is None else transform_points(inverse(to_scene), np.array([path.centre], np.float64))[0]
         rotations = _rotations(target - middle + _centres(path, config.n_frames), focal)
         homographies = to_scene @ _intrinsics(in_frame_px, focal) @ rotations @ np.linalg.inv(frame)
@@ -83,7 +83,7 @@ def camera_rotations(config: SimulationConfig, homographies: FloatArray, scene_s
 
 def scene_motion(homographies: FloatArray, frame_shape: tuple[int, int], path: object) -> FloatArray:
     """Return how far the scene has moved through the middle of the frame since the first frame: (T, 2) px."""
-    middle = _middle(frame_shape)
+    middle = middle_of(frame_shape)
     if isinstance(path, TurnPath):
         steps = transform_points(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
         return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
@@ -197,13 +197,8 @@ def _at_constant_speed(points: FloatArray, n_frames: int) -> FloatArray:
     return np.stack([np.interp(wanted, travelled, coordinate) for coordinate in points.T], axis=1)
 
 
-def _middle(shape: tuple[float, float]) -> FloatArray:
-    height, width = shape
-    return np.array([(width - 1) / 2, (height - 1) / 2])
-
-
 def _intrinsics(shape: tuple[float, float], focal: float) -> FloatArray:
-    x, y = _middle(shape)
+    x, y = middle_of(shape)
     return camera_matrix(focal, (x, y))
 
 

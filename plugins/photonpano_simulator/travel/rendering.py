@@ -222,9 +222,7 @@ def _add(m: FloatArray, p: int, x: float, y: float, weight: float, atlas: Atlas,
     share = np.float32(exact - level if level < atlas.counts[p] - 1 else 0.0)
     scale = np.float32(weight / n)
     for each in range(2 if share > 0 else 1):
-        start, height, width = atlas.starts[p, level + each], atlas.heights[p, level + each], atlas.widths[p, level + each]
-        part = scale * (share if each else 1 - share)
-        _sample(m, x, y, n, step_a, step_b, part, atlas.texels, start, height, width, pixels)
+        _sample(m, x, y, n, step_a, step_b, scale * (share if each else 1 - share), atlas, p, level + each, pixels)
 
 
 @compiled
@@ -236,13 +234,13 @@ def _sample(
     step_a: float,
     step_b: float,
     scale: np.float32,
-    texels: NDArray[np.float32],
-    start: int,
-    height: int,
-    width: int,
+    atlas: Atlas,
+    p: int,
+    level: int,
     pixels: NDArray[np.float32],
 ) -> None:
     """Add `scale` times `n` samples of a level of a texture, interpolated linearly, for each of successive pixels."""
+    texels, start, height, width = atlas.texels, atlas.starts[p, level], atlas.heights[p, level], atlas.widths[p, level]
     for k in range(len(pixels)):
         depth = 1 / (m[2, 0] * (x + k) + m[2, 1] * y + m[2, 2])
         a, b = m[0, 0] * (x + k) + m[0, 1] * y + m[0, 2], m[1, 0] * (x + k) + m[1, 1] * y + m[1, 2]
