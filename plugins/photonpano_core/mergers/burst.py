@@ -255,14 +255,9 @@ def search(
 ) -> None:
     """Find each patch of `fixed`, (h, w), in `moving`, by the mean squared difference over the pixels that both show.
 
-    Args:
-        fixed: (h, w) where patches are cut out.
-        moving: (h, w) where they are searched.
-        side: of a patch, in px.
-        starts: (S, rows, columns, 2) displacements x and y; the search goes on around the best.
-        radius: largest distance from it, along x and along y.
-        found: (rows, columns, 2) output, displacements, between pixels by a parabola.
-        costs: (rows, columns, 2) output, costs of no displacement and of the one found; infinite without overlap.
+    The search goes on around the best of `starts`, (S, rows, columns, 2) displacements x and y, up to `radius` along each axis.
+    Writes the displacements, between pixels by a parabola, and the costs of no displacement and of the one found, infinite
+    without overlap.
     """
     step = side // 2
     around = np.empty((2 * radius + 3, 2 * radius + 3))

@@ -44,20 +44,11 @@ class TravelSource(SimulatedSource):
         return self._exposed(flux, int(self._taken[index]))
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
-        """Return the ground truth of the frames.
+        """Return the ground truth of the frames: `docs/how-to/simulate-depth.md` lists the arrays.
 
         Convention:
             Points of the world are (x, y, z) in m: x right, y down, z ahead. `camera_from_world` maps them to points of the
             camera, X_c = R X_w + t, with the same axes; pixels are K X_c, integers are pixel centres.
-
-        Returns:
-            `camera_from_world` (T, 3, 4), `camera_matrix` (3, 3), `frame_shape` (2,), `frame_rate_hz` (), `seed` (); `taken`
-            (T,), the index of each frame before drops and repeats; `light` (T,), relative to the first of these. The scene, as
-            P rectangles: `plane_corners`, `plane_along`, `plane_down` (P, 3), top left corner and edges in frame 0 in m;
-            `plane_velocities` (P, 3) in m per frame; `plane_is_disc` (P,); `textures` (N,) float16, one after the other, of
-            the shapes `texture_shapes` (P, 2), and the flux of a texel that is 1, `texture_flux` (), photons per pixel per
-            frame that are detected. `dark_rates` (H, W) float32 and `hot_pixels` (H, W) bool; of pixels that differ also
-            `gains` (H, W) float32.
         """
         gains = {"gains": self._sensor.gains} if (self._sensor.gains != 1).any() else {}
         return {**super().truth(), **self._truth.arrays(), **gains}

@@ -78,14 +78,10 @@ def add_moments(time: np.float32, value: Image, trust: Image, moments: Image, ri
 
 @compiled
 def fit_each(moments: Image, right: Image, prior: float, where: BoolArray, found: Image) -> None:
-    """Solve a least-squares fit of polynomials without a constant term at each pixel, by Cholesky decomposition.
+    """Solve a least-squares fit of polynomials without a constant term at some pixels, (H, W), by Cholesky decomposition.
 
-    Args:
-        moments: (2 D - 1, H, W), weighted sums of the powers 2 to 2 D of time.
-        right: (D, H, W, 2), weighted sums of the powers 1 to D of time, times x and y.
-        prior: added to the diagonal.
-        where: (H, W) pixels to solve for.
-        found: (D, H, W, 2) output, coefficients of the powers 1 to D.
+    `moments` (2 D - 1, H, W) are weighted sums of the powers 2 to 2 D of time, `right` (D, H, W, 2) those of the powers 1 to D
+    times x and y. `prior` is added to the diagonal. Writes the coefficients of the powers 1 to D, (D, H, W, 2).
     """
     degree = right.shape[0]
     lower, x = np.zeros((degree, degree)), np.zeros((degree, 2))
