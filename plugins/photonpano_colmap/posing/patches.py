@@ -118,17 +118,9 @@ def _find(
 ) -> None:
     """Find patches of a template, (H, W), in an image by Gauss-Newton steps; those that are lost stay NaN.
 
-    Args:
-        template: (H, W) the image that they were chosen in.
-        image: (H, W) the other one.
-        middles: (N, 2) px.
-        inverse_depth: (N, 3), see `Patches`.
-        turn: (3, 3), see `path.between`.
-        shift: (3,), see `path.between`.
-        gradient_noise: variance of a gradient of the image that is noise.
-        pixels: (N, 2) output, their middles in the image.
-        hessian: (N, 2, 2) output, weighted sums of products of the gradients of the scene.
-        chi_square: (N,) output, weighted mean square of the residuals, whose mean is subtracted.
+    `middles` are (N, 2) px; `turn` and `shift` are from `path.between`; `gradient_noise` is the variance of a gradient by
+    noise. Writes the middles in the image, (N, 2), the weighted sums of products of gradients of the scene, (N, 2, 2), and the
+    weighted mean square of the residuals less their mean, (N,).
     """
     size = (2 * _HALF + 1) ** 2
     values, us, vs, weights = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
