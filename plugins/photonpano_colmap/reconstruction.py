@@ -40,7 +40,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
-    """What COLMAP found."""
+    """The result of COLMAP."""
 
     # the largest first, each with an image that no larger one has; empty if no pair of images was enough to begin with
     pieces: tuple[Piece, ...]

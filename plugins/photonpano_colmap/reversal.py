@@ -24,7 +24,7 @@ _ALIKE = 0.9  # neither reading is likelier if the ratio of their residuals is a
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """How well two readings of the depth explain the images."""
+    """Residuals of two readings of the depth, and which is likelier."""
 
     found_px: float  # median distance of a point from where images show it, adjusted from the reading that COLMAP found
     reversed_px: float  # the same, adjusted from near and far exchanged

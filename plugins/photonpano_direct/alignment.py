@@ -40,7 +40,7 @@ _HESSIAN_PX = 0.25  # the Hessian is updated after steps above this
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quality:
-    """How well two images agree."""
+    """Accuracy of an alignment, and the agreement of the images."""
 
     information: FloatArray  # (8, 8) inverse covariance of p1..p8 of the homography, from the photons of both images
     noise_ratio: float  # mean squared residual relative to that of photon noise

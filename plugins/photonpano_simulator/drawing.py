@@ -48,7 +48,7 @@ _NUMBER = re.compile(r"(?:(?P<percent>-?[\d.]+)%|(?P<name>[a-z_]+)(?:\*(?P<facto
 
 @cache
 def read_scene(name: str) -> dict[str, Any]:
-    """Return what the file of a scene of this package describes."""
+    """Return the content of the file of a scene of this package."""
     from ruamel.yaml import YAML
 
     path = Path(__file__).parent / "data" / f"{name}.yaml"

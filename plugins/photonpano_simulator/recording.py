@@ -1,4 +1,4 @@
-"""What all simulated captures share: frames, rate, light, and which frames the capture keeps."""
+"""Keys of all simulated captures: frames, rate, light, and dropped and repeated frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What frames see: a plane before the camera or an equirectangular panorama around it, and objects in front of it.
+"""Render views of a plane before the camera or an equirectangular panorama around it, and objects in front of them.
 
 Convention:
     Points are (x, y), x right, y down; integers are pixel centres; sizes are (height, width). A direction is (x, y, z), x

@@ -25,7 +25,7 @@ class Attributes(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     version: int = VERSION  # the version of these attributes
-    kind: Literal["binary"] = "binary"  # what the frames are; there are no others than binary ones yet
+    kind: Literal["binary"] = "binary"  # kind of frames; others than binary ones are not written yet
     width: int = Field(ge=1)  # columns of a frame, in px
     bit_order: Literal["big", "little"] = "big"  # "big" if the first of eight pixels is the highest bit of its byte
     frame_rate_hz: float | None = Field(None, gt=0)  # frames a second, in Hz; None if unknown
@@ -117,7 +117,7 @@ def read_metadata(array: Location) -> Metadata:
 
 
 def read_attributes(array: Location, metadata: Metadata) -> Attributes | None:
-    """Return what photonpano has written into an array, if it has; raises an `InputError` if that is newer or damaged."""
+    """Return the attributes of photonpano in an array, if any; raises an `InputError` if they are newer or damaged."""
     own = metadata.attributes.get("photonpano")
     if own is None:
         return None

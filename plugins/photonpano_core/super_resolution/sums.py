@@ -21,7 +21,7 @@ from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 
 _BATCH = 16  # chunks that are summed before they are added to the grid
-_PART_ROWS = 64  # rows of the grid, about, that a thread adds to at a time
+_PART_ROWS = 64  # approximate number of rows of the grid that a thread adds to at a time
 _MANY_PIECES = 64  # a span is divided into at least this many chunks, if it has the frames: some of them are held out
 _UP = 0.5 + 1e-6  # a centre on the border of two cells belongs to the second one, whatever the rounding of its coordinates
 

@@ -134,7 +134,7 @@ def _of_text(content: bytes) -> Callable[[str], str | None]:
 
 
 def _of_xml(path: Path, content: bytes) -> Callable[[str], str | None]:
-    """Return what looks up a value of a .cihx file, without all before `<cih>`: so no entities can be expanded."""
+    """Return a function that looks up a value of a .cihx file from `<cih>` on, so that no entities are expanded."""
     start, end = content.find(b"<cih>"), content.rfind(b"</cih>")
     if not 0 <= start < end:
         raise InputError(f"{path} is no header of a Photron camera: it has no part between <cih> and </cih>")

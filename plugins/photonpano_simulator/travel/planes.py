@@ -40,7 +40,7 @@ class Planes:
         return np.asarray(np.where(self.is_disc[:, None], sides.min(axis=1, keepdims=True) / sides / 2, 2.0))
 
     def maps(self, pose: FloatArray, matrix: FloatArray, frame: float) -> FloatArray:
-        """Return what maps pixels to places on each plane at an instant: (P, 3, 3), from (x, y, 1) to (a, b, 1) / depth.
+        """Return maps of pixels to places on each plane at an instant: (P, 3, 3), from (x, y, 1) to (a, b, 1) / depth.
 
         The third row is the inverse depth along the optical axis: at most 0 for a plane that is not seen.
         """

@@ -20,7 +20,7 @@ class Frames(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """How the pixels of a grid move beyond a homography, in cells of a coarser or finer grid."""
+    """Motion of the pixels of a grid beyond a homography, in cells of a coarser or finer grid."""
 
     where: BoolArray  # (H, W) pixels of the grid that are added to
     # cells per pixel, and the row and the column of the first cell. Pixels in one cell move alike
@@ -30,7 +30,7 @@ class Moved(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What `add_along` adds to."""
+    """Sums that `add_along` adds to."""
 
     counts: Image  # (H, W) sums
     weight: Image  # (H, W) numbers of frames
