@@ -39,13 +39,18 @@ _ENOUGH = 0.93
 _SIGNIFICANT = 2.0  # held-out frames show detail if they are likelier with it than without by this many standard errors
 
 
-@dataclass(frozen=True, slots=True)
-class _Chosen:
-    """The number of rounds that held-out frames support for a motion."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scan:
+    """Frames of a span along a motion, in chunks."""
 
+    source: Source
     trajectory: Trajectory
     span: FrameSpan
-    n_rounds: int
+    chunks: Sequence[Chunk]
+
+    def near(self, canvas: Canvas) -> list[Chunk]:
+        """Return the chunks whose frames may reach into a canvas."""
+        return visible(self.chunks, canvas, self.source.info.frame_shape)
 
 
 class SuperResolutionRenderer:
@@ -58,7 +63,8 @@ class SuperResolutionRenderer:
     def __init__(self, config: SuperResolutionConfig, threads: int, decide: Decide) -> None:
         """Take the keys of the spec, how many blocks are estimated at once, and what records decisions."""
         self._config, self._threads, self._decide = config, threads, decide
-        self._chosen: _Chosen | None = None
+        # A motion, a span, and the number of rounds that held-out frames support for them.
+        self._chosen: tuple[Trajectory, FrameSpan, int] | None = None
         self._lock = Lock()
 
     def render(
@@ -73,40 +79,31 @@ class SuperResolutionRenderer:
         """Render the frames of a span on a canvas: see `Renderer`."""
         # Frames are sorted by where their pixels lie on the canvas.
         tolerance_px = min(tolerance_px, 0.25 / _scale_of(canvas))
-        chunks = pieces_of(span, trajectory, source.info.frame_shape, tolerance_px)
-        if not visible(chunks, canvas, source.info.frame_shape):
+        scan = _Scan(source, trajectory, span, pieces_of(span, trajectory, source.info.frame_shape, tolerance_px))
+        if not scan.near(canvas):
             advance(len(span))
             return Panorama(np.full(canvas.shape, np.nan, np.float32), np.zeros(canvas.shape, np.float32), canvas.transform)
         with _pool(self._threads) as pool:
             with self._lock:
                 chosen = self._chosen
-                if chosen is None or chosen.trajectory is not trajectory or chosen.span != span:
-                    n_rounds = self._rounds(source, chunks, trajectory, span, canvas, pool)
-                    chosen = self._chosen = _Chosen(trajectory, span, n_rounds)
+                if chosen is None or chosen[0] is not trajectory or chosen[1] != span:
+                    chosen = self._chosen = trajectory, span, self._rounds(scan, canvas, pool)
             wide, left, top = _widened(canvas)
-            seen = visible(chunks, wide, source.info.frame_shape)
+            seen = scan.near(wide)
             progress = _Shares(advance, len(span))
             n_frames = sum(len(chunk.span) for chunk in seen)
             sums = sums_on(source, seen, wide, partial(progress.add, 1 / (n_frames * _GATHERING)), pool)
             blank = np.full(wide.shape, np.nan, np.float32)
             whole = Panorama(blank, np.zeros(wide.shape, np.float32), wide.transform)
             blocks = _blocks(wide)
-            work = partial(self._fill, whole, sums, chunks, source, chosen.n_rounds)
+            work = partial(self._fill, whole, sums, scan, chosen[2])
             for _ in pool.map(work, blocks):
                 progress.add((1 - 1 / _GATHERING) / len(blocks), 1)
             progress.finish()
         inner = slice(top, top + canvas.height), slice(left, left + canvas.width)
         return Panorama(whole.flux[inner].copy(), whole.weight[inner].copy(), canvas.transform)
 
-    def _fill(
-        self,
-        panorama: Panorama,
-        sums: PhotonSums,
-        chunks: Sequence[Chunk],
-        source: Source,
-        n_rounds: int,
-        block: Box,
-    ) -> None:
+    def _fill(self, panorama: Panorama, sums: PhotonSums, scan: _Scan, n_rounds: int, block: Box) -> None:
         """Estimate what frames show of a block of a panorama, if they show anything."""
         part = _seen_part(sums.seen, block)
         if part is None:
@@ -114,13 +111,13 @@ class SuperResolutionRenderer:
         block, inner, around = part
         rows, columns = block
         middle = np.array([(columns.start + columns.stop - 1) / 2, (rows.start + rows.stop - 1) / 2])
-        zoom = _zoom_at(middle, panorama.canvas, chunks, source.info.frame_shape)
-        observed = self._observations(source, sums.part(around), zoom)
-        weight = observed.weight()[inner] * np.float32(zoom**2 / _trials(source))
+        zoom = _zoom_at(middle, panorama.canvas, scan.chunks, scan.source.info.frame_shape)
+        observed = self._observations(scan.source, sums.part(around), zoom)
+        weight = observed.weight()[inner] * np.float32(zoom**2 / _trials(scan.source))
         known = weight >= _FEWEST_FRAMES
         if not known.any():
             return
-        flux = rounds_of(observed, n_rounds)[-1][inner] * np.float32(_trials(source))
+        flux = rounds_of(observed, n_rounds)[-1][inner] * np.float32(_trials(scan.source))
         panorama.flux[block] = np.where(known, flux, np.float32(np.nan))
         panorama.weight[block] = np.where(known, weight, 0)
 
@@ -129,29 +126,22 @@ class SuperResolutionRenderer:
         area = pixel_area(zoom * float(np.sqrt(self._config.fill_factor)))
         return Observations(sums.lit, sums.seen, area, binary, sums.light)
 
-    def _rounds(
-        self,
-        source: Source,
-        chunks: Sequence[Chunk],
-        trajectory: Trajectory,
-        span: FrameSpan,
-        canvas: Canvas,
-        pool: ThreadPoolExecutor,
-    ) -> int:
+    def _rounds(self, scan: _Scan, canvas: Canvas, pool: ThreadPoolExecutor) -> int:
         """Choose the number of rounds by frames held out, record it, and say whether they show the detail of this scale."""
         scores: list[FloatArray] = []
         detail = np.zeros(2)
         for share in _PROBES:
-            probe = _probe(share, source, trajectory, span, canvas)
-            near = visible(chunks, probe, source.info.frame_shape)
+            probe = _probe(share, scan, canvas)
+            near = scan.near(probe)
             held = [chunk for index, chunk in enumerate(near) if index % _HELD_OUT == _HELD_OUT // 2]
             kept = [chunk for index, chunk in enumerate(near) if index % _HELD_OUT != _HELD_OUT // 2]
             if not held:
                 continue
             middle = np.array([(probe.width - 1) / 2, (probe.height - 1) / 2])
-            zoom = _zoom_at(middle, probe.transform, near, source.info.frame_shape)
+            zoom = _zoom_at(middle, probe.transform, near, scan.source.info.frame_shape)
             fitted, tested = (
-                self._observations(source, sums_on(source, part, probe, lambda _: None, pool), zoom) for part in (kept, held)
+                self._observations(scan.source, sums_on(scan.source, part, probe, lambda _: None, pool), zoom)
+                for part in (kept, held)
             )
             inner = slice(_HALO_PX, -_HALO_PX), slice(_HALO_PX, -_HALO_PX)
             results = rounds_of(fitted, len(STRENGTHS))
@@ -266,12 +256,11 @@ def _seen_part(seen: FluxImage, block: Box) -> tuple[Box, Box, Box] | None:
     return part, inner, around
 
 
-def _probe(share: float, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> Canvas:
+def _probe(share: float, scan: _Scan, canvas: Canvas) -> Canvas:
     """Return a square, with its margin, around the middle of the frame at a share of the span, on pixels of the canvas."""
-    instant = span.start + share * (len(span) - 1)
-    shape = source.info.frame_shape
-    to_canvas = canvas.transform @ trajectory.at([instant])[0]
-    outline = transform_points(to_canvas, corners(shape))
+    instant = scan.span.start + share * (len(scan.span) - 1)
+    to_canvas = canvas.transform @ scan.trajectory.at([instant])[0]
+    outline = transform_points(to_canvas, corners(scan.source.info.frame_shape))
     # Even sides, so that the detail of a grid half as fine is easily found.
     width, height = (2 * int(min(_PROBE_PX, side) // 2 + _HALO_PX) for side in np.ceil(np.ptp(outline, axis=0)) + 1)
     left, top = np.rint(outline.mean(axis=0) - [width / 2, height / 2])
