@@ -29,7 +29,7 @@ from photonpano import (
 )
 from photonpano.geometry import Camera, camera_matrix
 from photonpano.locating import blur_against_noise, stabilised_8_bit
-from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig
+from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, counted, too_few_averages
 from photonpano_colmap.pose_noise import PoseNoise, pose_noise
 from photonpano_colmap.posing.merging import lit_counts
 from photonpano_colmap.posing.path import PoseSpline, left_out, positions_of
@@ -50,6 +50,7 @@ _FOCAL_SHARE = 0.02  # relative standard error of an estimated focal length abov
 _FOCAL_BIAS = 0.01
 _PLANE = 0.01  # points lie in a plane if their smallest extent is below this fraction of the largest
 _SHOWN_PIECES = 4
+_MISSED_SHARE = 0.5  # interpolation error of the spline, as a fraction of the variance of leave-one-out errors
 
 
 class AveragesEstimator:
@@ -62,9 +63,8 @@ class AveragesEstimator:
     def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
         """Estimate the poses of a capture: see `photonpano.PoseEstimator`.
 
-        Raises:
-            LocationError: the averages show too little texture, the camera only turns or travels too little, or the poses fall
-                into pieces.
+        Raises a `LocationError` if averages show too little texture, the camera only turns or hardly travels, or poses fall
+        into pieces.
         """
         spans = self._spans(source.info.n_frames)
         images = []
@@ -93,11 +93,8 @@ class AveragesEstimator:
         else:
             starts = list(range(0, n_frames - size + 1, self._config.step))
         spans = [FrameSpan(start, start + size) for start in starts if n_frames >= size]
-        if len(spans) < MIN_AVERAGES:
-            raise LocationError(
-                f"{n_frames} frames are {len(spans)} averages of {size}; at least {MIN_AVERAGES} are needed: choose a smaller "
-                "pose.with.group_size, or record longer"
-            )
+        if problem := too_few_averages(n_frames, len(spans), size):
+            raise LocationError(problem)
         return spans
 
     def _chosen(self, found: Reconstruction, spans: Sequence[FrameSpan]) -> Piece:
@@ -222,7 +219,7 @@ class _Assembly:
                 reason = f"their averages belong to piece {others[elsewhere[0]]}, which is not connected to the largest"
             elif inside:
                 matches = int(self.found.n_matches[inside].max())
-                reason = f"COLMAP found no pose for {_counted(inside)}, with at most {matches} matching keypoints"
+                reason = f"COLMAP found no pose for {counted(len(inside))}, with at most {matches} matching keypoints"
             else:
                 reason = "they are fewer than an average"
             lost.append(LostFrames(FrameSpan(start, stop), reason))
@@ -283,10 +280,10 @@ def relative_std(std_position: FloatArray, poses: FloatArray) -> float | None:
 
 
 def chosen_size(capture: CaptureSummary, n_frames: int) -> tuple[int, str]:
-    """Return the number of frames of an average, and a clause with the reason.
+    """Return the frames of an average, and a clause with the reason.
 
-    Light wants 60 photons a pixel, motion a blur of at most 6 px, and the less of both decides; a capture has 24 to 150
-    averages.
+    An average should have 60 photons a pixel, and a motion blur of at most 6 px: the shorter one is taken. A capture has 24 to
+    150.
     """
     light = _PHOTONS / max(capture.flux, 1e-9)
     motion = math.inf if not capture.speed_px else _BLUR_PX / capture.speed_px
@@ -326,15 +323,11 @@ def _picture(exposure: VirtualExposure) -> tuple[NDArray[np.uint8], NDArray[np.u
 
 
 def _between(frames: FloatArray, instants: FloatArray, std: FloatArray, apart: FloatArray, located: BoolArray) -> FloatArray:
-    """Return the expected error of each frame: that of the poses, and what a spline between them misses; NaN if not located."""
+    """Return the expected error of each frame, from poses and interpolation between them; NaN if not located."""
     at_poses = np.interp(frames, instants, std)
     # Distances of poses from the spline through the others hold the noise of the poses as well.
     missed = max(0.0, float(np.mean(apart**2)) - 2 * float(np.mean(std**2))) if len(apart) else 0.0
     return np.where(located, np.sqrt(at_poses**2 + _MISSED_SHARE * missed), np.nan)
-
-
-# Interpolation error of the spline between poses, as a fraction of the variance of leave-one-out errors.
-_MISSED_SHARE = 0.5
 
 
 def _require_texture(found: Reconstruction) -> None:
@@ -353,7 +346,3 @@ def _described(piece: Piece, spans: Sequence[FrameSpan]) -> str:
     named = " and ".join(f"{spans[run[0]].start} to {spans[run[-1]].stop - 1}" for run in runs[:3])
     more = f" and {len(runs) - 3} more spans" if len(runs) > 3 else ""
     return f"frames {named}{more} ({len(images)} averages)"
-
-
-def _counted(numbers: Sequence[int]) -> str:
-    return "1 average" if len(numbers) == 1 else f"{len(numbers)} averages"

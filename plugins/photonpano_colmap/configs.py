@@ -14,6 +14,21 @@ SEEDS = 2**31  # seeds of the library are below this
 MIN_AVERAGES = 5  # a spline through fewer poses would be a guess
 
 
+def counted(averages: int) -> str:
+    """Return a number of averages in words."""
+    return "1 average" if averages == 1 else f"{max(0, averages)} averages"
+
+
+def too_few_averages(n_frames: int, averages: int, size: int) -> str | None:
+    """Return the problem if a capture gives too few averages of some frames."""
+    if averages >= MIN_AVERAGES:
+        return None
+    return (
+        f"{n_frames} frames are {counted(averages)} of {size}; at least {MIN_AVERAGES} are needed: choose a smaller "
+        "pose.with.group_size, or record longer"
+    )
+
+
 class PycolmapTwoViewConfig(KeypointConfig):
     """COLMAP's features and matches, LO-RANSAC, least squares."""
 

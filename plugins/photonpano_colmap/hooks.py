@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import photonpano_colmap as plugin
-from photonpano import LocatorContribution, PoseEstimatorContribution, Requirement, hookimpl
-from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, PycolmapTwoViewConfig, StratifiedPoseConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from photonpano import StreamInfo
+from photonpano import LocatorContribution, PoseEstimatorContribution, Requirement, StreamInfo, hookimpl
+from photonpano_colmap.configs import ColmapAveragesConfig, PycolmapTwoViewConfig, StratifiedPoseConfig, too_few_averages
 
 _REQUIRES = (Requirement("pycolmap", "photonpano[colmap]"),)
 
@@ -53,11 +48,5 @@ def _problems_of_averages(config: ColmapAveragesConfig, stream: StreamInfo) -> l
     if config.group_size == "auto":
         return []
     step = config.group_size if config.step == "auto" else config.step
-    number = 1 + (stream.n_frames - config.group_size) // step
-    if number < MIN_AVERAGES:
-        averages = "1 average" if number == 1 else f"{max(0, number)} averages"
-        return [
-            f"{stream.n_frames} frames are {averages} of {config.group_size}; at least {MIN_AVERAGES} are needed: choose a "
-            "smaller pose.with.group_size, or record longer"
-        ]
-    return []
+    problem = too_few_averages(stream.n_frames, 1 + (stream.n_frames - config.group_size) // step, config.group_size)
+    return [problem] if problem else []

@@ -1,4 +1,4 @@
-"""The expected errors of poses that bundle adjustment found: the covariance of cameras, with origin, axes and scale aligned.
+"""Expected errors of poses from bundle adjustment: the covariance of cameras with origin, axes and scale aligned.
 
 Convention:
     X_c = R (X - c) for the position c of a camera. A pose is perturbed by a rotation vector of its camera, exp(w) R, and by a
@@ -21,19 +21,12 @@ _SMALLEST = 1e-12  # eigenvalues of the information below this fraction of the l
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseNoise:
-    """Expected errors, root mean square.
+    """Expected errors, root mean square."""
 
-    Attributes:
-        std_position: (N,) in units of the world.
-        std_rotation: (N,) in radians.
-        std_focal_px: 0 if the focal length is known.
-        residual_px: root mean square of the residuals along x and y.
-    """
-
-    std_position: FloatArray
-    std_rotation: FloatArray
-    std_focal_px: float
-    residual_px: float
+    std_position: FloatArray  # (N,) in units of the world
+    std_rotation: FloatArray  # (N,) in radians
+    std_focal_px: float  # 0 if the focal length is known
+    residual_px: float  # root mean square of the residuals along x and y
 
 
 def pose_noise(
@@ -43,17 +36,11 @@ def pose_noise(
     matrix: FloatArray,
     finds_focal: bool,
 ) -> PoseNoise:
-    """Return the expected errors of poses after the best alignment of positions with the true ones.
+    """Return the expected errors of (N, 3, 4) poses after the best alignment of positions with the true ones.
 
-    The points are eliminated (Schur complement), and the seven directions of the gauge are projected out of the covariance, as
-    a similarity that aligns the positions does. The noise of a position in an image is that of the residuals.
-
-    Args:
-        poses: (N, 3, 4), world to camera.
-        points: (M, 3).
-        observed: for each pose the indices of K points, and their (K, 2) ideal pixels.
-        matrix: (3, 3) K.
-        finds_focal: whether the focal length was found as well.
+    The points, (M, 3), are eliminated (Schur complement), and the seven directions of the gauge are projected out of the
+    covariance, as a similarity that aligns the positions does. The noise in an image is that of the residuals. `observed` are
+    for each pose the indices of K points, and their (K, 2) ideal pixels.
     """
     n_poses, size = len(poses), _POSE * len(poses) + finds_focal
     information = np.zeros((size, size))
@@ -108,12 +95,7 @@ def _linearised(
 
 
 def without_gauge(information: FloatArray, poses: FloatArray) -> FloatArray:
-    """Invert an information matrix, and project the covariance as the best alignment of the positions does.
-
-    Args:
-        information: (6 N, 6 N) of poses, or with one more unknown; see the convention of this module.
-        poses: (N, 3, 4).
-    """
+    """Invert (6 N, 6 N) information, or with one more unknown, and project the covariance as aligning the positions does."""
     values, vectors = np.linalg.eigh(information)
     inverted = np.where(values > _SMALLEST * values[-1], 1 / np.where(values > 0, values, 1), 0)
     covariance = (vectors * inverted) @ vectors.T

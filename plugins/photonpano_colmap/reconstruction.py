@@ -27,38 +27,25 @@ _START_ANGLE_DEG = 4.0  # parallax of COLMAP's initial pair; its own 16 degrees 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """Images whose poses are connected.
+    """Images whose poses are connected."""
 
-    Attributes:
-        images: (N,) their indices, increasing.
-        poses: (N, 3, 4), world to camera.
-        points: (M, 3) positions in the world.
-        observed: for each image the indices of K points, and where it shows them, (K, 2).
-        focal_px: focal length.
-        readings: how well this reading of the depth, and the other one, explain the images.
-    """
-
-    images: NDArray[np.intp]
-    poses: FloatArray
-    points: FloatArray
+    images: NDArray[np.intp]  # (N,) their indices, increasing
+    poses: FloatArray  # (N, 3, 4), world to camera
+    points: FloatArray  # (M, 3) positions in the world
+    # for each image the indices of K points, and where it shows them, (K, 2)
     observed: tuple[tuple[NDArray[np.intp], FloatArray], ...]
     focal_px: float
-    readings: Readings
+    readings: Readings  # how well this reading of the depth, and the other one, explain the images
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
-    """What COLMAP found.
+    """The result of COLMAP."""
 
-    Attributes:
-        pieces: the largest first, each with an image that no larger one has; empty if no pair of images was enough to begin
-            with.
-        n_keypoints: (N,) keypoints of each image.
-        n_matches: (N,) keypoints of each image that match those of another one, in agreement with a motion: the most of any.
-    """
-
+    # the largest first, each with an image that no larger one has; empty if no pair of images was enough to begin with
     pieces: tuple[Piece, ...]
-    n_keypoints: NDArray[np.intp]
+    n_keypoints: NDArray[np.intp]  # (N,) keypoints of each image
+    # (N,) keypoints of each image that match those of another one, in agreement with a motion: the most of any
     n_matches: NDArray[np.intp]
 
 
@@ -68,15 +55,9 @@ def reconstruct(
     config: ColmapAveragesConfig,
     seed: int,
 ) -> Reconstruction:
-    """Find the poses of images with COLMAP, in a folder that is removed again.
+    """Find the poses of pictures, (H, W) of 8 bits with masks, 0 where no keypoints may lie, in a temporary folder.
 
-    It has one thread: with more, COLMAP numbers the images in another order each time, and finds other poses.
-
-    Args:
-        images: (H, W) pictures of 8 bits, and masks of the same shape, 0 where no keypoints may lie.
-        camera: what is known.
-        config: mapper, matcher and number of keypoints.
-        seed: of RANSAC.
+    COLMAP has one thread: with more, it numbers the images in another order each time, and finds other poses.
     """
     # What it would print as an error, such as that it found no poses, becomes a message of ours.
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)

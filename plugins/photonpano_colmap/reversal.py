@@ -24,28 +24,16 @@ _ALIKE = 0.9  # neither reading is likelier if the ratio of their residuals is a
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """How well two readings of the depth explain the images.
+    """Residuals of two readings of the depth, and which is likelier."""
 
-    Attributes:
-        found_px: median distance of a point from where images show it, adjusted from the reading that COLMAP found.
-        reversed_px: the same, adjusted from near and far exchanged.
-        is_reversed: whether the likelier one is not what COLMAP found.
-        is_unsure: whether both differ, and explain the images alike.
-    """
-
-    found_px: float
-    reversed_px: float
-    is_reversed: bool = False
-    is_unsure: bool = False
+    found_px: float  # median distance of a point from where images show it, adjusted from the reading that COLMAP found
+    reversed_px: float  # the same, adjusted from near and far exchanged
+    is_reversed: bool = False  # whether the likelier one is not what COLMAP found
+    is_unsure: bool = False  # whether both differ, and explain the images alike
 
 
 def likelier_reading(found: pycolmap.Reconstruction, finds_focal: bool) -> tuple[pycolmap.Reconstruction, Readings]:
-    """Return a reconstruction as it is, or with its depth reversed if that explains the images better; and how well each does.
-
-    Args:
-        found: poses and points; it is not changed.
-        finds_focal: whether the focal length was found with them.
-    """
+    """Return a reconstruction, or a copy with its depth reversed if that explains the images better; and how well each does."""
     adjusted, other = copy.deepcopy(found), _reversed(found)
     found_px, reversed_px = _adjust(adjusted, finds_focal), _adjust(other, finds_focal)
     # Where perspective is strong, adjustment leads from the wrong reading to the right one.

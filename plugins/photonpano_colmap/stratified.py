@@ -38,11 +38,7 @@ class StratifiedEstimator:
         self._context = context
 
     def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
-        """Estimate the poses of a capture: see `photonpano.PoseEstimator`.
-
-        Raises:
-            LocationError: the averages have no poses, or a lens distorts, through which exposures are not merged.
-        """
+        """Estimate the poses of a capture: see `photonpano.PoseEstimator`; raises a `LocationError` if the lens distorts."""
         if any(camera.distortion):
             raise LocationError(
                 "stratified-pose merges no frames through a lens that distorts; leave out camera.distortion, or take "

@@ -11,14 +11,7 @@ from numpy.typing import NDArray
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import normalised
-from photonpano.locating import (
-    Matches,
-    PointLocator,
-    blur_against_noise,
-    motion_from_points,
-    stabilised_8_bit,
-    too_few_matches,
-)
+from photonpano.locating import Matches, PointLocator, blur_against_noise, motion_from_points, stabilised_8_bit, too_few_matches
 from photonpano_colmap.configs import FIRST_CENTRE, SEEDS, PycolmapTwoViewConfig
 
 MAX_TRIALS = 10_000  # of RANSAC, which finds a homography with 20 % inliers in half as many
@@ -27,19 +20,12 @@ _SIFT = pycolmap.FeatureExtractorType.SIFT
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """Keypoints of one exposure, the largest first.
+    """Keypoints of one exposure, the largest first."""
 
-    Attributes:
-        points: (N, 2) float64, pixel centres are integers.
-        sizes: (N,) float64, scales of the keypoints in px; position errors are proportional to them.
-        descriptors: (N, 128) uint8.
-        shape: (height, width) of the exposure.
-    """
-
-    points: FloatArray
-    sizes: FloatArray
-    descriptors: NDArray[np.uint8]
-    shape: tuple[int, int]
+    points: FloatArray  # (N, 2), pixel centres are integers
+    sizes: FloatArray  # (N,), scales of the keypoints in px; position errors are proportional to them
+    descriptors: NDArray[np.uint8]  # (N, 128)
+    shape: tuple[int, int]  # (height, width) of the exposure
 
     def for_matcher(self) -> tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors]:
         """Return points and descriptors in types of the library, which cannot be pickled; matching uses positions alone."""
@@ -50,8 +36,7 @@ class Features:
 class TwoViewLocator(PointLocator):
     """Extracts features once, matches them near the current motion or in the whole image, and fits all inliers.
 
-    The library's own threads are off. It holds the GIL while it extracts and matches, so that pairs are not processed in
-    parallel.
+    The library holds the GIL while it extracts and matches, so pairs are not processed in parallel; its own threads are off.
     """
 
     def __init__(self, config: PycolmapTwoViewConfig, seed: int) -> None:

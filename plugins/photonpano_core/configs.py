@@ -135,8 +135,8 @@ class ShortSpansConfig(Config):
     )
 
 
-class SplatConfig(Config):
-    """`splat` has no keys."""
+class NoKeys(Config):
+    """A component without keys."""
 
 
 class InterpolatorConfig(Config):
@@ -148,10 +148,6 @@ class InterpolatorConfig(Config):
         description="frames beyond the last located instant for which the velocity is kept before the motion stops; "
         "twice the mean distance of located instants by default",
     )
-
-
-class MergeConfig(Config):
-    """`merge`, the renderer, has no keys."""
 
 
 class SuperResolutionConfig(Config):
@@ -172,11 +168,3 @@ class ExrConfig(Config):
     compression: Literal["zip", "zips", "none"] = Field(
         "zip", description="compression, without loss: zip of 16 rows, zips of single rows, or none"
     )
-
-
-class RadianceConfig(Config):
-    """A Radiance picture."""
-
-
-class ThreadsConfig(Config):
-    """`threads`, the executor, has no keys."""

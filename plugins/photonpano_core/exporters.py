@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import FinishedPanorama
-    from photonpano_core.configs import ExrConfig
+from photonpano import FinishedPanorama
+from photonpano_core.configs import ExrConfig
 
 _BLOCK_ROWS = 256
 _COMPRESSIONS = {"none": "NO_COMPRESSION", "zip": "ZIP_COMPRESSION", "zips": "ZIPS_COMPRESSION"}
@@ -20,7 +17,7 @@ _COMPRESSIONS = {"none": "NO_COMPRESSION", "zip": "ZIP_COMPRESSION", "zips": "ZI
 class ExrExporter:
     """Writes channels `Y`, or `R`, `G` and `B`, with the flux, and layers `weight`, `std` and `saturated`.
 
-    Unseen pixels are 0, and transparent: `A` is 1 where a pixel was seen, so that viewers need not know NaN.
+    Unseen pixels are 0 and transparent (`A` is 0), since many viewers do not handle NaN.
     """
 
     def __init__(self, config: ExrConfig) -> None:
@@ -75,11 +72,7 @@ class RadianceExporter:
 
 
 def encoded(flux: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return red, green, blue and exponent of each pixel (Ward 1991): (h, w, 4).
-
-    Args:
-        flux: (h, w), or (h, w, 3) of red, green and blue; negative and unknown flux becomes 0.
-    """
+    """Return red, green, blue and exponent (Ward 1991), (h, w, 4), of flux, (h, w) or (h, w, 3); negative or unknown is 0."""
     colours = np.maximum(np.nan_to_num(flux), 0)
     colours = np.repeat(colours[..., None], 3, axis=-1) if colours.ndim == 2 else colours
     brightest = colours.max(axis=-1)

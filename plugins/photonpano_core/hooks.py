@@ -1,49 +1,33 @@
-"""Hooks: the components that this plugin offers."""
+"""Hooks of the plugin."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 import photonpano_core as plugin
 from photonpano import (
+    Executor,
+    ExecutorContext,
     ExecutorContribution,
     ExporterContribution,
     InterpolatorContribution,
     MergerContribution,
     RefinerContribution,
+    Renderer,
     RendererContribution,
     Requirement,
+    Resampler,
     ResamplerContribution,
     SourceContribution,
+    StageContext,
+    StreamInfo,
     hookimpl,
 )
-from photonpano_core.configs import (
-    BurstConfig,
-    ExrConfig,
-    GroupedConfig,
-    InterpolatorConfig,
-    LocalFlowConfig,
-    MergeConfig,
-    MidpointConfig,
-    PhotonMleConfig,
-    RadianceConfig,
-    RobustMergeConfig,
-    ShortSpansConfig,
-    SlidingWindowConfig,
-    SplatConfig,
-    StratifiedConfig,
-    SuperResolutionConfig,
-    ThreadsConfig,
-)
-from photonpano_core.group_size import shortest_of
-from photonpano_core.resamplers import too_short
+from photonpano_core import configs
+from photonpano_core.resamplers import shortest_of, too_short
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from photonpano import Executor, ExecutorContext, Renderer, Resampler, StageContext, StreamInfo
-
-Grouped = TypeVar("Grouped", bound=GroupedConfig)
+Grouped = TypeVar("Grouped", bound=configs.GroupedConfig)
 
 
 @hookimpl
@@ -60,27 +44,27 @@ def photonpano_resamplers() -> Iterator[ResamplerContribution]:
     yield _resampler(
         "midpoint",
         "Groups of equal size; each level adds one between every two (paper, section 4)",
-        MidpointConfig,
+        configs.MidpointConfig,
         lambda config, _: plugin.MidpointResampler(config),
         densifies=True,
     )
     yield _resampler(
         "stratified",
         "As many groups as midpoint, at random instants, one in each stratum",
-        StratifiedConfig,
+        configs.StratifiedConfig,
         lambda config, context: plugin.StratifiedResampler(config, context.seed),
         densifies=True,
     )
     yield _resampler(
         "sliding-window",
         "Groups at a fixed step, the same at each level (the paper's baseline)",
-        SlidingWindowConfig,
+        configs.SlidingWindowConfig,
         lambda config, _: plugin.SlidingWindowResampler(config),
     )
     yield _resampler(
         "constant-groups",
         "The same groups side by side at each level (the paper's failing ablation)",
-        GroupedConfig,
+        configs.GroupedConfig,
         lambda config, _: plugin.ConstantGroupsResampler(config),
     )
 
@@ -91,32 +75,32 @@ def photonpano_mergers() -> Iterator[MergerContribution]:
     yield MergerContribution(
         name="photon-mle",
         summary="Maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
-        config=PhotonMleConfig,
+        config=configs.PhotonMleConfig,
         build=lambda config, context: plugin.PhotonMleMerger(config, context.decide),
     )
     yield MergerContribution(
         name="robust-merge",
         summary="photon-mle without ghosts: moving objects get less weight (Ma et al. 2020)",
-        config=RobustMergeConfig,
+        config=configs.RobustMergeConfig,
         build=lambda config, _: plugin.RobustMerger(config),
     )
     yield MergerContribution(
         name="splat",
         summary="Warps each photon along the motion of its own frame: for low light and fast motion",
-        config=SplatConfig,
+        config=configs.NoKeys,
         build=lambda _config, _context: plugin.SplatMerger(),
         accepts_corrected_sums=False,
     )
     yield MergerContribution(
         name="local-flow",
         summary="photon-mle, and optical flow where photons contradict the global motion: moving things and parallax are sharp",
-        config=LocalFlowConfig,
+        config=configs.LocalFlowConfig,
         build=lambda config, _: plugin.LocalFlowMerger(config),
     )
     yield MergerContribution(
         name="burst",
         summary="Quanta burst photography (Ma et al. 2020): blocks of frames aligned patch by patch in one shot, a baseline",
-        config=BurstConfig,
+        config=configs.BurstConfig,
         build=lambda config, _: plugin.BurstMerger(config),
     )
 
@@ -127,25 +111,25 @@ def photonpano_interpolators() -> Iterator[InterpolatorContribution]:
     yield InterpolatorContribution(
         name="lucas-kanade",
         summary="Cubic spline of the eight parameters of the homography (paper, section 4)",
-        config=InterpolatorConfig,
+        config=configs.InterpolatorConfig,
         build=lambda config, _: plugin.LucasKanadeInterpolator(config),
     )
     yield InterpolatorContribution(
         name="smoothing-spline",
         summary="Cubic spline of the eight parameters, whose smoothness follows from the noise",
-        config=InterpolatorConfig,
+        config=configs.InterpolatorConfig,
         build=lambda config, context: plugin.SmoothingSplineInterpolator(config, context.stream.frame_shape),
     )
     yield InterpolatorContribution(
         name="geodesic",
         summary="Constant velocity from each located instant to the next, along geodesics",
-        config=InterpolatorConfig,
+        config=configs.InterpolatorConfig,
         build=lambda config, _: plugin.GeodesicInterpolator(config),
     )
     yield InterpolatorContribution(
         name="lie",
         summary="Cubic spline in the group of the homographies",
-        config=InterpolatorConfig,
+        config=configs.InterpolatorConfig,
         build=lambda config, context: plugin.LieInterpolator(config, context.stream.frame_shape),
     )
 
@@ -156,7 +140,7 @@ def photonpano_refiners() -> Iterator[RefinerContribution]:
     yield RefinerContribution(
         name="short-spans",
         summary="Tremor inside groups, from the shifts of spans of a few frames against the panorama",
-        config=ShortSpansConfig,
+        config=configs.ShortSpansConfig,
         build=lambda config, context: plugin.ShortSpansRefiner(
             config, context.stream.frame_shape, context.stream.frame_rate_hz
         ),
@@ -169,7 +153,7 @@ def photonpano_renderers() -> Iterator[RendererContribution]:
     yield RendererContribution(
         name="merge",
         summary="Maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
-        config=MergeConfig,
+        config=configs.NoKeys,
         build=_build_merge,
         divides_by_light=True,
         renders_on_any_canvas=True,
@@ -177,7 +161,7 @@ def photonpano_renderers() -> Iterator[RendererContribution]:
     yield RendererContribution(
         name="super-resolution",
         summary="The most probable flux on a fine grid, with the area of pixels and a denoiser as prior",
-        config=SuperResolutionConfig,
+        config=configs.SuperResolutionConfig,
         build=lambda config, context: plugin.SuperResolutionRenderer(config, context.threads, context.decide),
         bytes_per_pixel=90,  # as measured by tests/benchmarks/super_resolution.py --large
         divides_by_light=True,
@@ -190,7 +174,7 @@ def photonpano_exporters() -> Iterator[ExporterContribution]:
     yield ExporterContribution(
         name="exr",
         summary="OpenEXR: flux, weight, standard deviation and saturated pixels as channels of 32 bits",
-        config=ExrConfig,
+        config=configs.ExrConfig,
         suffix=".exr",
         requires=(Requirement("OpenEXR", "photonpano[exr]"),),
         build=lambda config, _: plugin.ExrExporter(config),
@@ -198,7 +182,7 @@ def photonpano_exporters() -> Iterator[ExporterContribution]:
     yield ExporterContribution(
         name="hdr",
         summary="Radiance: flux in 8 bits a colour with a common exponent",
-        config=RadianceConfig,
+        config=configs.NoKeys,
         suffix=".hdr",
         build=lambda _config, _context: plugin.RadianceExporter(),
     )
@@ -210,7 +194,7 @@ def photonpano_executors() -> Iterator[ExecutorContribution]:
     yield ExecutorContribution(
         name="threads",
         summary="Threads of this process, as many as run.threads says",
-        config=ThreadsConfig,
+        config=configs.NoKeys,
         build=_build_threads,
     )
 
@@ -233,18 +217,18 @@ def _resampler(
     return ResamplerContribution(name=name, summary=summary, config=config, build=build, check=_check_groups)
 
 
-def _check_groups(config: GroupedConfig, stream: StreamInfo) -> list[str]:
+def _check_groups(config: configs.GroupedConfig, stream: StreamInfo) -> list[str]:
     problem = too_short(shortest_of(stream) if config.group_size == "auto" else config.group_size, stream.n_frames)
     return [problem] if problem else []
 
 
-def _build_merge(_: MergeConfig, context: StageContext) -> Renderer:
+def _build_merge(_: configs.NoKeys, context: StageContext) -> Renderer:
     from photonpano.merging import MergeRenderer
 
     return MergeRenderer(context.in_order)
 
 
-def _build_threads(_: ThreadsConfig, context: ExecutorContext) -> Executor:
+def _build_threads(_: configs.NoKeys, context: ExecutorContext) -> Executor:
     from photonpano.execution import LocalExecutor
 
     return LocalExecutor(context.threads)

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
-from photonpano import ExecutorContribution, Requirement, hookimpl
+from photonpano import Executor, ExecutorContext, ExecutorContribution, Requirement, hookimpl
 from photonpano_dask.configs import DaskConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from photonpano import Executor, ExecutorContext
 
 
 @hookimpl

@@ -29,11 +29,7 @@ _SETTINGS_OF_TASKS = {
 
 
 def workers_of(config: DaskConfig, context: ExecutorContext) -> DaskWorkers:
-    """Connect to a scheduler, or start workers on this machine.
-
-    Raises:
-        InputError: no scheduler answers, it has no workers, or they differ from this process.
-    """
+    """Connect to a scheduler, or start workers on this machine; raises an `InputError` if none fits this process."""
     cluster: LocalCluster | None = None
     with dask.config.set(_SETTINGS):
         if config.address is None:

@@ -1,4 +1,7 @@
-"""Align one layer of an exposure, the template, to that of another, and estimate how well."""
+"""Align one layer of an exposure, the template, to that of another, and estimate how well.
+
+Inverse-compositional Gauss-Newton steps on homographies (Baker and Matthews 2004), with Levenberg-Marquardt damping.
+"""
 
 from __future__ import annotations
 
@@ -9,53 +12,53 @@ from threading import local
 import numpy as np
 
 from photonpano import FloatArray, Homography, NotLocated
-from photonpano.geometry import corners, generators, slopes, unit_coordinates, why_implausible
-from photonpano.locating import NO_TEXTURE, PRIOR_STD, information_on_turn
-from photonpano_direct import descent
-from photonpano_direct.curvature import information_of
-from photonpano_direct.moments import Buffers, Layer
+from photonpano.compiling import compiled
+from photonpano.geometry import corners, generators, slopes, unit_coordinates, violation, why_implausible
+from photonpano.locating import NO_TEXTURE, information_on_turn
+from photonpano_direct.curvature import (
+    MOMENTS_X,
+    MOMENTS_Y,
+    PRIOR,
+    Coordinates,
+    chance_level,
+    curvatures,
+    expected_px,
+    information_of,
+)
+from photonpano_direct.moments import Buffers, Layer, residuals_and_moments
+from photonpano_direct.small_matrices import applied, dot, inverse_homography, product, scaled_to_one, solve, transposed
 
-# (8, 8) inverse covariance of p1..p8 in unit coordinates: between two exposures a camera shifts the image by any amount, but
-# rolls by 1 or 2 degrees and changes the perspective by little.
-_PRIOR = np.diag(np.array([PRIOR_STD, PRIOR_STD, PRIOR_STD, PRIOR_STD, np.inf, np.inf, PRIOR_STD, PRIOR_STD]) ** -2.0)
+# Exit status: no texture is flat, an impossible homography diverges.
+_CONVERGED, _FLAT, _MAX_STEPS, _DIVERGED = 0, 1, 2, 3
+_MIN_CURVATURE = 5.0  # floor on the common curvature, relative to that of noise by chance; it bounds the steps
+# Levenberg-Marquardt damping after a step that raised the cost, as a fraction of the Hessian of the template; multiplied by 4
+# on each further failure, and halved by each step that lowers the cost.
+_DAMPING = 0.1
+_NEGLIGIBLE = 0.02  # converged below this fraction of the expected error: in the dark, steps stay small for long
+_HESSIAN_PX = 0.25  # the Hessian is updated after steps above this
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quality:
-    """How well two images agree.
+    """Accuracy of an alignment, and the agreement of the images."""
 
-    Attributes:
-        information: (8, 8) inverse covariance of p1..p8 of the homography, from the photons of both images.
-        noise_ratio: mean squared residual relative to that of photon noise.
-        overlap: fraction of the template that both see.
-        std_px: expected error of a corner, in px of the layer.
-    """
-
-    information: FloatArray
-    noise_ratio: float
-    overlap: float
-    std_px: float
+    information: FloatArray  # (8, 8) inverse covariance of p1..p8 of the homography, from the photons of both images
+    noise_ratio: float  # mean squared residual relative to that of photon noise
+    overlap: float  # fraction of the template that both see
+    std_px: float  # expected error of a corner, in px of the layer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aligned:
-    """An aligned template.
-
-    Attributes:
-        template: the moving layer.
-        homography: (3, 3), pixels of the template to pixels of the fixed layer.
-        pixels: number of pixels that both see.
-        squares: weighted sum of the squared residuals.
-        weights: sum of the weights, the inverse variances of the residuals.
-        buffers: residual and weight at the last step. They belong to the thread, and are valid until it aligns another template
-            of this shape.
-    """
+    """An aligned template."""
 
     template: Layer
-    homography: Homography
-    pixels: int
-    squares: float
-    weights: float
+    homography: Homography  # (3, 3), pixels of the template to pixels of the fixed layer
+    pixels: int  # number of pixels that both see
+    squares: float  # weighted sum of the squared residuals
+    weights: float  # sum of the weights, the inverse variances of the residuals
+    # residual and weight at the last step. They belong to the thread, and are valid until it aligns another template of this
+    # shape
     buffers: Buffers
 
     @property
@@ -64,11 +67,7 @@ class Aligned:
         return self.pixels / self.template.image.size
 
     def quality(self, camera_matrix: FloatArray | None) -> Quality:
-        """Return how well the images agree. Overwrites the buffers, so it can be called once.
-
-        Args:
-            camera_matrix: (3, 3) K, in px of the layer, if only a turn was estimated; else None.
-        """
+        """Return how well the images agree, given K in px of the layer for a rotation; it overwrites the buffers."""
         # A Gaussian blur of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
         noise_ratio = self.squares / self.pixels * 4 * np.pi * self.template.blur_px**2
         shape = (self.template.image.shape[0], self.template.image.shape[1])
@@ -79,9 +78,7 @@ class Aligned:
             self.pixels,
             self.weights,
             noise_ratio,
-            _PRIOR,
-            np.array(generators(shape)),
-            _to_corners(shape),
+            _coordinates(shape),
         )
         if camera_matrix is not None and np.isfinite(std_px):
             information, std_px = information_on_turn(information, self.homography, camera_matrix, shape)
@@ -97,46 +94,38 @@ def align(
     tolerance_px: float,
     max_steps: int,
 ) -> Aligned | NotLocated:
-    """Align a template to another layer.
+    """Align a template to another layer of the same shape, from an initial map of its pixels to those of the other layer.
 
-    Args:
-        template: the moving layer.
-        fixed: the other layer, of the same shape.
-        homography: (3, 3) initial map, pixels of the template to pixels of the fixed layer.
-        prior_mean: (3, 3) prior mean of the homography.
-        basis: (8, K) small changes of p1..p8 in unit coordinates that are estimated.
-        tolerance_px: converged when a step moves no corner further.
-        max_steps: step limit.
+    `basis` (8, K) are the small changes of p1..p8 in unit coordinates that are estimated. It has converged when a step moves no
+    corner further than `tolerance_px`.
     """
     shape = (template.image.shape[0], template.image.shape[1])
     buffers = buffers_of(template)
-    status, homography, pixels, squares, weights = descent.descend(
+    status, homography, pixels, squares, weights = descend(
         template,
         fixed,
         homography,
         prior_mean,
-        _PRIOR,
-        np.array(unit_coordinates(shape)),
+        _coordinates(shape),
         basis,
-        _to_corners(shape),
         tolerance_px,
         max_steps,
         buffers,
     )
-    if status == descent.CONVERGED:
+    if status == _CONVERGED:
         return Aligned(template, homography, pixels, squares, weights, buffers)
-    if status == descent.DIVERGED:
+    if status == _DIVERGED:
         return NotLocated(f"the alignment diverges: {why_implausible(homography, shape, 0.0)}")
-    if status == descent.NO_TEXTURE:
+    if status == _FLAT:
         return NotLocated(NO_TEXTURE)
     return NotLocated(f"the alignment has not converged after {max_steps} steps")
 
 
 @cache
-def _to_corners(shape: tuple[int, int]) -> FloatArray:
-    """Return the derivatives of the corners of an image with respect to p1..p8: (8, 8)."""
+def _coordinates(shape: tuple[int, int]) -> Coordinates:
     homogeneous = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
-    return np.ascontiguousarray(slopes(homogeneous, generators(shape) @ homogeneous))
+    to_corners = np.ascontiguousarray(slopes(homogeneous, generators(shape) @ homogeneous))
+    return Coordinates(np.array(unit_coordinates(shape)), np.array(generators(shape)), to_corners)
 
 
 _of_thread = local()
@@ -149,3 +138,118 @@ def buffers_of(layer: Layer) -> Buffers:
     if shape not in buffers:
         buffers[shape] = Buffers(*(np.empty(size, np.float32) for size in (shape, shape, (2, *shape))))
     return buffers[shape]
+
+
+@compiled
+def descend(
+    moving: Layer,
+    fixed: Layer,
+    homography: Homography,
+    prior_mean: Homography,
+    coordinates: Coordinates,
+    basis: FloatArray,
+    tolerance_px: float,
+    max_steps: int,
+    buffers: Buffers,
+) -> tuple[int, Homography, int, float, float]:
+    """Align a template to an image of the same shape.
+
+    Args:
+        moving: the template.
+        fixed: the other image.
+        homography: (3, 3) initial map, pixels of the template to pixels of the fixed image.
+        prior_mean: (3, 3) prior mean of the homography.
+        coordinates: of the template.
+        basis: (8, K) small changes in unit coordinates of the template that are estimated.
+        tolerance_px: converged when the next step is expected to move no corner further.
+        max_steps: step limit.
+        buffers: filled by `residuals_and_moments` at the start of the last step.
+
+    Returns:
+        The exit status, the homography, and the result of `residuals_and_moments` at the start of the last step.
+    """
+    height, width = moving.image.shape
+    half = max(height, width) / 2
+    unit = coordinates.unit
+    from_unit, to_prior_mean = inverse_homography(unit), product(unit, inverse_homography(prior_mean))
+    moments_x, moments_y = np.empty((3, 3)), np.empty((3, 3))
+    own, hessian = np.zeros((8, 8)), np.zeros((8, 8))
+    of_basis, gradient = transposed(basis), np.empty((8, 1))
+    std_px, hessian_is_current = 0.0, False
+    damping, previous, least_cost, last_px = 0.0, homography, np.inf, 0.0
+    pixels, squares, weights = 0, 0.0, 0.0
+    for _ in range(max_steps):
+        pixels, squares, weights = residuals_and_moments(moving, fixed, homography, buffers, moments_x, moments_y)
+        if pixels == 0:
+            return _FLAT, homography, pixels, squares, weights
+        if not hessian_is_current:
+            floor = min(0.5, _MIN_CURVATURE * chance_level(pixels, moving.blur_px))
+            own, hessian = curvatures(moving, buffers, 0.0, floor)
+            for i in range(8):
+                for j in range(8):
+                    hessian[i, j] += PRIOR[i, j]
+            std_px, hessian_is_current = expected_px(hessian, basis, coordinates.to_corners), True
+        deviation = _parameters(product(product(to_prior_mean, homography), from_unit))
+        prior_gradient = applied(PRIOR, deviation)
+        cost = (squares + dot(deviation, prior_gradient)) / pixels
+        for k in range(8):
+            image_gradient = dot(MOMENTS_X[k], moments_x.reshape(-1)) + dot(MOMENTS_Y[k], moments_y.reshape(-1))
+            gradient[k, 0] = half * image_gradient + prior_gradient[k]
+        unknowns = product(of_basis, gradient)
+        if not solve(product(of_basis, product(hessian + damping * own, basis)), unknowns):
+            return _FLAT, homography, pixels, squares, weights
+        p = product(basis, unknowns)[:, 0]
+        step = product(product(from_unit, _from_parameters(p)), unit)
+        step_px = _corner_px(step, height, width)
+        if step_px > _HESSIAN_PX:
+            hessian_is_current = False
+        if cost > least_cost:
+            # The last step raised the cost: repeat it with more damping.
+            homography, least_cost, last_px, damping = previous, np.inf, 0.0, max(_DAMPING, 4 * damping)
+            continue
+        previous, least_cost, damping = homography, cost, damping / 2
+        homography = scaled_to_one(product(homography, inverse_homography(step)))
+        # An alignment that passes through an impossible homography may return, but not to the true one.
+        if violation(homography, height, width)[0]:
+            return _DIVERGED, homography, pixels, squares, weights
+        # Convergence is linear: the ratio of the next step to this one is that of this one to the last.
+        if step_px * (min(1.0, step_px / last_px) if last_px > 0 else 1.0) < max(tolerance_px, _NEGLIGIBLE * std_px):
+            return _CONVERGED, homography, pixels, squares, weights
+        last_px = step_px
+    return _MAX_STEPS, homography, pixels, squares, weights
+
+
+@compiled
+def _parameters(homography: Homography) -> FloatArray:
+    """Return p1..p8 of a homography."""
+    p = np.empty(8)
+    for i in range(8):
+        # The matrix column by column: [[1 + p1, p3, p5], [p2, 1 + p4, p6], [p7, p8, 1]].
+        row, column = (i % 2, i // 2) if i < 6 else (2, i - 6)
+        p[i] = homography[row, column] / homography[2, 2] - (1.0 if row == column else 0.0)
+    return p
+
+
+@compiled
+def _from_parameters(p: FloatArray) -> Homography:
+    """Return the homography of p1..p8."""
+    homography = np.eye(3)
+    for i in range(8):
+        row, column = (i % 2, i // 2) if i < 6 else (2, i - 6)
+        homography[row, column] += p[i]
+    return homography
+
+
+@compiled
+def _corner_px(step: Homography, height: int, width: int) -> float:
+    """Return the largest displacement of a corner of an image by a step."""
+    largest = 0.0
+    for x in (0.0, width - 1.0):
+        for y in (0.0, height - 1.0):
+            depth = step[2, 0] * x + step[2, 1] * y + step[2, 2]
+            u = (step[0, 0] * x + step[0, 1] * y + step[0, 2]) / depth - x
+            v = (step[1, 0] * x + step[1, 1] * y + step[1, 2]) / depth - y
+            distance = np.sqrt(u * u + v * v) if depth > 0 else np.inf
+            if not distance <= largest:
+                largest = distance
+    return largest

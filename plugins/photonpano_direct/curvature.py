@@ -7,12 +7,14 @@ Parameters are p1..p8 in unit coordinates, which run from -1 to 1 along the long
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
-from photonpano.locating import MIN_COMMON_CURVATURE
+from photonpano.locating import MIN_COMMON_CURVATURE, PRIOR_STD
 from photonpano_direct.moments import Buffers, Layer, derivative_moments, differentiate
 from photonpano_direct.small_matrices import cholesky, dot, product, solve_lower, transposed
 
@@ -50,6 +52,19 @@ def _moments_of_products() -> FloatArray:
 MOMENTS_X, MOMENTS_Y, _MOMENTS_OF_PRODUCTS = _X.reshape(8, 9), _Y.reshape(8, 9), _moments_of_products()
 
 
+# (8, 8) inverse covariance of p1..p8 in unit coordinates: between two exposures a camera shifts the image by any amount, but
+# rolls by 1 or 2 degrees and changes the perspective by little.
+PRIOR = np.diag(np.array([PRIOR_STD, PRIOR_STD, PRIOR_STD, PRIOR_STD, np.inf, np.inf, PRIOR_STD, PRIOR_STD]) ** -2.0)
+
+
+class Coordinates(NamedTuple):
+    """Unit coordinates of an image of some shape."""
+
+    unit: FloatArray  # (3, 3), pixels to unit coordinates
+    generators: FloatArray  # (8, 3, 3), see `photonpano.geometry.generators`
+    to_corners: FloatArray  # (8, 8), derivatives of the corners with respect to p1..p8, in px
+
+
 @compiled
 def chance_level(pixels: int, blur_px: float) -> float:
     """Return the curvature that the noise of two images has in common by chance, relative to that of one of them."""
@@ -61,13 +76,8 @@ def curvatures(moving: Layer, buffers: Buffers, chance: float, floor: float) -> 
     """Return the (8, 8) Gauss-Newton Hessian of the template, and the part that both images have in common.
 
     The noise of the template has derivatives too, larger in the dark than those of the scene. The two images have only the
-    scene in common.
-
-    Args:
-        moving: the template.
-        buffers: residual and weight from `residuals_and_moments`; the gradients are overwritten.
-        chance: common curvature of noise by chance, relative to the template's; it is subtracted.
-        floor: lower bound of the eigenvalues of the common curvature, relative to the template's.
+    scene in common. The common curvature of noise by `chance` is subtracted, and eigenvalues stay above `floor`, both relative
+    to the template's. The gradients of the buffers are overwritten.
     """
     own = _hessian(moving.gradients, moving.gradients, buffers.weight)
     differentiate(buffers.residual, buffers.gradients)
@@ -91,13 +101,7 @@ def curvatures(moving: Layer, buffers: Buffers, chance: float, floor: float) -> 
 
 @compiled
 def _hessian(first: NDArray[np.float32], second: NDArray[np.float32], weight: NDArray[np.float32]) -> FloatArray:
-    """Return the (8, 8) weighted sums over pixels of products of their derivatives with respect to two parameters.
-
-    Args:
-        first: (2, H, W) derivatives of one image along x and y.
-        second: (2, H, W) those of the other.
-        weight: (H, W).
-    """
+    """Return (8, 8) weighted sums of products of derivatives by two parameters, from (2, H, W) derivatives along x and y."""
     moments = np.empty((3, 5, 5))
     derivative_moments(first, second, weight, moments)
     height, width = weight.shape
@@ -113,10 +117,7 @@ def _hessian(first: NDArray[np.float32], second: NDArray[np.float32], weight: ND
 def expected_px(information: FloatArray, basis: FloatArray, to_corners: FloatArray) -> float:
     """Return the expected error of a corner in px if noise is white; 0 if the information is singular.
 
-    Args:
-        information: (8, 8) inverse covariance of p1..p8.
-        basis: (8, K) changes of p1..p8 that are estimated.
-        to_corners: (8, 8) derivatives of the corners with respect to p1..p8, in px.
+    `basis` (8, K) are the changes of p1..p8 that are estimated, `to_corners` (8, 8) the derivatives of the corners by p1..p8.
     """
     of_basis, n = transposed(basis), basis.shape[1]
     root, moves = np.zeros((n, n)), transposed(product(to_corners, basis))
@@ -135,26 +136,12 @@ def information_of(
     pixels: int,
     weights: float,
     noise_ratio: float,
-    prior: FloatArray,
-    generators: FloatArray,
-    to_corners: FloatArray,
+    coordinates: Coordinates,
 ) -> tuple[FloatArray, float]:
-    """Return the information matrix and the expected corner error of an aligned pair.
+    """Return the inverse covariance of p1..p8, (8, 8), and the expected error of a corner in px, infinite without texture.
 
-    Args:
-        moving: the template.
-        buffers: residual and weight from `residuals_and_moments`; all are overwritten.
-        homography: (3, 3), pixels of the template to pixels of the fixed image.
-        pixels: number of pixels that both see.
-        weights: the sum of their weights.
-        noise_ratio: mean squared residual relative to that of photon noise.
-        prior: (8, 8) inverse covariance of the prior.
-        generators: (8, 3, 3), see `photonpano.geometry.generators`.
-        to_corners: (8, 8) derivatives of the corners of the template with respect to the parameters, in px.
-
-    Returns:
-        The (8, 8) inverse covariance of p1..p8 of the homography, and the expected error of a corner in px of the layer,
-        infinite without texture.
+    Residual and weight of the buffers come from `residuals_and_moments`, and all are overwritten. `noise_ratio` is the mean
+    squared residual relative to that of photon noise.
     """
     _, hessian = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
     # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights and positions
@@ -166,17 +153,17 @@ def information_of(
             row[t] *= row[t] * per_pixel
     scatter, root = _hessian(moving.smoothed, moving.smoothed, buffers.weight), np.zeros((8, 8))
     if not cholesky(scatter, root):
-        return prior, np.inf
+        return PRIOR.copy(), np.inf
     solve_lower(root, hessian)
     information = product(transposed(hessian), hessian)
     for i in range(8):
         for j in range(8):
-            information[i, j] = information[i, j] / max(1.0, noise_ratio) + prior[i, j]
-    std_px = expected_px(information, np.eye(8), to_corners)
+            information[i, j] = information[i, j] / max(1.0, noise_ratio) + PRIOR[i, j]
+    std_px = expected_px(information, np.eye(8), coordinates.to_corners)
     # From steps in unit coordinates of the template to p1..p8 of the homography, with h33 = 1.
     to_parameters = np.empty((8, 8))
     for k in range(8):
-        changed = product(homography, generators[k])
+        changed = product(homography, coordinates.generators[k])
         for i in range(8):
             row_i, column_i = (i % 2, i // 2) if i < 6 else (2, i - 6)
             to_parameters[i, k] = changed[row_i, column_i] - homography[row_i, column_i] * changed[2, 2]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import photonpano_direct as plugin
 from photonpano import LocatorContribution, hookimpl
 from photonpano_direct.configs import DirectConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @hookimpl

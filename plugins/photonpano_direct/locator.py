@@ -23,8 +23,7 @@ from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.majority import JUDGED, masked, part_following, shifts_between
 from photonpano_direct.moments import Layer
-from photonpano_direct.pyramid import Pyramid, pyramid_of
-from photonpano_direct.similarity import similarity_under
+from photonpano_direct.pyramid import Pyramid, pyramid_of, similarity_under
 from photonpano_direct.small_matrices import rescaled
 
 _EXACT_PX = 0.1  # expected corner error below which coarser layers are not considered
@@ -40,32 +39,19 @@ _BLUR_DIFFERENCE = 0.1
 
 
 class _Descent(NamedTuple):
-    """The alignment of some layers.
+    """The alignment of some layers."""
 
-    Attributes:
-        homography: (3, 3) the motion, in pixels of the finest layer.
-        found: scales of the layers on which all parameters were estimated, and their alignments, coarsest first.
-        failure: why a layer could not be aligned, of the last one that could not; None if all could.
-    """
-
-    homography: Homography
+    homography: Homography  # (3, 3) the motion, in pixels of the finest layer
+    # scales of the layers on which all parameters were estimated, and their alignments, coarsest first
     found: Sequence[tuple[float, Aligned]]
-    failure: NotLocated | None
+    failure: NotLocated | None  # why a layer could not be aligned, of the last one that could not; None if all could
 
 
 class DirectLocator:
-    """Aligns exposures by their brightness, coarse to fine, weighted by the photon statistics of both.
-
-    Where a part of the image follows another motion than most of it, such as an object, that part is left out.
-    """
+    """Aligns exposures by their brightness, coarse to fine, and leaves out a part that follows another motion."""
 
     def __init__(self, config: DirectConfig, camera_matrix: FloatArray | None = None) -> None:
-        """Prepare to align.
-
-        Args:
-            config: of the locator.
-            camera_matrix: (3, 3) K, in px of the exposures, of a camera that only turns; None for any other.
-        """
+        """Take (3, 3) K, in px of the exposures, of a camera that only turns; None for any other."""
         self._config = config
         self._camera_matrix = camera_matrix
 
@@ -85,12 +71,7 @@ class DirectLocator:
         return _hypotheses(*coarsest, len(moving.layers))
 
     def register(self, moving: Pyramid, fixed: Pyramid, initial: Homography | None) -> Located | NotLocated:
-        """Align; see `photonpano.Locator`.
-
-        Returns:
-            `NotLocated` with the numbers that decided when the alignment diverges, when too little overlaps, or when the images
-            differ after alignment.
-        """
+        """Align; see `photonpano.Locator`."""
         if not (moving.layers[-1].weight.any() and fixed.layers[-1].weight.any()):
             return NotLocated(NOTHING_SEEN)
         searches = initial is None
@@ -181,7 +162,7 @@ class _Alignment:
     ) -> tuple[Pyramid, _Descent]:
         """Restrict an alignment to the larger part that follows one motion, if the images do not follow it as a whole.
 
-        `first` is the alignment of the coarse layers, down to the layer `judged` on which parts are compared, from `start`. Of
+        `first` is the alignment from `start` of the coarse layers, down to the layer `judged` on which parts are compared. Of
         several motions, that of the camera fits most of the image.
         """
         n_layers = len(moving.layers)

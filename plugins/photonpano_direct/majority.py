@@ -1,23 +1,16 @@
-"""Restrict an alignment to the part of an image that follows one motion: that of the camera, and not that of an object."""
+"""Restrict an alignment to the part of an image that follows the motion of the camera, not that of an object."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
+from photonpano import BoolArray, Homography
 from photonpano.geometry import translation
 from photonpano.locating import Follows, follows
 from photonpano_direct.alignment import buffers_of
-from photonpano_direct.moments import residuals_and_moments
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from photonpano import BoolArray, Homography
-    from photonpano_direct.moments import Layer
-    from photonpano_direct.pyramid import Pyramid
+from photonpano_direct.moments import Image, Layer, residuals_and_moments
+from photonpano_direct.pyramid import Pyramid
 
 JUDGED = 1  # layer on which parts are compared: coarse, so that noise and small errors of the motion do not matter
 _DIFFERENT = 0.5  # cap on the residual of a pixel in a search for shifts, relative to its usual one
@@ -28,13 +21,7 @@ _TRIED = 3  # number of shifts that a search returns
 
 
 def part_following(moving: Layer, fixed: Layer, homography: Homography) -> Follows:
-    """Find the part of a template that follows a motion.
-
-    Args:
-        moving: the template.
-        fixed: the other image, of the same shape.
-        homography: (3, 3), pixels of the template to pixels of the fixed image.
-    """
+    """Find the part of a template that follows a motion, (3, 3), to pixels of another image of the same shape."""
     buffers = buffers_of(moving)
     residuals_and_moments(moving, fixed, homography, buffers, np.empty((3, 3)), np.empty((3, 3)))
     noise_left = 1 / (4 * np.pi * moving.blur_px**2)
@@ -44,13 +31,9 @@ def part_following(moving: Layer, fixed: Layer, homography: Homography) -> Follo
 
 
 def shifts_between(moving: Layer, fixed: Layer) -> list[Homography]:
-    """Return the shifts under which most of a template fits, the best first: whatever moves otherwise counts at most half.
+    """Return the shifts under which most of a template fits an image, the best first: what moves otherwise counts half at most.
 
     All shifts by whole pixels, up to a third of the image, are compared.
-
-    Args:
-        moving: the template.
-        fixed: the other image, of the same shape.
     """
     height, width = moving.image.shape
     reach_y, reach_x = height // 3, width // 3
@@ -85,7 +68,7 @@ def shifts_between(moving: Layer, fixed: Layer) -> list[Homography]:
 def masked(pyramid: Pyramid, part: BoolArray) -> Pyramid:
     """Return a pyramid of which only a part is used, given on any of its layers."""
 
-    def limited(weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    def limited(weight: Image) -> Image:
         size = weight.shape[1], weight.shape[0]
         return weight * cv2.resize(part.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
 
@@ -93,5 +76,5 @@ def masked(pyramid: Pyramid, part: BoolArray) -> Pyramid:
     return pyramid._replace(layers=layers, details=pyramid.details._replace(weight=limited(pyramid.details.weight)))
 
 
-def _blur(image: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+def _blur(image: Image, side: int) -> Image:
     return np.asarray(cv2.blur(image, (side, side)), np.float32)

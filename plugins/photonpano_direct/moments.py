@@ -11,48 +11,31 @@ from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
 from photonpano.geometry import run_from, sample_run, visible_columns
 
+Image = NDArray[np.float32]
+
 
 class Layer(NamedTuple):
-    """A level of an image pyramid.
+    """A level of an image pyramid."""
 
-    Attributes:
-        image: (H, W) float32, variance-stabilised and blurred.
-        weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 at masked pixels.
-        blur_px: standard deviation of the Gaussian that reduces white noise as much as the blur and the halving did, in px of
-            the layer.
-        gradients: (2, H, W) float32, derivatives of the image along x and y.
-        smoothed: (2, H, W) float32, the gradients, blurred by the same Gaussian once more.
-    """
-
-    image: NDArray[np.float32]
-    weight: NDArray[np.float32]
+    image: Image  # (H, W), variance-stabilised and blurred
+    weight: Image  # (H, W), inverse noise variance of a pixel before the blur; 0 at masked pixels
+    # standard deviation of the Gaussian that reduces white noise as much as the blur and the halving did, in px of the layer
     blur_px: float
-    gradients: NDArray[np.float32]
-    smoothed: NDArray[np.float32]
+    gradients: Image  # (2, H, W), derivatives of the image along x and y
+    smoothed: Image  # (2, H, W), the gradients, blurred by the same Gaussian once more
 
 
 class Buffers(NamedTuple):
-    """Images that a thread reuses, since to allocate them takes longer than to fill them.
+    """Images that a thread reuses, since to allocate them takes longer than to fill them."""
 
-    Attributes:
-        residual: (H, W) float32.
-        weight: (H, W) float32.
-        gradients: (2, H, W) float32.
-    """
-
-    residual: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    gradients: NDArray[np.float32]
+    residual: Image  # (H, W)
+    weight: Image  # (H, W)
+    gradients: Image  # (2, H, W)
 
 
 @compiled
 def residuals_and_moments(
-    moving: Layer,
-    fixed: Layer,
-    homography: Homography,
-    buffers: Buffers,
-    moments_x: FloatArray,
-    moments_y: FloatArray,
+    moving: Layer, fixed: Layer, homography: Homography, buffers: Buffers, moments_x: FloatArray, moments_y: FloatArray
 ) -> tuple[int, float, float]:
     """Compute the residuals of a template, their weights, and the moments of the weighted residuals times derivatives.
 
@@ -136,23 +119,14 @@ def _compare(moving: Layer, fixed: Layer, homography: Homography, y: int, buffer
 
 
 @compiled
-def _across(width: int, half: float) -> NDArray[np.float32]:
+def _across(width: int, half: float) -> Image:
     """Return the unit coordinates of the pixels of a row: (width,). To read them is faster than to compute them in loops."""
     return ((np.arange(width) - (width - 1) / 2) / half).astype(np.float32)
 
 
 @compiled
-def derivative_moments(
-    first: NDArray[np.float32], second: NDArray[np.float32], weight: NDArray[np.float32], moments: FloatArray
-) -> None:
-    """Compute the moments of products of the derivatives of two images, in unit coordinates.
-
-    Args:
-        first: (2, H, W) derivatives of one image along x and y.
-        second: (2, H, W) those of the other.
-        weight: (H, W) weights of pixels.
-        moments: (3, 5, 5) output: sums of the products xx, xy and yy times x^i y^j.
-    """
+def derivative_moments(first: Image, second: Image, weight: Image, moments: FloatArray) -> None:
+    """Compute (3, 5, 5) weighted sums of the products xx, xy and yy of (2, H, W) derivatives of two images times x^i y^j."""
     height, width = weight.shape
     half = max(height, width) / 2
     across, zero = _across(width, half), np.float32(0)
@@ -200,7 +174,7 @@ def derivative_moments(
 
 
 @compiled
-def differentiate(image: NDArray[np.float32], gradients: NDArray[np.float32]) -> None:
+def differentiate(image: Image, gradients: Image) -> None:
     """Write the central differences of (H, W) pixels along x and y: (2, H, W); 0 at the borders."""
     height, width = image.shape
     half = np.float32(0.5)

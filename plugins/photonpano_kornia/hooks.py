@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
 
 import photonpano_kornia as plugin
-from photonpano import LocatorContribution, Requirement, hookimpl
+from photonpano import LocatorContribution, Requirement, StreamInfo, hookimpl
 from photonpano_kornia.configs import KorniaFeaturesConfig, KorniaLoftrConfig, KorniaRegistratorConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from photonpano import StreamInfo
 
 REQUIRES = (Requirement("kornia", "photonpano[kornia]"),)  # kornia installs torch
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import apply
+from photonpano.geometry import transform_points
 from photonpano.locating import (
     Matches,
     MatchingConfig,
@@ -25,8 +25,7 @@ from photonpano.locating import (
     stabilised_8_bit,
 )
 from photonpano_kornia.configs import KorniaFeaturesConfig, KorniaLoftrConfig
-from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
-from photonpano_kornia.weights import loftr_from
+from photonpano_kornia.runtime import device_of, images_on, loftr_from, one_thread, seeded
 
 _FAR = 1e3  # descriptor distance of keypoints beyond the search radius; true ones are at most 2
 _SMALLEST_SIDE = 32  # px: four of the cells that LoFTR matches first
@@ -35,17 +34,12 @@ _CONFIDENCE = 0.999  # probability of having found the best motion at which RANS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiftFeatures:
-    """Keypoints of one exposure.
+    """Keypoints of one exposure."""
 
-    Attributes:
-        frames: (N, 2, 3) float32, kornia's local affine frames: the last column is the position, the others the shape.
-        descriptors: (N, 128) float16, RootSIFT.
-        shape: (height, width) of the exposure.
-    """
-
+    # (N, 2, 3), kornia's local affine frames: the last column is the position, the others the shape
     frames: NDArray[np.float32]
-    descriptors: NDArray[np.float16]
-    shape: tuple[int, int]
+    descriptors: NDArray[np.float16]  # (N, 128), RootSIFT
+    shape: tuple[int, int]  # (height, width) of the exposure
 
     @property
     def points(self) -> FloatArray:
@@ -104,7 +98,7 @@ class FeatureLocator(PointLocator):
         distances = torch.cdist(here, there)
         near = None
         if guide is not None:
-            near = cdist(apply(guide, moving.points), fixed.points) <= self._config.search_px
+            near = cdist(transform_points(guide, moving.points), fixed.points) <= self._config.search_px
             distances.masked_fill_(torch.tensor(~near, device=self._device), _FAR)
         if self._config.matcher == "smnn":
             _, pairs = match_smnn(here, there, self._config.ratio, distances)
@@ -118,15 +112,10 @@ class FeatureLocator(PointLocator):
 
 
 class Picture(NamedTuple):
-    """An exposure as input of LoFTR. Its feature maps would take fifty times the memory.
+    """An exposure as input of LoFTR. Its feature maps would take fifty times the memory."""
 
-    Attributes:
-        image: (H, W) uint8; masked pixels have the mean of the others.
-        seen: (H, W) bool, False for masked pixels.
-    """
-
-    image: NDArray[np.uint8]
-    seen: NDArray[np.bool_]
+    image: NDArray[np.uint8]  # (H, W); masked pixels have the mean of the others
+    seen: NDArray[np.bool_]  # (H, W), False for masked pixels
 
 
 class LoftrLocator:
@@ -152,12 +141,7 @@ class LoftrLocator:
         return Picture(image, seen)
 
     def register(self, moving: Picture, fixed: Picture, initial: Homography | None) -> Located | NotLocated:
-        """Match and fit; see `photonpano.Locator`.
-
-        Returns:
-            `NotLocated` with the numbers that decided when too few points match or agree, when they leave the corners of the
-            frame uncertain, or when no camera moves like that.
-        """
+        """Match and fit; see `photonpano.Locator`."""
         if min(moving.image.shape) < _SMALLEST_SIDE:
             height, width = moving.image.shape
             return NotLocated(f"the images have {height} x {width} px, LoFTR needs at least {_SMALLEST_SIDE} along each side")
@@ -171,7 +155,7 @@ class LoftrLocator:
     def _attempts(self, here: FloatArray, there: FloatArray, initial: Homography | None) -> Iterator[Matches]:
         """Return the matches near the positions that the current motion predicts, then all."""
         if initial is not None:
-            near = np.linalg.norm(apply(initial, here) - there, axis=1) <= self._config.search_px
+            near = np.linalg.norm(transform_points(initial, here) - there, axis=1) <= self._config.search_px
             yield Matches(here[near], there[near], guided=True)
         yield Matches(here, there, guided=False)
 

@@ -46,11 +46,9 @@ _ROUNDS = 3  # most descents on a layer; the weights of pixels are updated in be
 
 
 def unit_square(shape: tuple[int, int]) -> FloatArray:
-    """Return the map from pixels to the coordinates of kornia's warper: (3, 3).
+    """Return the (3, 3) map from pixels to the coordinates of kornia's warper.
 
-    Convention:
-        Integer pixels are centres. -1 and 1 are the outer edges of the image, not the centres of its outermost pixels: in
-        kornia's terms, `align_corners=False`.
+    -1 and 1 are the outer edges of the image, not the centres of its outermost pixels: `align_corners=False`.
     """
     height, width = shape
     return np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
@@ -71,12 +69,7 @@ class RegistratorLocator:
         return view_pyramid(exposure, blur_px, self._config.pyramid_levels, SMALLEST_SIDE)
 
     def register(self, moving: tuple[View, ...], fixed: tuple[View, ...], initial: Homography | None) -> Located | NotLocated:
-        """Align; see `photonpano.Locator`.
-
-        Returns:
-            `NotLocated` with the numbers that decided when the finest layer of the pyramid cannot be aligned, or when the
-            images differ after alignment.
-        """
+        """Align; see `photonpano.Locator`."""
         if not (moving[-1].seen.any() and fixed[-1].seen.any()):
             return NotLocated(NOTHING_SEEN)
         start = _shift_between(moving[-1], fixed[-1]) if initial is None else initial
@@ -179,10 +172,8 @@ class _Descent:
     def _loss(self, to_fixed: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """Return half the weighted sum of squared differences.
 
-        Args:
-            to_fixed: (3, 3), the moving image to the fixed one, in kornia's coordinates. The warper takes this direction too:
-                it maps pixels of its output to its input.
-            weights: (1, 1, H, W).
+        `to_fixed` (3, 3) maps the moving image to the fixed one, in kornia's coordinates, as the warper maps its output to its
+        input.
         """
         self.evaluations += 1
         warped = self._warper(self._there, to_fixed[None].to(torch.float32))

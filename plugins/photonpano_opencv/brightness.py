@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import apply, normalised, rescaled, translation, why_implausible
+from photonpano.geometry import normalised, rescaled, transform_points, translation, why_implausible
 from photonpano.locating import (
     NO_TEXTURE,
     TRANSLATION,
@@ -40,12 +40,7 @@ class EccLocator:
         return view_pyramid(exposure, blur_px, self._config.pyramid_levels, _SMALLEST_SIDE)
 
     def register(self, moving: tuple[View, ...], fixed: tuple[View, ...], initial: Homography | None) -> Located | NotLocated:
-        """Align; see `photonpano.Locator`.
-
-        Returns:
-            `NotLocated` with the numbers that decided when OpenCV converges on no layer of the pyramid, or when the images
-            differ after alignment.
-        """
+        """Align; see `photonpano.Locator`."""
         if initial is None:
             shift = shift_between(moving[-1], fixed[-1])
             if shift is None:
@@ -84,8 +79,7 @@ def _sentence_of(error: cv2.error) -> str:
 class PhaseCorrelationLocator:
     """Shifts one exposure onto another, starting from the shift of the image centre under the current motion.
 
-    The other parameters of the current motion are dropped: no pair measures rolls and perspective, so their errors would be fed
-    back from level to level.
+    The rest of the current motion is dropped: no pair measures it, so that its errors would be fed back from level to level.
     """
 
     def __init__(self, config: PhaseCorrelationConfig) -> None:
@@ -96,12 +90,7 @@ class PhaseCorrelationLocator:
         return view_of(exposure, blur_against_noise(exposure, self._config.blur_px))
 
     def register(self, moving: View, fixed: View, initial: Homography | None) -> Located | NotLocated:
-        """Shift; see `photonpano.Locator`.
-
-        Returns:
-            A translation; `NotLocated` with the numbers that decided when there is no texture, or when the images differ after
-            alignment, as where the camera rolls.
-        """
+        """Shift; see `photonpano.Locator`."""
         config = self._config
         homography = np.eye(3) if initial is None else _shift_of(initial, moving.shape)
         for _ in range(config.max_rounds):
@@ -117,4 +106,4 @@ class PhaseCorrelationLocator:
 def _shift_of(motion: Homography, shape: tuple[int, int]) -> FloatArray:
     """Return the translation that moves the centre of an image as a motion does."""
     centre = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
-    return translation(*(apply(motion, centre) - centre)[0])
+    return translation(*(transform_points(motion, centre) - centre)[0])

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import photonpano_opencv as plugin
 from photonpano import LocatorContribution, hookimpl
 from photonpano_opencv.configs import OpencvEccConfig, OpencvOrbConfig, OpencvSiftConfig, PhaseCorrelationConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @hookimpl

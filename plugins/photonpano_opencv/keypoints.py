@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from photonpano import Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import apply, why_implausible
+from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
+from photonpano.geometry import transform_points, why_implausible
 from photonpano.locating import (
     KeypointConfig,
     Matches,
@@ -22,7 +23,6 @@ from photonpano.locating import (
     stabilised_8_bit,
 )
 from photonpano_opencv.configs import OpencvOrbConfig, OpencvSiftConfig
-from photonpano_opencv.matching import match_everywhere, match_nearby, unit_bits, unit_descriptors
 
 GUIDED_RADII = (1.5, 1.0)  # of the search around predicted positions, one a round, in units of `threshold_px`
 # Lowe's ratio within these radii
@@ -34,29 +34,18 @@ _ROUNDING_PX = math.sqrt(1 / 12)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keypoints:
-    """Keypoints of one exposure.
+    """Keypoints of one exposure."""
 
-    Attributes:
-        points: (N, 2) float32, pixel centres are integers.
-        sizes: (N,) float32, diameters of the keypoints in px; position errors are proportional to them.
-        descriptors: (N, D) uint8, as the detector returns them.
-        shape: (height, width) of the exposure.
-    """
-
-    points: NDArray[np.float32]
-    sizes: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
-    shape: tuple[int, int]
+    points: NDArray[np.float32]  # (N, 2), pixel centres are integers
+    sizes: NDArray[np.float32]  # (N,), diameters of the keypoints in px; position errors are proportional to them
+    descriptors: NDArray[np.uint8]  # (N, D), as the detector returns them
+    shape: tuple[int, int]  # (height, width) of the exposure
 
 
 def detected(
     detector: cv2.Feature2D, image: NDArray[np.uint8], mask: NDArray[np.uint8], most: int
 ) -> tuple[Sequence[cv2.KeyPoint], Keypoints]:
-    """Detect and describe at most `most` keypoints of an image, the strongest, where the mask is not 0.
-
-    Returns:
-        The keypoints as OpenCV returns them, and as `Keypoints`.
-    """
+    """Detect and describe at most `most` keypoints of an image, the strongest, where the mask is not 0."""
     keypoints, descriptors = detector.detectAndCompute(image, mask)
     # OpenCV keeps all keypoints that are as strong as the weakest, so there may be more than the detector's limit.
     keypoints = keypoints[:most]
@@ -82,15 +71,7 @@ class KeypointMatcher(PointLocator):
         ratio: float,
         rounding_px: float = 0.0,
     ) -> None:
-        """Prepare to match.
-
-        Args:
-            config: thresholds.
-            seed: of MAGSAC.
-            as_unit_vectors: converts descriptors to vectors that are compared by scalar products.
-            ratio: Lowe's ratio for the distances of these vectors.
-            rounding_px: standard deviation of an error common to all matches.
-        """
+        """Take Lowe's ratio for distances of descriptors as unit vectors, and the standard error that all matches share."""
         self._config: KeypointConfig = config
         self._seed = seed
         self._as_unit_vectors = as_unit_vectors
@@ -100,7 +81,7 @@ class KeypointMatcher(PointLocator):
     def _matches(self, moving: Keypoints, fixed: Keypoints, initial: Homography | None) -> Iterator[Matches]:
         descriptors = self._descriptors(moving, fixed)
         if initial is not None:
-            predicted = apply(initial, moving.points)
+            predicted = transform_points(initial, moving.points)
             pairs = match_nearby(*descriptors, predicted, fixed.points, self._config.search_px, self._ratio)
             yield Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided=True)
         pairs = match_everywhere(*descriptors, self._ratio)
@@ -119,7 +100,7 @@ class KeypointMatcher(PointLocator):
         descriptors = self._descriptors(moving, fixed)
         for radius, max_std_px in zip(GUIDED_RADII, (np.inf, config.max_std_px), strict=True):
             limits = config.model_copy(update={"threshold_px": radius * config.threshold_px, "max_std_px": max_std_px})
-            predicted = apply(homography, moving.points)
+            predicted = transform_points(homography, moving.points)
             pairs = match_nearby(*descriptors, predicted, fixed.points, limits.threshold_px, GUIDED_RATIO)
             here, there, sizes = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], moving.sizes[pairs[:, 0]]
             # One round: matches that were searched within the threshold are all inliers.
@@ -197,3 +178,75 @@ class OrbLocator(KeypointMatcher):
         size = np.array(image.shape[::-1], dtype=np.float32)
         centres = (keypoints.points / scales + 0.5) * (size / np.rint(size / scales)) - 0.5
         return replace(keypoints, points=np.asarray(centres, np.float32))
+
+
+def unit_descriptors(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return RootSIFT (Arandjelovic and Zisserman 2012): square roots, so that the scalar product is Hellinger's kernel."""
+    raw = descriptors.astype(np.float32)
+    return np.asarray(np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1)))
+
+
+def unit_bits(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the bits of (N, D) bytes as vectors of length 1: the square of a distance is 4 / (8 D) times Hamming's."""
+    bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
+    return np.asarray((2 * bits - 1) / np.sqrt(max(1, bits.shape[1])), np.float32)
+
+
+def match_everywhere(moving: NDArray[np.float32], fixed: NDArray[np.float32], ratio: float) -> NDArray[np.intp]:
+    """Match unit descriptors (M, D) and (N, D): pairs of indices (K, 2)."""
+    if min(len(moving), len(fixed)) < 2:
+        return np.zeros((0, 2), dtype=np.intp)
+    similarity = moving @ fixed.T
+    rows = np.arange(len(moving))
+    best = similarity.argmax(axis=1)
+    mutual = similarity.argmax(axis=0)[best] == rows
+    first = similarity[rows, best]
+    similarity[rows, best] = -1
+    second = similarity.max(axis=1)
+    # Unit vectors: the squared distance is 2 - 2 * similarity, and Lowe's ratio is one of distances.
+    distinct = (1 - first) <= ratio**2 * (1 - second)
+    chosen = np.flatnonzero(mutual & distinct)
+    return np.stack([chosen, best[chosen]], axis=1)
+
+
+def match_nearby(
+    moving: NDArray[np.float32],
+    fixed: NDArray[np.float32],
+    predicted: FloatArray,
+    points: NDArray[np.float32],
+    radius_px: float,
+    ratio: float,
+) -> NDArray[np.intp]:
+    """Match unit descriptors (M, D) and (N, D) within a radius of predicted positions: pairs of indices (K, 2).
+
+    `predicted` are positions of the moving keypoints in the fixed image, `points` those of the fixed ones, px. Without a second
+    candidate, its similarity is taken as -1.
+    """
+    if min(len(moving), len(fixed)) == 0:
+        return np.zeros((0, 2), dtype=np.intp)
+    near = cKDTree(predicted).sparse_distance_matrix(cKDTree(points), radius_px, output_type="ndarray")
+    i, j = near["i"], near["j"]
+    similarity = np.einsum("kd,kd->k", moving[i], fixed[j])
+    first, best = _best_two(i, similarity, len(moving))
+    partner, _ = _best_two(j, similarity, len(fixed))
+    k = first[first >= 0]
+    second = best[i[k], 1]
+    mutual = partner[j[k]] == k
+    distinct = (1 - similarity[k]) <= ratio**2 * (1 - second)
+    k = k[mutual & distinct]
+    return np.stack([i[k], j[k]], axis=1)
+
+
+def _best_two(
+    owner: NDArray[np.intp], similarity: NDArray[np.float32], count: int
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Return the index of the best candidate of each owner (-1 if none), and the similarities of the best and second best."""
+    order = np.lexsort((-similarity, owner))
+    starts = np.flatnonzero(np.diff(owner[order], prepend=-1))
+    best = np.full(count, -1, dtype=np.intp)
+    best[owner[order[starts]]] = order[starts]
+    values = np.full((count, 2), -1, dtype=np.float32)
+    values[owner[order[starts]], 0] = similarity[order[starts]]
+    seconds = starts[np.diff(np.append(starts, len(order))) > 1] + 1
+    values[owner[order[seconds]], 1] = similarity[order[seconds]]
+    return best, values

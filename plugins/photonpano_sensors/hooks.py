@@ -1,20 +1,16 @@
-"""What this plugin contributes."""
+"""Hooks of the plugin."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 from photonpano import SourceContribution, hookimpl
+from photonpano_sensors.bin_files import SPAD512, SWISSSPAD_FULL, SWISSSPAD_HALF
 from photonpano_sensors.intensity.contributions import INTENSITY_SOURCES
 from photonpano_sensors.mat_parts import MAT_PARTS
-from photonpano_sensors.spad512 import SPAD512
 from photonpano_sensors.spad512_sparse import SPAD512_SPARSE
-from photonpano_sensors.swissspad import SWISSSPAD_FULL, SWISSSPAD_HALF
 from photonpano_sensors.ubicept import UBICEPT_H5
 from photonpano_sensors.visionsim import VISIONSIM
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @hookimpl

@@ -39,11 +39,7 @@ class _Info(BaseModel):
 
 
 class MatPartsSource(BinarySource):
-    """Frames of MATLAB files. A part is read whole when one of its frames is read, and the last four parts are kept.
-
-    Raises:
-        InputError: a part is missing or damaged, differs from the others in size, or holds something else.
-    """
+    """Frames of MATLAB files. A part is read whole when one of its frames is read, and the last four parts are kept."""
 
     def __init__(self, config: MatPartsConfig) -> None:
         self._paths = _parts(config.path)

@@ -45,14 +45,7 @@ class _Variable(NamedTuple):
 
 
 class MatFrames:
-    """The frames of a file, which are not read yet.
-
-    Attributes:
-        shape: (frames, height, width).
-
-    Raises:
-        InputError: the file is damaged, or has no frames in a variable OUTPUT (height, width, frames).
-    """
+    """The frames of a file, (frames, height, width), not read yet; raises an `InputError` if there are none in OUTPUT."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -61,11 +54,7 @@ class MatFrames:
             self.shape = _frame_order(path, variable.shape)
 
     def packed(self) -> NDArray[np.uint8]:
-        """Return all frames, (n, H, ceil(W / 8)), as `numpy.packbits` packs along the width.
-
-        Raises:
-            InputError: the file is damaged, or holds values other than 0 and 1.
-        """
+        """Return all frames, (n, H, ceil(W / 8)), packed along the width; raises an `InputError` if they are not binary."""
         n_frames, height, width = self.shape
         packed = np.empty((n_frames, height, -(-width // 8)), np.uint8)
         with reading(self._path, _DAMAGED), self._variable(self._path) as variable:

@@ -31,11 +31,7 @@ class Spad512SparseConfig(Config):
 
 
 class Spad512SparseSource(BinarySource):
-    """Little-endian uint32 addresses, 512 y + x, of lit pixels; 512 x 512 ends a frame.
-
-    Raises:
-        InputError: a file is missing, ends within a frame, or holds an address that no pixel has.
-    """
+    """Little-endian uint32 addresses, 512 y + x, of lit pixels; 512 x 512 ends a frame."""
 
     def __init__(self, config: Spad512SparseConfig) -> None:
         self._paths = _files(config.path)

@@ -33,11 +33,7 @@ class UbiceptConfig(Config):
 
 
 class UbiceptSource(SingleFrameSource):
-    """Sums of binary frames. The HDF5 library reads one at a time, whatever the number of threads.
-
-    Raises:
-        InputError: the file is missing or damaged, holds no frames, or lacks the number of binary frames of a sum.
-    """
+    """Sums of binary frames. The HDF5 library reads one at a time, whatever the number of threads."""
 
     def __init__(self, config: UbiceptConfig) -> None:
         import h5py

@@ -48,7 +48,7 @@ _NUMBER = re.compile(r"(?:(?P<percent>-?[\d.]+)%|(?P<name>[a-z_]+)(?:\*(?P<facto
 
 @cache
 def read_scene(name: str) -> dict[str, Any]:
-    """Return what the file of a scene of this package describes."""
+    """Return the content of the file of a scene of this package."""
     from ruamel.yaml import YAML
 
     path = Path(__file__).parent / "data" / f"{name}.yaml"
@@ -110,16 +110,10 @@ class Chance:
 
 
 class Drawing(Chance):
-    """Draws a picture.
+    """Draws a picture of (height, width) px from pictures that marks may name.
 
     Convention:
         Lengths are in units of the picture, which is `height` units high whatever its size in pixels; x right, y down.
-
-    Args:
-        shape: (height, width) of the result, px.
-        height: height of the picture, in units.
-        pictures: that marks may name.
-        rng: random generator of the picture.
     """
 
     def __init__(self, shape: tuple[int, int], height: float, pictures: Pictures, rng: np.random.Generator) -> None:

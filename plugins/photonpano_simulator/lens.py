@@ -18,11 +18,7 @@ _POINTS_OF_A_SIDE = 16
 
 
 def undistorted(config: SimulationConfig, points: ArrayLike) -> FloatArray:
-    """Return where a lens without distortion images what this lens images at (..., 2) points: see `Lens` and `Distortion`.
-
-    Raises:
-        InputError: the lens images nothing at one of the points.
-    """
+    """Return where a lens without distortion images what this lens images at (..., 2) points: see `Lens` and `Distortion`."""
     points = np.asarray(points, dtype=np.float64)
     if not any(config.distortion.coefficients):
         return _undivided(config.lens, points, config.frame_shape)
@@ -62,21 +58,22 @@ def pixel_grid(frame_shape: tuple[int, int]) -> FloatArray:
 
 def transmission(lens: Lens, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return the share of the light in the middle that reaches each pixel: (H, W)."""
-    middle = _middle(frame_shape)
+    middle = middle_of(frame_shape)
     squared = _squared_distance(pixel_grid(frame_shape) - middle, middle)
     return (1 - lens.vignette * squared).astype(np.float32)
 
 
 def _undivided(lens: Lens, points: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
     """Undo the division model."""
-    middle = _middle(frame_shape)
+    middle = middle_of(frame_shape)
     offsets = points - middle
     squared = _squared_distance(offsets, middle)[..., None]
     return np.asarray(middle + offsets / (1 + squared * (lens.k1 + squared * lens.k2)))
 
 
-def _middle(frame_shape: tuple[int, int]) -> FloatArray:
-    height, width = frame_shape
+def middle_of(shape: tuple[float, float]) -> FloatArray:
+    """Return the middle of an image of (height, width): (x, y)."""
+    height, width = shape
     return np.array([(width - 1) / 2, (height - 1) / 2])
 
 

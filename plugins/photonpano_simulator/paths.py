@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from photonpano import FloatArray, InputError
-from photonpano.geometry import Camera, apply, camera_matrix, inverse, normalised, rescaling, rotation_matrices
+from photonpano.geometry import Camera, camera_matrix, inverse, normalised, rescaling, rotation_matrices, transform_points
 from photonpano.reading import read_array, read_arrays
 from photonpano_simulator.config import (
     FilePath,
@@ -28,7 +28,7 @@ from photonpano_simulator.config import (
     SplinePath,
     TurnPath,
 )
-from photonpano_simulator.lens import camera, outline
+from photonpano_simulator.lens import camera, middle_of, outline
 from photonpano_simulator.sensor import Draw, generator
 
 if TYPE_CHECKING:
@@ -41,10 +41,9 @@ _SPLINE_REACH = (1.0, 0.5)  # how far a random path reaches along x and y, relat
 
 
 def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: int) -> FloatArray:
-    """Return the true homographies of all frames: (T, 3, 3), frame pixels to scene pixels.
+    """Return the true homographies of all frames, (T, 3, 3), frame pixels to scene pixels.
 
-    Raises:
-        InputError: a frame reaches beyond the scene, or the file of the path cannot be used.
+    Raises an `InputError` if a frame reaches beyond the scene, or the file of the path cannot be used.
     """
     path, focal = config.path, config.focal_length_px
     frame = _intrinsics(config.frame_shape, focal)
@@ -55,8 +54,8 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
     else:
         to_scene = rescaling(config.scene_scale)
         in_frame_px = scene_shape[0] / config.scene_scale, scene_shape[1] / config.scene_scale
-        middle = _middle(in_frame_px)
-        target = middle if path.centre is None else apply(inverse(to_scene), np.array([path.centre], np.float64))[0]
+        middle = middle_of(in_frame_px)
+        target = middle if path.centre is None else transform_points(inverse(to_scene), np.array([path.centre], np.float64))[0]
         rotations = _rotations(target - middle + _centres(path, config.n_frames), focal)
         homographies = to_scene @ _intrinsics(in_frame_px, focal) @ rotations @ np.linalg.inv(frame)
     if path.shake is not None:
@@ -68,10 +67,9 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
 
 
 def camera_rotations(config: SimulationConfig, homographies: FloatArray, scene_shape: tuple[int, int]) -> FloatArray | None:
-    """Return the rotations of a path: (T, 3, 3), directions of a frame to those of a camera before the middle of the scene.
+    """Return the rotations of a path, (T, 3, 3): directions of a frame to those of a camera before the middle of the scene.
 
-    Returns:
-        None for homographies from a file, which need not be rotations.
+    It is None for homographies from a file, which need not be rotations.
     """
     if isinstance(config.path, FilePath):
         return None
@@ -85,19 +83,15 @@ def camera_rotations(config: SimulationConfig, homographies: FloatArray, scene_s
 
 def scene_motion(homographies: FloatArray, frame_shape: tuple[int, int], path: object) -> FloatArray:
     """Return how far the scene has moved through the middle of the frame since the first frame: (T, 2) px."""
-    middle = _middle(frame_shape)
+    middle = middle_of(frame_shape)
     if isinstance(path, TurnPath):
-        steps = apply(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
+        steps = transform_points(inverse(homographies[1:]) @ homographies[:-1], middle[None])[:, 0] - middle
         return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    return np.asarray(apply(inverse(homographies), apply(homographies[0], middle[None]))[:, 0] - middle)
+    return np.asarray(transform_points(inverse(homographies), transform_points(homographies[0], middle[None]))[:, 0] - middle)
 
 
 def _turn(config: SimulationConfig, path: TurnPath, scene_shape: tuple[int, int], seed: int) -> FloatArray:
-    """Return K R K^-1 of a camera that turns before a panorama of (height, width), 360 degrees wide: (T, 3, 3).
-
-    Raises:
-        InputError: a frame reaches above or below the panorama, or the panorama is too coarse for the camera.
-    """
+    """Return K R K^-1 of a camera that turns before a panorama of (height, width), 360 degrees wide: (T, 3, 3)."""
     focal, per_radian = config.focal_length_px, scene_shape[1] / (2 * np.pi)
     if per_radian < focal * config.scene_scale / 2:
         raise InputError(
@@ -177,15 +171,7 @@ def _raster(path: ScanPath) -> FloatArray:
 def random_path(
     reach: tuple[float, ...], length: float, knots: int, progress: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return a cubic spline through random points, (T, D), around 0, whose speed changes on the way.
-
-    Args:
-        reach: how far it reaches along each axis, relative to each other.
-        length: of the path.
-        knots: number of random points, evenly spaced in time.
-        progress: (T,) times from 0 to 1.
-        rng: draws the points.
-    """
+    """Return a spline of a length through random knots around 0, (T, D), at times from 0 to 1; `reach` is relative."""
     spline = random_spline(reach, knots, rng)
     dense = spline(np.linspace(0, 1, _DENSE))
     middle = (dense.min(axis=0) + dense.max(axis=0)) / 2
@@ -211,22 +197,13 @@ def _at_constant_speed(points: FloatArray, n_frames: int) -> FloatArray:
     return np.stack([np.interp(wanted, travelled, coordinate) for coordinate in points.T], axis=1)
 
 
-def _middle(shape: tuple[float, float]) -> FloatArray:
-    height, width = shape
-    return np.array([(width - 1) / 2, (height - 1) / 2])
-
-
 def _intrinsics(shape: tuple[float, float], focal: float) -> FloatArray:
-    x, y = _middle(shape)
+    x, y = middle_of(shape)
     return camera_matrix(focal, (x, y))
 
 
 def looking(ahead: FloatArray) -> FloatArray:
-    """Return rotations of the world to level cameras that look along directions (T, 3): (T, 3, 3).
-
-    Convention:
-        x right, y down, z ahead. A camera cannot be level that looks straight up or down.
-    """
+    """Return rotations of the world to level cameras that look along directions (T, 3), not straight up or down: (T, 3, 3)."""
     x, y, z = ahead.T
     side = np.hypot(x, z)
     reach, zero = np.hypot(side, y), np.zeros_like(x)
@@ -260,7 +237,7 @@ def sums_of_sines(
 
 def _require_inside(homographies: FloatArray, frame: FloatArray, scene_shape: tuple[int, int]) -> None:
     """Require that the outline of the frame, (N, 2), lies in the scene."""
-    x, y = np.moveaxis(apply(homographies, frame), -1, 0)
+    x, y = np.moveaxis(transform_points(homographies, frame), -1, 0)
     height, width = scene_shape
     worst = np.stack([-x, x - (width - 1), -y, y - (height - 1)]).max(axis=2)
     # Coordinates of points behind the camera are meaningless.
@@ -277,11 +254,7 @@ def _require_inside(homographies: FloatArray, frame: FloatArray, scene_shape: tu
 
 
 def _read_homographies(path: Path, n_frames: int) -> FloatArray:
-    """Read (n_frames, 3, 3) homographies from a .npy file, or from `homographies` in an .npz archive.
-
-    Raises:
-        InputError: the file is missing, is something else, or has another number of homographies.
-    """
+    """Read (n_frames, 3, 3) homographies from a .npy file, or from `homographies` in an .npz archive."""
     arrays = read_arrays(path, "a file of homographies", ("homographies", "scene_projection", "camera_from_world"))
     if "scene_projection" in arrays and str(arrays["scene_projection"]) == "spherical":
         raise InputError(f"{path} is the truth of a turn, and its homographies lie on no plane; take a path of the kind turn")

@@ -1,4 +1,4 @@
-"""What all simulated captures share: frames, rate, light, and which frames the capture keeps."""
+"""Keys of all simulated captures: frames, rate, light, and dropped and repeated frames."""
 
 from __future__ import annotations
 
@@ -41,13 +41,7 @@ Repeats: TypeAlias = Annotated[
 def delivered(n_frames: int, drops: tuple[FrameRange, ...], repeats: tuple[FrameRange, ...]) -> NDArray[np.int64]:
     """Return, for each frame of the capture, the index of the frame that the camera took.
 
-    Args:
-        n_frames: frames that the camera takes.
-        drops: frames that are missing in the capture.
-        repeats: frames that the capture holds twice.
-
-    Raises:
-        InputError: a range lies beyond the last frame, or no frame is left.
+    Raises an `InputError` if a range lies beyond the last frame, or no frame is left.
     """
     for key, ranges in (("drops", drops), ("repeats", repeats)):
         for each in ranges:

@@ -25,16 +25,10 @@ _COLOUR_STD, _STRONGEST_COLOUR = 2.0, 1.5  # of the logarithms of red and blue, 
 def scene_flux(
     scene: StreetScene | NightScene | PhotoScene, flux: float, in_colour: bool = False, is_round: bool = False
 ) -> NDArray[np.float32]:
-    """Return the flux of a scene: (Hs, Ws), in photons per pixel per frame, with the mean `flux`.
+    """Return the flux of a scene, (Hs, Ws) or (Hs, Ws, 3) in colour, in photons per pixel per frame.
 
-    Args:
-        scene: a photograph, or a drawing, which is painted in colour.
-        flux: the mean; in colour, that of the sum of red, green and blue.
-        in_colour: whether to return red, green and blue: (Hs, Ws, 3).
-        is_round: whether the ends of a drawing meet; those of a photograph are taken as they are.
-
-    Raises:
-        InputError: the photograph cannot be used.
+    `flux` is the mean, in colour that of the sum of red, green and blue. The ends of a drawing that `is_round` meet; those of a
+    photograph are taken as they are. Raises an `InputError` if the photograph cannot be used.
     """
     if isinstance(scene, PhotoScene):
         linear = photograph(scene.file, scene.width, in_colour)
@@ -114,15 +108,9 @@ def _joined(linear: NDArray[np.float32], overlap: int) -> NDArray[np.float32]:
 
 
 def photograph(path: Path, width: int | None = None, in_colour: bool = False) -> NDArray[np.float32]:
-    """Return the linear luminance of a photograph, from 0 to 1; or its linear red, green and blue, (H, W, 3).
+    """Return the linear luminance of a photograph, from 0 to 1, or its linear red, green and blue, (H, W, 3), at a width in px.
 
-    Args:
-        path: the image file.
-        width: to which it is resized, in px; None keeps it.
-        in_colour: whether to return red, green and blue.
-
-    Raises:
-        InputError: the file is no image of 8 or 16 bits, or it is too large.
+    Raises an `InputError` if the file is no image of 8 or 16 bits, or it is too large.
     """
     otherwise = "is not an image that OpenCV reads; save it as PNG or JPEG"
     look_first(path, "cv2:imread")
@@ -158,15 +146,9 @@ def brightness(lamp: Lamp, n_frames: int, frame_rate_hz: float) -> NDArray[np.fl
 
 
 def shares(lamps: tuple[Lamp, ...], scene_shape: tuple[int, int], is_round: bool = False) -> NDArray[np.float32]:
-    """Return the share of each lamp in the light of each place of the scene.
+    """Return the share of each lamp in the light of each place of the scene, (N, Hs, Ws), whose ends meet if it `is_round`.
 
-    Args:
-        lamps: of the scene.
-        scene_shape: (height, width).
-        is_round: whether the left and the right end of the scene meet.
-
-    Returns:
-        (N, Hs, Ws); where the lamps together would give more than all of the light, each gives less.
+    Where the lamps together would give more than all of the light, each gives less.
     """
     height, width = scene_shape
     found = np.ones((len(lamps), height, width), np.float32)

@@ -42,14 +42,10 @@ class SpadSensor:
     """Pixels that are 1 with the probability `1 - exp(-(q * flux + dark))` (paper, equation 2), and 0 else.
 
     Attributes:
-        response: how flux becomes counts.
         dark_rates: (H, W) float32, dark counts per frame period, those of hot pixels included.
         hot: (H, W) bool, the hot pixels.
         valid: (H, W) bool, False for hot pixels if the config masks them.
         gains: (H, W) float32, the sensitivity of each pixel, dirt included; 1 for an ideal one.
-
-    Raises:
-        InputError: a file of rates or of hot pixels cannot be used.
     """
 
     kind: Literal["binary"] = "binary"
@@ -77,12 +73,7 @@ class SpadSensor:
         return {"dark_rates": self.dark_rates, "hot_pixels": self.hot}
 
     def expose(self, flux: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
-        """Take a frame.
-
-        Args:
-            flux: (H, W) photons that are detected per pixel per frame, dark counts not included; it is overwritten.
-            rng: the chance of this frame.
-        """
+        """Take a frame of (H, W) photons that are detected per pixel, without dark counts; `flux` is overwritten."""
         # -p: the probability that no photon is detected, minus 1.
         chance = np.expm1(np.subtract(self._minus_dark_rates, flux, out=flux), out=flux)
         threshold = np.multiply(chance, _MINUS_RANGE, out=chance).astype(np.uint32)
@@ -93,15 +84,7 @@ class SpadSensor:
 
 
 class IntensityCamera:
-    """Pixels of level `black_level + (photons + read noise) / photons_per_level`, rounded and clipped at the highest level.
-
-    Attributes:
-        response: how flux becomes levels.
-        bits: bits of a level.
-        exposure: fraction of the frame period during which the shutter is open.
-        valid: (H, W) bool, all True.
-        gains: (H, W) float32, the sensitivity of each pixel, all 1.
-    """
+    """Pixels of level `black_level + (photons + read noise) / photons_per_level`, rounded and clipped at the highest level."""
 
     kind: Literal["intensity"] = "intensity"
 
@@ -115,12 +98,7 @@ class IntensityCamera:
         self.gains: NDArray[np.float32] = np.ones(frame_shape, np.float32)
 
     def expose(self, flux: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint16]:
-        """Take a frame.
-
-        Args:
-            flux: (H, W) expected number of detected photons per pixel.
-            rng: the random generator of this frame.
-        """
+        """Take a frame of (H, W) expected detected photons per pixel."""
         photons = rng.poisson(flux) + self._read_noise * rng.standard_normal(flux.shape, np.float32)
         levels = photons / self.response.photons_per_level + self.response.black_level
         return np.clip(np.rint(levels), 0, self._top).astype(np.uint16)
@@ -137,11 +115,7 @@ def bayer_of(config: Sensor | IntensitySensor) -> Bayer | None:
 
 
 def filter_array(config: Sensor, frame_shape: tuple[int, int]) -> NDArray[np.float32] | None:
-    """Return what each pixel sees of red, green and blue, 1 or 0: (H, W, 3); None for a sensor without colour filters.
-
-    Raises:
-        InputError: the file of the filters cannot be used.
-    """
+    """Return what each pixel sees of red, green and blue, 1 or 0: (H, W, 3); None for a sensor without colour filters."""
     if config.filters is None:
         return None
     if isinstance(config.filters, Path):
@@ -176,11 +150,7 @@ def _light_through(dirt: Dirt, frame_shape: tuple[int, int], rng: np.random.Gene
 
 
 def _read_rates(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Read (H, W) rates per frame period.
-
-    Raises:
-        InputError: the file is missing, is something else, or holds rates that are negative or not finite.
-    """
+    """Read (H, W) rates per frame period, finite and not negative."""
     rates = read_array(path, "a file of rates")
     if rates.shape != frame_shape or rates.dtype.kind not in "fiu":
         raise InputError(
@@ -192,11 +162,7 @@ def _read_rates(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]
 
 
 def _read_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Read an (H, W) mask.
-
-    Raises:
-        InputError: the file is missing or is something else.
-    """
+    """Read an (H, W) mask."""
     mask = read_array(path, "a mask")
     if mask.shape != frame_shape or mask.dtype != np.bool_:
         raise InputError(f"{path} holds {mask.dtype} of shape {mask.shape}; a mask is bool of the frame's shape {frame_shape}")

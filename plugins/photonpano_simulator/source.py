@@ -10,21 +10,16 @@ from photonpano.geometry import corner_displacements, corners, inverse
 from photonpano.reading import SingleFrameSource
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig, TurnPath
 from photonpano_simulator.lens import camera, distorts, transmission, undistorted
-from photonpano_simulator.objects import DrawnObject
 from photonpano_simulator.paths import camera_path, camera_rotations, scene_motion
 from photonpano_simulator.recording import delivered
 from photonpano_simulator.scenes import brightness, scene_flux, shares
 from photonpano_simulator.sensor import Draw, IntensityCamera, SpadSensor, bayer_of, filter_array, generator
 from photonpano_simulator.travel_config import TravelConfig
-from photonpano_simulator.views import Views
+from photonpano_simulator.views import DrawnObject, Views
 
 
 class SimulatedSource(SingleFrameSource):
-    """A simulated camera, whose frames depend only on the config, the seed and their index.
-
-    Raises:
-        InputError: a file of the sensor cannot be used, or frames are dropped that do not exist.
-    """
+    """A simulated camera, whose frames depend only on the config, the seed and their index."""
 
     def __init__(self, config: SimulatorConfig | CameraSimulatorConfig | TravelConfig, context: SourceContext) -> None:
         self._seed = context.seed if config.seed is None else config.seed
@@ -56,11 +51,7 @@ class SimulatedSource(SingleFrameSource):
 
 
 class SimulatorSource(SimulatedSource):
-    """A camera that rotates in front of a scene (paper, section 5, "Simulation Details").
-
-    Raises:
-        InputError: a file cannot be used, the camera path leaves the scene, or frames are dropped that do not exist.
-    """
+    """A camera that rotates in front of a scene (paper, section 5, "Simulation Details")."""
 
     def __init__(self, config: SimulatorConfig | CameraSimulatorConfig, context: SourceContext) -> None:
         super().__init__(config, context)
@@ -142,13 +133,7 @@ class SimulatorSource(SimulatedSource):
         return truth
 
     def sharp_view(self, frame: int) -> NDArray[np.float32]:
-        """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W).
-
-        Behind colour filters, each pixel shows its own colour.
-
-        Raises:
-            InputError: there is no such frame.
-        """
+        """Return the flux of a frame, (H, W), without noise, dark counts and differences between pixels but their filters."""
         self.info.require(FrameSpan(frame, frame + 1))
         taken = int(self._taken[frame])
         return self._flux(taken) * np.float32(self._light[taken])

@@ -1,4 +1,4 @@
-"""What this plugin contributes."""
+"""Hooks of the plugin."""
 
 from __future__ import annotations
 

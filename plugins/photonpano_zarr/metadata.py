@@ -20,23 +20,15 @@ _AGAIN = "write it again with photonpano convert"
 
 
 class Attributes(BaseModel):
-    """What an array contains, so that it opens without further keys.
-
-    Attributes:
-        version: the version of these attributes.
-        kind: what the frames are; there are no others than binary ones yet.
-        width: columns of a frame, in px.
-        bit_order: "big" if the first of eight pixels is the highest bit of its byte.
-        frame_rate_hz: frames a second, in Hz; None if unknown.
-    """
+    """Description of the capture in an array, so that it opens without further keys."""
 
     model_config = ConfigDict(frozen=True)
 
-    version: int = VERSION
-    kind: Literal["binary"] = "binary"
-    width: int = Field(ge=1)
-    bit_order: Literal["big", "little"] = "big"
-    frame_rate_hz: float | None = Field(None, gt=0)
+    version: int = VERSION  # the version of these attributes
+    kind: Literal["binary"] = "binary"  # kind of frames; others than binary ones are not written yet
+    width: int = Field(ge=1)  # columns of a frame, in px
+    bit_order: Literal["big", "little"] = "big"  # "big" if the first of eight pixels is the highest bit of its byte
+    frame_rate_hz: float | None = Field(None, gt=0)  # frames a second, in Hz; None if unknown
 
 
 class _Named(BaseModel):
@@ -45,26 +37,17 @@ class _Named(BaseModel):
 
 
 class Metadata(BaseModel):
-    """An array of zarr version 3, as far as captures need it.
-
-    Attributes:
-        shape: frames, height, bytes of a row.
-        data_type: the type of its values.
-        chunk_grid: how it is cut into chunks.
-        chunk_key_encoding: how the chunks are named.
-        codecs: how the bytes of a chunk are stored, in the order of writing.
-        attributes: what its writer says about it.
-    """
+    """The metadata of an array of zarr version 3 that captures need."""
 
     zarr_format: Literal[3]
     node_type: Literal["array"]
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # frames, height, bytes of a row
     data_type: Any
-    chunk_grid: _Named
-    chunk_key_encoding: _Named
+    chunk_grid: _Named  # how it is cut into chunks
+    chunk_key_encoding: _Named  # how the chunks are named
     fill_value: Any = 0
-    codecs: tuple[_Named, ...]
-    attributes: dict[str, Any] = {}
+    codecs: tuple[_Named, ...]  # how the bytes of a chunk are stored, in the order of writing
+    attributes: dict[str, Any] = {}  # added by the writer
 
     @property
     def chunk_shape(self) -> tuple[int, int, int]:
@@ -119,11 +102,7 @@ def written(info: StreamInfo, frames_of_chunk: int, compressors: Sequence[Mappin
 
 
 def read_metadata(array: Location) -> Metadata:
-    """Read the metadata of an array of packed frames.
-
-    Raises:
-        InputError: there are none, or they are those of something else.
-    """
+    """Read the metadata of an array of packed frames; raises an `InputError` if there are none, or of something else."""
     text = _read(array)
     try:
         found = Metadata.model_validate_json(text)
@@ -138,11 +117,7 @@ def read_metadata(array: Location) -> Metadata:
 
 
 def read_attributes(array: Location, metadata: Metadata) -> Attributes | None:
-    """Return what photonpano has written into an array; None for an array that others have written.
-
-    Raises:
-        InputError: it was written by a newer photonpano, or is damaged.
-    """
+    """Return the attributes of photonpano in an array, if any; raises an `InputError` if they are newer or damaged."""
     own = metadata.attributes.get("photonpano")
     if own is None:
         return None

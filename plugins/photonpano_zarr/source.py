@@ -31,11 +31,7 @@ _MOST_BYTES = 2 * 1024**3  # the largest chunk that is read: a larger one is a m
 
 
 def opened(config: ZarrConfig) -> Source:
-    """Open an array.
-
-    Raises:
-        InputError: it is missing, incomplete, or something else, or does not agree with the config.
-    """
+    """Open an array; raises an `InputError` if it is missing, incomplete, something else, or does not agree with the config."""
     array, (metadata, layout, frame_rate_hz) = config.path, read_layout(config)
     if metadata.compressors or not metadata.has_whole_frames:
         return _Chunks(array, metadata, layout, frame_rate_hz)
@@ -49,11 +45,7 @@ def opened(config: ZarrConfig) -> Source:
 
 
 def read_layout(config: ZarrConfig) -> tuple[Metadata, FrameLayout, float | None]:
-    """Return the metadata of an array, the layout of its frames, and their rate in Hz.
-
-    Raises:
-        InputError: as `opened`.
-    """
+    """Return the metadata of an array, the layout of its frames, and their rate in Hz; raises as `opened`."""
     array, metadata = config.path, read_metadata(config.path)
     own = read_attributes(array, metadata)
     _, height, row_bytes = metadata.shape
@@ -70,11 +62,7 @@ def read_layout(config: ZarrConfig) -> tuple[Metadata, FrameLayout, float | None
 
 
 def require_layout(config: ZarrConfig) -> None:
-    """Refuse an array that `opened` refuses, or that others wrote and whose frames show that they are packed in another way.
-
-    Raises:
-        InputError: it is so.
-    """
+    """Refuse an array that `opened` refuses, or that others wrote and whose frames show that they are packed in another way."""
     array, (metadata, _, _) = config.path, read_layout(config)
     if config.bit_order is not None or read_attributes(array, metadata) is not None:
         return
@@ -114,11 +102,7 @@ def _require_whole(array: Location, metadata: Metadata) -> None:
 
 
 class _Chunks(BinarySource):
-    """Frames in chunks that are compressed, or contain parts of frames. A chunk is read whole, and the last ones are kept.
-
-    Raises:
-        InputError: when frames are read: a chunk is missing or damaged, or its codec is not installed.
-    """
+    """Frames in chunks that are compressed, or contain parts of frames. A chunk is read whole, and the last ones are kept."""
 
     def __init__(self, array: Location, metadata: Metadata, layout: FrameLayout, frame_rate_hz: float | None) -> None:
         super().__init__(metadata.shape[0], layout, frame_rate_hz)
@@ -170,15 +154,10 @@ def _decoder(array: Location, name: str, configuration: dict[str, Any]) -> Any:
     if name == "gzip":
         return lambda data: zlib.decompress(data, wbits=31)
     if name == "crc32c":
-        return _without_checksum
+        return lambda data: memoryview(data)[:-4]  # without the checksum, which no small library computes
     library("numcodecs", "photonpano[zarr]", f"{array}, compressed with {name},")
     import numcodecs.blosc
     import numcodecs.zstd
 
     del configuration  # the compressed data contain it
     return numcodecs.blosc.Blosc().decode if name == "blosc" else numcodecs.zstd.Zstd().decode
-
-
-def _without_checksum(data: Any) -> Any:
-    """Return data without the four bytes of their checksum, which no small library computes."""
-    return memoryview(data)[:-4]

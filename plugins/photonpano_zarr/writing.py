@@ -21,15 +21,8 @@ _LEVEL = 1  # of zstd: higher ones take longer, and gain little on photon noise
 def write(folder: Path, info: StreamInfo, frames: Iterable[NDArray[np.uint8]], *, compressed: bool) -> None:
     """Write an array of version 3 into an empty folder; the metadata come last.
 
-    Args:
-        folder: the folder.
-        info: the size and rate of the capture.
-        frames: all packed frames in order, a few at a time: (n, height, bytes of a row).
-        compressed: whether to compress the chunks with zstd.
-
-    Raises:
-        InputError: they are to be compressed, and numcodecs is not installed.
-        OSError: the files cannot be written.
+    `frames` are packed, in order, a few at a time: (n, height, bytes of a row). They are `compressed` with zstd, for which
+    numcodecs must be installed, or an `InputError` is raised.
     """
     frame_shape = info.height, -(-info.width // 8)
     n_frames = min(info.n_frames, max(1, _CHUNK_BYTES // math.prod(frame_shape)))

@@ -31,10 +31,10 @@ from pages import write_tables
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext, parse_spec, run
 from photonpano.geometry import FrameTrajectory, apply, inverse
 from photonpano_core.configs import BurstConfig, LocalFlowConfig, PhotonMleConfig, RobustMergeConfig
-from photonpano_core.dense_motion.burst import BurstMerger
-from photonpano_core.dense_motion.local_flow import LocalFlowMerger
-from photonpano_core.photon_mle import PhotonMleMerger
-from photonpano_core.robust_merge import RobustMerger
+from photonpano_core.mergers.burst import BurstMerger
+from photonpano_core.mergers.local_flow import LocalFlowMerger
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.robust_merge import RobustMerger
 from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.source import SimulatorSource

@@ -39,7 +39,7 @@ from photonpano.geometry import FrameTrajectory, apply, corner_displacements, co
 from photonpano.protocols import KnowsTruth
 from photonpano.registry import Catalog
 from photonpano_core.configs import PhotonMleConfig
-from photonpano_core.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
 
 SHAPE = (254, 496)
 GROUP_SIZE = 250

@@ -21,10 +21,10 @@ from pages import write_tables
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext
 from photonpano.geometry import FrameTrajectory, translation
 from photonpano_core.configs import PhotonMleConfig, RobustMergeConfig
-from photonpano_core.photon_mle import PhotonMleMerger
-from photonpano_core.robust_merge import RobustMerger
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.robust_merge import RobustMerger
+from photonpano_core.mergers.splat import SplatMerger
 from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
-from photonpano_core.splat import SplatMerger
 from photonpano_simulator.config import StreetScene
 from photonpano_simulator.scenes import scene_flux
 

@@ -32,7 +32,7 @@ from photonpano.evaluation import load_truth
 from photonpano.geometry import FrameTrajectory, inverse
 from photonpano.protocols import Source
 from photonpano_core.configs import MidpointConfig, PhotonMleConfig
-from photonpano_core.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
 from photonpano_core.resamplers import MidpointResampler
 from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
 

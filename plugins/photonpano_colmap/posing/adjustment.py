@@ -32,19 +32,12 @@ _FAR_PX = 1e3  # residual of a point behind a camera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Points that exposures see.
+    """Points that exposures see."""
 
-    Attributes:
-        points: (M,) numbers of the points.
-        views: (M,) numbers of the exposures.
-        pixels: (M, 2) px.
-        covariance: (M, 2, 2) px^2, up to a common factor.
-    """
-
-    points: NDArray[np.intp]
-    views: NDArray[np.intp]
-    pixels: FloatArray
-    covariance: FloatArray
+    points: NDArray[np.intp]  # (M,) numbers of the points
+    views: NDArray[np.intp]  # (M,) numbers of the exposures
+    pixels: FloatArray  # (M, 2) px
+    covariance: FloatArray  # (M, 2, 2) px^2, up to a common factor
 
     def kept(self, which: NDArray[np.bool_]) -> Observations:
         """Return some of the observations."""
@@ -53,36 +46,20 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """Poses and points that agree best with all observations.
+    """Poses and points that agree best with all observations."""
 
-    Attributes:
-        poses: (V, 3, 4).
-        points: (N, 3).
-        confirmed: (N,) points that at least 3 exposures see where they should be.
-        information: (V, 6, 6) of each pose while the others rest: a rotation vector of the camera, and a shift in the world.
-        std_position: (V,) expected distance of a camera from its true place, after the best alignment of all.
-        std_rotation: (V,) expected angle in radians, after that alignment.
-        residual_px: median distance of a observation from where its point is seen.
-    """
-
-    poses: FloatArray
-    points: FloatArray
-    confirmed: NDArray[np.bool_]
+    poses: FloatArray  # (V, 3, 4)
+    points: FloatArray  # (N, 3)
+    confirmed: NDArray[np.bool_]  # (N,) points that at least 3 exposures see where they should be
+    # (V, 6, 6) of each pose while the others rest: a rotation vector of the camera, and a shift in the world
     information: FloatArray
-    std_position: FloatArray
-    std_rotation: FloatArray
-    residual_px: float
+    std_position: FloatArray  # (V,) expected distance of a camera from its true place, after the best alignment of all
+    std_rotation: FloatArray  # (V,) expected angle in radians, after that alignment
+    residual_px: float  # median distance of an observation from where its point is seen
 
 
 def adjust(poses: FloatArray, points: FloatArray, observations: Observations, camera_matrix: FloatArray) -> Adjusted:
-    """Solve for the poses and points that agree best with the observations.
-
-    Args:
-        poses: (V, 3, 4) to begin with.
-        points: (N, 3) to begin with.
-        observations: each of the points is seen at least twice.
-        camera_matrix: (3, 3) K.
-    """
+    """Solve for the poses (V, 3, 4) and points (N, 3), each observed twice or more, that agree best with the observations."""
     settings = gtsam.LevenbergMarquardtParams()
     settings.setMaxIterations(_MOST_STEPS)
     settings.setRelativeErrorTol(1e-4)

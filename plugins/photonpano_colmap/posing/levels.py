@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from photonpano import BoolArray, FloatArray, FrameSpan, Group, LocationError, Source
 from photonpano_colmap.posing.adjustment import Adjusted, Observations, adjust
-from photonpano_colmap.posing.depth import inverse_depth_of
-from photonpano_colmap.posing.merging import PosedExposure, merge_through_depth
+from photonpano_colmap.posing.merging import PosedExposure, inverse_depth_of, merge_through_depth
 from photonpano_colmap.posing.patches import Found, find_patches, patches_of, stabilised
 from photonpano_colmap.posing.path import Path, between, exceeding_noise_of_poses, moves
 from photonpano_colmap.posing.tremor import Tremor, find_tremor
@@ -35,59 +34,37 @@ _OUT_OF_SIGHT = 0.8  # exposures are compared if their centres are closer than t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Path and scene before a level.
-
-    Attributes:
-        path: of the camera.
-        located: (T,) frames whose pose is known.
-        points: (N, 3) of the world.
-    """
+    """Path and scene before a level."""
 
     path: Path
-    located: BoolArray
-    points: FloatArray
+    located: BoolArray  # (T,) frames whose pose is known
+    points: FloatArray  # (N, 3) of the world
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merged:
-    """The exposures of a level.
-
-    Attributes:
-        exposures: of all groups.
-        path: along which they are merged.
-        tremor: the last one found; None if the capture is too short.
-    """
+    """The exposures of a level."""
 
     exposures: Sequence[PosedExposure]
-    path: Path
-    tremor: Tremor | None
+    path: Path  # along which they are merged
+    tremor: Tremor | None  # the last one found; None if the capture is too short
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedLevel:
-    """The exposures of a level, located.
-
-    Attributes:
-        groups: of the exposures.
-        is_located: (V,) bool.
-        adjusted: poses of the located exposures, and points.
-        observations: of these points, in the located exposures.
-        exposures: all of them.
-        path: of the camera.
-        tremor: what was found last before the exposures were located.
-    """
+    """The exposures of a level, located."""
 
     groups: Sequence[Group]
-    is_located: BoolArray
-    adjusted: Adjusted
-    observations: Observations
+    is_located: BoolArray  # (V,)
+    adjusted: Adjusted  # poses of the located exposures, and points
+    observations: Observations  # of these points, in the located exposures
     exposures: Sequence[PosedExposure]
     path: Path
-    tremor: Tremor | None
+    tremor: Tremor | None  # the last one before the exposures were located
 
     @property
     def scene(self) -> Scene:
-        """What the next level begins with."""
+        """Path, located frames and points for the next level."""
         located = np.zeros(len(self.path.poses), np.bool_)
         for group, is_located in zip(self.groups, self.is_located, strict=True):
             located[group.span.start : group.span.stop] = is_located
@@ -142,13 +119,9 @@ def merge(source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: 
 def locate(
     exposures: Sequence[PosedExposure], camera_matrix: FloatArray, pool: ThreadPoolExecutor
 ) -> tuple[FloatArray, Observations]:
-    """Choose points in key exposures, and find them in the others.
+    """Choose points in key exposures, (N, 3) where the depth so far has them, and find them in the others.
 
-    Returns:
-        (N, 3) points of the world, where the depth so far has them, and where exposures see them.
-
-    Raises:
-        LocationError: no patch of an exposure is found in another one.
+    Raises a `LocationError` if hardly a patch of an exposure is found in another one.
     """
     views = list(pool.map(stabilised, exposures))
     number = len(exposures)
@@ -160,7 +133,9 @@ def locate(
         found = [
             (other, find_patches(patches, (here, views[key]), (exposures[other], views[other]), camera_matrix))
             for other in range(number)
-            if other != key and _near(key, other) and _overlap(here, exposures[other], camera_matrix)
+            if other != key
+            and (abs(other - key) <= _NEIGHBOURS or (other - key) % _FURTHER == 0)
+            and _overlap(here, exposures[other], camera_matrix)
         ]
         rays = np.concatenate([patches.pixels, np.ones((len(patches.pixels), 1))], axis=1) @ np.linalg.inv(camera_matrix).T
         return (rays / patches.inverse_depth[:, :1] - here.pose[:, 3]) @ here.pose[:, :3], found
@@ -185,11 +160,7 @@ def locate(
 def interpolate(
     groups: Sequence[Group], merged: Merged, points: FloatArray, observations: Observations, camera_matrix: FloatArray
 ) -> PosedLevel:
-    """Adjust exposures and points to the observations, and correct the path by the poses of the exposures.
-
-    Raises:
-        LocationError: few exposures show points of others.
-    """
+    """Adjust exposures and points to the observations, and correct the path by the poses of the exposures."""
     exposures = merged.exposures
     located = np.bincount(observations.views, minlength=len(exposures)) >= _LEAST_OBSERVATIONS
     if located.sum() < _LEAST_LOCATED:
@@ -217,10 +188,6 @@ def _borders(groups: Sequence[Group]) -> FloatArray:
     """Return where groups begin and end in time, in frames; where some are left out between them, halfway."""
     between = [(before.span.stop + after.span.start - 1) / 2 for before, after in pairwise(groups)]
     return np.array([groups[0].span.start - 0.5, *between, groups[-1].span.stop - 0.5])
-
-
-def _near(key: int, other: int) -> bool:
-    return abs(other - key) <= _NEIGHBOURS or (other - key) % _FURTHER == 0
 
 
 def _overlap(here: PosedExposure, there: PosedExposure, camera_matrix: FloatArray) -> bool:

@@ -1,11 +1,14 @@
-"""Merge frames along the path of the camera, through the depth of the scene."""
+"""Merge frames along the path of the camera, through the depth of the scene, which is interpolated between points."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.spatial import cKDTree
 
 from photonpano import FloatArray, FrameSpan, Group, Source, VirtualExposure, capture_of
 from photonpano.compiling import compiled
@@ -13,37 +16,32 @@ from photonpano.geometry import inverse, scaled_ahead
 from photonpano.merging import PhotonSum, chunks_of
 from photonpano_colmap.posing.path import Path, between
 
+Image = NDArray[np.float32]
+
 _CHUNK_PX = 1.0  # frames that move less than this are summed before they are warped
+_STEP_PX = 8  # spacing of the grid on which depth is interpolated
+_MARGIN = 0.05  # points up to this far outside of the frame are used, in its longer side
+# A point is an outlier if its inverse depth differs from the median of its 7 neighbours by half of it.
+_NEIGHBOURS = 7
+_APART = 0.5
+_LEAST = 4  # fewest points of a depth map
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedExposure:
-    """A virtual exposure, with its place in the world.
+    """A virtual exposure, with its place in the world."""
 
-    Attributes:
-        exposure: flux and weight, seen from the reference instant of its group.
-        pose: (3, 4) of that instant.
-        inverse_depth: (H, W) of its pixels.
-    """
-
-    exposure: VirtualExposure
-    pose: FloatArray
-    inverse_depth: NDArray[np.float32]
+    exposure: VirtualExposure  # flux and weight, seen from the reference instant of its group
+    pose: FloatArray  # (3, 4) of that instant
+    inverse_depth: Image  # (H, W) of its pixels
 
 
 def merge_through_depth(
-    source: Source, group: Group, path: Path, inverse_depth: NDArray[np.float32], camera_matrix: FloatArray
+    source: Source, group: Group, path: Path, inverse_depth: Image, camera_matrix: FloatArray
 ) -> PosedExposure:
     """Merge the frames of a group as its reference instant sees them (paper, section 6: aggregation that is consistent in 3D).
 
     Each chunk of frames is interpolated once, where its frames see the points of the reference view. Occlusions are ignored.
-
-    Args:
-        source: the capture.
-        group: the frames and the reference instant.
-        path: of the camera.
-        inverse_depth: (H, W) of the view at the reference instant.
-        camera_matrix: (3, 3) K.
     """
     pose = path.at([group.reference])[0]
     counts, weight = np.zeros((2, *source.info.frame_shape), np.float32)
@@ -70,20 +68,14 @@ class _Plane:
         return scaled_ahead(inverse(maps))
 
 
-def lit_counts(source: Source, span: FrameSpan) -> NDArray[np.float32]:
+def lit_counts(source: Source, span: FrameSpan) -> Image:
     """Return the sum of the frames of a span, of the flux alone: (H, W)."""
     return capture_of(source).corrected_counts(span).astype(np.float32)
 
 
 @compiled
 def _add(
-    frames: NDArray[np.float32],
-    frame_weight: NDArray[np.float32],
-    inverse_depth: NDArray[np.float32],
-    turn: FloatArray,
-    shift: FloatArray,
-    counts: NDArray[np.float32],
-    weight: NDArray[np.float32],
+    frames: Image, frame_weight: Image, inverse_depth: Image, turn: FloatArray, shift: FloatArray, counts: Image, weight: Image
 ) -> None:
     """Add (H, W) counts and weights of frames to those of a view, interpolated bilinearly; see `path.between`."""
     height, width = frames.shape
@@ -109,3 +101,33 @@ def _add(
             weight_of[x] += (one - b) * ((one - a) * upper_weight[i] + a * upper_weight[i + 1]) + b * (
                 (one - a) * lower_weight[i] + a * lower_weight[i + 1]
             )
+
+
+def inverse_depth_of(pose: FloatArray, points: FloatArray, camera_matrix: FloatArray, shape: tuple[int, int]) -> Image | None:
+    """Return the inverse depth of the pixels of a view, (H, W), from points of the world; None if it sees fewer than 4.
+
+    It is linear between points, as that of a plane is. At the edges of things it is wrong by the width of a triangle; within a
+    group, the camera moves so little that this hardly matters.
+    """
+    height, width = shape
+    seen = points @ pose[:, :3].T + pose[:, 3]
+    seen = seen[seen[:, 2] > 0]
+    pixels = seen @ camera_matrix.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    margin = _MARGIN * max(shape)
+    inside = ((pixels > -margin) & (pixels < (width + margin, height + margin))).all(axis=1)
+    pixels, inverse_depth = pixels[inside], 1 / seen[inside, 2]
+    if len(pixels) >= _NEIGHBOURS:
+        _, nearest = cKDTree(pixels).query(pixels, k=_NEIGHBOURS)
+        median = np.median(inverse_depth[nearest], axis=1)
+        kept = np.abs(inverse_depth - median) < _APART * median
+        pixels, inverse_depth = pixels[kept], inverse_depth[kept]
+    if len(pixels) < _LEAST or np.linalg.matrix_rank(pixels - pixels.mean(axis=0), tol=1.0) < 2:
+        return None
+    rows, columns = -(-height // _STEP_PX), -(-width // _STEP_PX)
+    middle = (_STEP_PX - 1) / 2
+    x, y = np.meshgrid(np.arange(columns) * _STEP_PX + middle, np.arange(rows) * _STEP_PX + middle)
+    grid = LinearNDInterpolator(pixels, inverse_depth)(x, y)
+    grid = np.where(np.isfinite(grid), grid, NearestNDInterpolator(pixels, inverse_depth)(x, y)).astype(np.float32)
+    fine = cv2.resize(grid, (columns * _STEP_PX, rows * _STEP_PX), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(fine[:height, :width])

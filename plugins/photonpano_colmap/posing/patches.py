@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray
 from photonpano.compiling import compiled
 from photonpano.locating import view_of
-from photonpano_colmap.posing.merging import PosedExposure
+from photonpano_colmap.posing.merging import Image, PosedExposure
 from photonpano_colmap.posing.path import between
 
 _BLUR_PX = 1.0  # standard deviation of the blur against photon noise
@@ -30,43 +30,26 @@ _SLOPE_PX = 3.0  # standard deviation of the blur before slopes of the inverse d
 
 
 class Stabilised(NamedTuple):
-    """An exposure as an image of uniform noise.
+    """An exposure as an image of uniform noise."""
 
-    Attributes:
-        image: (H, W) float32, blurred; NaN where it is unknown.
-        noise: variance of a pixel before the blur.
-        noise_left: share of this variance that the blur leaves.
-    """
-
-    image: NDArray[np.float32]
-    noise: float
-    noise_left: float
+    image: Image  # (H, W), blurred; NaN where it is unknown
+    noise: float  # variance of a pixel before the blur
+    noise_left: float  # share of this variance that the blur leaves
 
 
 class Patches(NamedTuple):
-    """Patches of an exposure.
+    """Patches of an exposure."""
 
-    Attributes:
-        pixels: (N, 2) their middles, px.
-        inverse_depth: (N, 3) that of their middles, and its slopes along x and y per px.
-    """
-
-    pixels: FloatArray
-    inverse_depth: FloatArray
+    pixels: FloatArray  # (N, 2) their middles, px
+    inverse_depth: FloatArray  # (N, 3) that of their middles, and its slopes along x and y per px
 
 
 class Found(NamedTuple):
-    """Where some patches are in another exposure.
+    """Where some patches are in another exposure."""
 
-    Attributes:
-        patches: (M,) their numbers.
-        pixels: (M, 2) px.
-        covariance: (M, 2, 2) px^2, as photon noise has it.
-    """
-
-    patches: NDArray[np.intp]
-    pixels: FloatArray
-    covariance: FloatArray
+    patches: NDArray[np.intp]  # (M,) their numbers
+    pixels: FloatArray  # (M, 2) px
+    covariance: FloatArray  # (M, 2, 2) px^2, as photon noise has it
 
 
 def stabilised(posed: PosedExposure) -> Stabilised:
@@ -95,20 +78,11 @@ def patches_of(posed: PosedExposure, view: Stabilised, most: int) -> Patches:
 
 
 def find_patches(
-    patches: Patches,
-    here: tuple[PosedExposure, Stabilised],
-    there: tuple[PosedExposure, Stabilised],
-    camera_matrix: FloatArray,
+    patches: Patches, here: tuple[PosedExposure, Stabilised], there: tuple[PosedExposure, Stabilised], camera_matrix: FloatArray
 ) -> Found:
-    """Find the patches of an exposure in another one.
+    """Find the patches of an exposure, `here`, in another one, `there`.
 
     The noise of the patch itself shifts it alike in all other exposures, and with it the point of the scene that it stands for.
-
-    Args:
-        patches: of the exposure `here`.
-        here: the exposure that they were chosen in.
-        there: the other one.
-        camera_matrix: (3, 3) K.
     """
     (posed, view), (other, image) = here, there
     turn, shift = between(posed.pose, other.pose, camera_matrix)
@@ -131,8 +105,8 @@ def find_patches(
 
 @compiled
 def _find(
-    template: NDArray[np.float32],
-    image: NDArray[np.float32],
+    template: Image,
+    image: Image,
     middles: FloatArray,
     inverse_depth: FloatArray,
     turn: FloatArray,
@@ -142,19 +116,11 @@ def _find(
     hessian: FloatArray,
     chi_square: FloatArray,
 ) -> None:
-    """Find patches in an image; those that are lost stay NaN.
+    """Find patches of a template, (H, W), in an image by Gauss-Newton steps; those that are lost stay NaN.
 
-    Args:
-        template: (H, W) the image that they were chosen in.
-        image: (H, W) the other one.
-        middles: (N, 2) px.
-        inverse_depth: (N, 3), see `Patches`.
-        turn: (3, 3), see `path.between`.
-        shift: (3,), see `path.between`.
-        gradient_noise: variance of a gradient of the image that is noise.
-        pixels: (N, 2) output, their middles in the image.
-        hessian: (N, 2, 2) output, weighted sums of products of the gradients of the scene.
-        chi_square: (N,) output, weighted mean square of the residuals, whose mean is subtracted.
+    `middles` are (N, 2) px; `turn` and `shift` are from `path.between`; `gradient_noise` is the variance of a gradient by
+    noise. Writes the middles in the image, (N, 2), the weighted sums of products of gradients of the scene, (N, 2, 2), and the
+    weighted mean square of the residuals less their mean, (N,).
     """
     size = (2 * _HALF + 1) ** 2
     values, us, vs, weights = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
@@ -215,7 +181,7 @@ def _find(
 
 
 @compiled
-def _sample(image: NDArray[np.float32], x: float, y: float) -> float:
+def _sample(image: Image, x: float, y: float) -> float:
     """Return an image at a place, interpolated bilinearly; NaN outside."""
     height, width = image.shape
     if not (0 <= x < width - 1 and 0 <= y < height - 1):

@@ -42,7 +42,7 @@ class PoseSpline:
 
 
 def left_out(instants: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far each inner pose is from the spline through the others: distances and angles in radians, (N - 2,) each."""
+    """Return leave-one-out errors of the spline at inner poses: distances and angles in radians, (N - 2,) each."""
     apart, angles = [], []
     for place in range(1, len(instants) - 1):
         others = np.delete(np.arange(len(instants)), place)
@@ -74,13 +74,9 @@ class Path:
     def corrected(self, borders: FloatArray, means: FloatArray) -> Path:
         """Return this path, corrected where groups of frames were located along it.
 
-        The frames of a group were merged along the path, so a group's pose gives the mean correction of its frames, not that of
-        one instant. The correction is the function with these means and the least second derivative: the derivative of the
-        natural quintic spline through its integral at the borders of the groups.
-
-        Args:
-            borders: (N + 1,) increasing, in frames: where groups begin and end, side by side.
-            means: (N, 6) corrections of the groups, as `moves` has them.
+        The frames of a group were merged along the path, so a group's pose gives the mean correction of its frames, (N, 6), not
+        that of one instant. The correction is the function with these means and the least second derivative: the derivative of
+        the natural quintic spline through its integral at the borders of the groups, (N + 1,) in frames.
         """
         integral = np.concatenate([np.zeros((1, 6)), np.cumsum(means * np.diff(borders)[:, None], axis=0)])
         end = [(3, np.zeros(6)), (4, np.zeros(6))]
@@ -111,17 +107,9 @@ def moves(before: FloatArray, after: FloatArray) -> FloatArray:
 
 
 def between(pose: FloatArray, other: FloatArray, camera_matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the map from pixels of a view to those of another one, for points of known depth.
+    """Return `turn`, (..., 3, 3), and `shift`, (..., 3): the map of pixels of a view to those of other poses, (..., 3, 4).
 
     A pixel (x, y) of inverse depth q is seen by the other camera at `turn @ (x, y, 1) + q * shift`, in homogeneous pixels.
-
-    Args:
-        pose: (3, 4) of the view.
-        other: (..., 3, 4) of one or several others.
-        camera_matrix: (3, 3) K of all.
-
-    Returns:
-        `turn`, (..., 3, 3), and `shift`, (..., 3).
     """
     rotation = other[..., :3] @ pose[:, :3].T
     moved = other[..., 3] - rotation @ pose[:, 3]
@@ -136,15 +124,7 @@ def projected(poses: FloatArray, points: FloatArray, camera_matrix: FloatArray) 
 
 
 def exceeding_noise_of_poses(moves: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Denoise corrections of poses with a Wiener filter, and keep their slow part.
-
-    Args:
-        moves: (N, 6) px, in order of time.
-        covariance: (N, 6, 6) of the noise of each.
-
-    Returns:
-        (N, 6).
-    """
+    """Denoise (N, 6) corrections of poses, in px, with a Wiener filter, and keep their slow part; `covariance` is (N, 6, 6)."""
     times = np.linspace(-1, 1, len(moves))
     basis = np.polynomial.legendre.legvander(times, min(_DEGREE, len(moves) - 1))
     slow = basis @ np.linalg.lstsq(basis, moves, rcond=None)[0]

@@ -15,14 +15,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from photonpano import FloatArray, FrameSpan, Source
 from photonpano.compiling import compiled
 from photonpano.filtering import exceeding_noise
 from photonpano.photometry import flux_std
-from photonpano_colmap.posing.merging import PosedExposure, lit_counts
+from photonpano_colmap.posing.merging import Image, PosedExposure, lit_counts
 from photonpano_colmap.posing.path import Path, between
 
 _NOISE_PX = 0.1  # standard error of the shift of a span that determines its length, within the limits below
@@ -41,38 +40,21 @@ _LEAST_INFORMATION = 1e-2  # modes with a standard error above 10 px are unknown
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tremor:
-    """What the camera does faster than its path.
+    """Motion of the camera at higher frequencies than its path."""
 
-    Attributes:
-        rotations: (T, 3) small rotation vectors of the camera at each frame.
-        std: (T,) their noise, in radians.
-        rms_px: root mean square of what they move in the image.
-        shift: root mean square of the shifts within groups, which are not corrected, in units of the world.
-    """
-
-    rotations: FloatArray
-    std: FloatArray
-    rms_px: float
-    shift: float
+    rotations: FloatArray  # (T, 3) small rotation vectors of the camera at each frame
+    std: FloatArray  # (T,) their noise, in radians
+    rms_px: float  # root mean square of the displacement in the image
+    shift: float  # root mean square of the shifts within groups, which are not corrected, in units of the world
 
 
 def find_tremor(
     source: Source, exposures: Sequence[PosedExposure], path: Path, camera_matrix: FloatArray, pool: ThreadPoolExecutor
 ) -> Tremor | None:
-    """Find how the camera moves within groups that were merged along a path.
+    """Find how the camera moves within groups, side by side, that were merged along a path; None if the frames are too few.
 
-    A span of a few frames shows the exposure of its group, moved by a step of the camera. Steps are estimated by weighted
-    least squares, and denoised with a Wiener filter.
-
-    Args:
-        source: the capture.
-        exposures: of groups side by side, merged along the path.
-        path: of the camera.
-        camera_matrix: (3, 3) K.
-        pool: threads; the result does not depend on their number.
-
-    Returns:
-        None if the frames are too few.
+    A span of a few frames shows the exposure of its group, moved by a step of the camera. Steps are estimated by weighted least
+    squares, and denoised with a Wiener filter. The result does not depend on the number of threads of the pool.
     """
     inverse_depth = float(np.median([np.median(each.inverse_depth) for each in exposures]))
     predicted = list(pool.map(lambda posed: _prediction(posed, camera_matrix, inverse_depth), exposures))
@@ -112,41 +94,24 @@ def _beyond_noise(shifts: FloatArray) -> float:
 
 
 class _Prediction(NamedTuple):
-    """What a frame of a group is expected to show, as its reference instant sees it.
+    """Expected counts of a frame of a group, seen from its reference instant."""
 
-    Attributes:
-        mean: (H, W) expected count of a frame.
-        slope_x: (H, W) its slope along x, divided by the variance of a frame; 0 where it is not known.
-        slope_y: (H, W) the same along y.
-        gain: (H, W) the mean, divided by that variance; 0 where the slopes are not known.
-        inverse_depth: (H, W).
-        mean_depth: inverse depth at which a shift of the camera counts in px.
-        to_ideal: (3, 3) pixels to directions.
-        information: (7, 7) of one frame that sees all of it.
-    """
-
-    mean: NDArray[np.float32]
-    slope_x: NDArray[np.float32]
-    slope_y: NDArray[np.float32]
-    gain: NDArray[np.float32]
-    inverse_depth: NDArray[np.float32]
-    mean_depth: float
-    to_ideal: FloatArray
-    information: FloatArray
+    mean: Image  # (H, W) expected count of a frame
+    slope_x: Image  # (H, W) its slope along x, divided by the variance of a frame; 0 where it is not known
+    slope_y: Image  # (H, W) the same along y
+    gain: Image  # (H, W) the mean, divided by that variance; 0 where the slopes are not known
+    inverse_depth: Image  # (H, W)
+    mean_depth: float  # inverse depth at which a shift of the camera counts in px
+    to_ideal: FloatArray  # (3, 3) pixels to directions
+    information: FloatArray  # (7, 7) of one frame that sees all of it
 
 
 class _Equations(NamedTuple):
-    """Normal equations of the motion of a span with its gain eliminated; rotations and translations count in px of the image.
+    """Normal equations of the motion of a span, with its gain eliminated, in px of the image."""
 
-    Attributes:
-        instant: centre of the span, in frames.
-        gradient: (6,) right-hand side.
-        information: (6, 6).
-    """
-
-    instant: float
-    gradient: FloatArray
-    information: FloatArray
+    instant: float  # centre of the span, in frames
+    gradient: FloatArray  # (6,) right-hand side
+    information: FloatArray  # (6, 6)
 
 
 def _solved(gradient: FloatArray, information: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -199,12 +164,7 @@ def _divided(span: FrameSpan, size: int) -> list[FrameSpan]:
 
 
 def _measured(
-    source: Source,
-    span: FrameSpan,
-    turn: FloatArray,
-    shift: FloatArray,
-    posed: PosedExposure,
-    predicted: _Prediction,
+    source: Source, span: FrameSpan, turn: FloatArray, shift: FloatArray, posed: PosedExposure, predicted: _Prediction
 ) -> _Equations:
     """Return the motion of the camera in a span, beyond that along which its group was merged."""
     valid = source.valid.astype(np.float32)
@@ -221,19 +181,10 @@ def _measured(
 
 
 @compiled
-def _add_information(
-    predicted: _Prediction,
-    slope_x: NDArray[np.float32],
-    slope_y: NDArray[np.float32],
-    noise: NDArray[np.float32],
-) -> None:
-    """Add the upper triangle of the information of one frame.
+def _add_information(predicted: _Prediction, slope_x: Image, slope_y: Image, noise: Image) -> None:
+    """Add the upper triangle of the information of one frame, from the slopes (H, W) of the mean count.
 
-    Args:
-        predicted: its `information` is added to.
-        slope_x: (H, W) slopes of the mean count.
-        slope_y: (H, W) the same along y.
-        noise: (H, W) variance of a slope that is noise, divided by that of a frame.
+    `noise` is (H, W), the variance of a slope that is noise, divided by that of a frame.
     """
     height, width = slope_x.shape
     along_x, along_y = np.zeros(6), np.zeros(6)
@@ -260,23 +211,9 @@ def _add_information(
 
 @compiled
 def _add_residuals(
-    frames: NDArray[np.float32],
-    frame_weight: NDArray[np.float32],
-    predicted: _Prediction,
-    turn: FloatArray,
-    shift: FloatArray,
-    sums: FloatArray,
+    frames: Image, frame_weight: Image, predicted: _Prediction, turn: FloatArray, shift: FloatArray, sums: FloatArray
 ) -> None:
-    """Add the right-hand side of the equations of a span, and the light that it sees.
-
-    Args:
-        frames: (H, W) sum of the frames of the span.
-        frame_weight: (H, W) number of frames in each pixel of the sum.
-        predicted: what one frame is expected to show.
-        turn: (3, 3), see `path.between`.
-        shift: (3,), see `path.between`.
-        sums: (8,) output.
-    """
+    """Add the right-hand side of the equations of a span, and the light that it sees, to the (8,) sums; see `path.between`."""
     height, width = frames.shape
     along_x, along_y = np.zeros(6), np.zeros(6)
     for row in range(height):
@@ -313,16 +250,7 @@ def _add_residuals(
 
 @compiled
 def _moves(row: int, column: int, q: float, to_ideal: FloatArray, along_x: FloatArray, along_y: FloatArray) -> None:
-    """Write the motion of a pixel by rotations of the camera about its axes, and translations along them, in focal lengths.
-
-    Args:
-        row: of the pixel.
-        column: of the pixel.
-        q: its inverse depth.
-        to_ideal: (3, 3) pixels to directions.
-        along_x: (6,) output.
-        along_y: (6,) output.
-    """
+    """Write, (6,) each, how rotations about the camera's axes and translations along them move a pixel, in focal lengths."""
     x = to_ideal[0, 0] * column + to_ideal[0, 2]
     y = to_ideal[1, 1] * row + to_ideal[1, 2]
     along_x[0], along_x[1], along_x[2] = -x * y, 1 + x * x, -y

@@ -1,16 +1,18 @@
-"""Interpolators whose curves pass through every knot: `lucas-kanade`, `geodesic` and `lie`."""
+"""Interpolators through every knot, `lucas-kanade`, `geodesic` and `lie`, and the trajectories that all interpolators fit."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
-from scipy.interpolate import BSpline
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline, make_interp_spline
 from scipy.sparse.linalg import splu
 
 from photonpano import FloatArray, LocationError
-from photonpano.geometry import apply, corners, inverse, parameters
+from photonpano.geometry import corners, from_parameters, inverse, normalised, parameters, transform_points
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators.sl3 import exponential, logarithm, unimodular
-from photonpano_core.interpolators.trajectories import GroupTrajectory, ParameterTrajectory, interpolating_spline
 
 DEGREE = 3
 MAX_ITERATIONS = 50
@@ -24,7 +26,7 @@ class LucasKanadeInterpolator:
         self._config = config
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> ParameterTrajectory:
-        """Interpolate; the information is not used, since the spline passes through every knot."""
+        """Interpolate through every knot."""
         del information
         spline = interpolating_spline(instants, parameters(homographies))
         return ParameterTrajectory(instants, spline, self._config.hold_frames)
@@ -41,11 +43,7 @@ class GeodesicInterpolator:
         self._config = config
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> GroupTrajectory:
-        """Interpolate; the information is not used, since the curve passes through every knot.
-
-        Raises:
-            LocationError: two knots are half a turn or more apart, so that the motion between them has no real logarithm.
-        """
+        """Interpolate through every knot; raises a `LocationError` if two knots are half a turn or more apart."""
         del information
         return GroupTrajectory(instants, homographies, 1, self._config.hold_frames)
 
@@ -63,11 +61,7 @@ class LieInterpolator:
         self._corners = corners(frame_shape)
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> GroupTrajectory:
-        """Interpolate; the information is not used, since the curve passes through every knot.
-
-        Raises:
-            LocationError: knots are half a turn or more apart, or the iteration does not converge.
-        """
+        """Interpolate through every knot; raises a `LocationError` if knots are half a turn apart, or nothing converges."""
         del information
         hold = self._config.hold_frames
         if len(instants) < 3:
@@ -78,7 +72,7 @@ class LieInterpolator:
         for _ in range(MAX_ITERATIONS):
             curve = GroupTrajectory(instants, controls, DEGREE, hold)
             residuals = inverse(curve.at(instants)) @ homographies
-            if np.abs(apply(residuals, self._corners) - self._corners).max() < TOLERANCE_PX:
+            if np.abs(transform_points(residuals, self._corners) - self._corners).max() < TOLERANCE_PX:
                 return curve
             errors = logarithm(unimodular(residuals))
             if np.isnan(errors).any():
@@ -92,3 +86,102 @@ class LieInterpolator:
             "no smooth curve of homographies was found through the located exposures: they turn too fast, or lie too unevenly "
             "in time; interpolate with geodesic, lucas-kanade or smoothing-spline"
         )
+
+
+def interpolating_spline(instants: FloatArray, values: FloatArray, degree: int = 3) -> BSpline:
+    """Return the spline through (N, K) values; the degree is at most N - 1, and a single knot gives a constant."""
+    if len(instants) == 1:
+        instants, values = np.array([instants[0], instants[0] + 1]), np.repeat(values, 2, axis=0)
+    return make_interp_spline(instants, values, k=min(degree, len(instants) - 1))
+
+
+class HeldTrajectory(ABC):
+    """A trajectory that keeps its velocity for a bounded time beyond its ends, and then stands still: polynomials diverge."""
+
+    def __init__(self, instants: FloatArray, hold_frames: float | None) -> None:
+        """Take the (N,) increasing instants of the knots; `hold_frames` is twice their mean distance by default."""
+        self._first, self._last = float(instants[0]), float(instants[-1])
+        spacing = (self._last - self._first) / max(1, len(instants) - 1)
+        self._hold = 2 * spacing if hold_frames is None else hold_frames
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the homographies of N instants: (N, 3, 3)."""
+        frames = np.atleast_1d(np.asarray(frame_indices, dtype=np.float64))
+        inside = np.clip(frames, self._first, self._last)
+        return self._extrapolated(inside, np.clip(frames - inside, -self._hold, self._hold))
+
+    @abstractmethod
+    def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
+        """Return (N, 3, 3), going on from instants `inside` the knots, (N,), at the velocity there for `beyond` frames."""
+
+
+class SplinePath(HeldTrajectory):
+    """A spline of K numbers; `at` returns these, (N, K)."""
+
+    def __init__(self, instants: FloatArray, spline: BSpline, hold_frames: float | None) -> None:
+        super().__init__(instants, hold_frames)
+        self._spline = spline
+        self._velocity = spline.derivative()
+
+    def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
+        return np.asarray(self._spline(inside) + self._velocity(inside) * beyond[:, None])
+
+
+class ParameterTrajectory(SplinePath):
+    """A spline of p1..p8."""
+
+    def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
+        return from_parameters(super()._extrapolated(inside, beyond))
+
+
+class GroupTrajectory(HeldTrajectory):
+    """A cumulative B-spline of homographies, frame to reference plane; the curve does not depend on the plane.
+
+    A B-spline with control points C[j] is C[0] + sum of w[j](t) (C[j] - C[j-1]), where w[j] is the sum of the basis functions
+    from the j-th on. With products for sums it is a curve of homographies (Kim, Kim and Shin 1995), as smooth as its basis:
+
+        H(t) = C[0] (C[0]^-1 C[1])^w[1](t) (C[1]^-1 C[2])^w[2](t) ...
+    """
+
+    def __init__(self, instants: FloatArray, controls: FloatArray, degree: int, hold_frames: float | None) -> None:
+        """Take a (3, 3) control point for each instant, (N,); raises a `LocationError` if a step has no real logarithm."""
+        super().__init__(instants, hold_frames)
+        spline = interpolating_spline(instants, np.zeros(len(instants)), degree)
+        self._knots, self._degree = spline.t, spline.k
+        self._controls = unimodular(controls if len(instants) > 1 else np.repeat(controls, 2, axis=0))
+        self._steps = logarithm(np.linalg.inv(self._controls[:-1]) @ self._controls[1:])
+        for missing in np.flatnonzero(np.isnan(self._steps[:, 0, 0])):
+            raise LocationError(
+                f"from frame {instants[missing]:g} to frame {instants[missing + 1]:g} the motion turns by half a turn or more, "
+                "or mirrors the image, so that it has no real logarithm; interpolate with lucas-kanade or smoothing-spline, "
+                "which need none, or locate more exposures in between"
+            )
+        self._velocities = [self._velocity(end) for end in (self._first, self._last)]
+
+    def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
+        start, weights = self._weights(inside)
+        result = self._controls[start]
+        for order in range(1, self._degree + 1):
+            result = result @ exponential(weights[:, order, None, None] * self._steps[start + order - 1])
+        for velocity, out in zip(self._velocities, (beyond < 0, beyond > 0), strict=True):
+            result[out] = result[out] @ exponential(beyond[out, None, None] * velocity)
+        return normalised(result)
+
+    def _weights(self, instants: FloatArray) -> tuple[NDArray[np.integer], FloatArray]:
+        """Return, for N instants, the first control point with influence, and the weights of it and those that follow."""
+        basis = BSpline.design_matrix(instants, self._knots, self._degree)
+        shape = len(instants), self._degree + 1
+        values, columns = basis.data.reshape(shape), basis.indices.reshape(shape)
+        return columns[:, 0], np.cumsum(values[:, ::-1], axis=1)[:, ::-1]
+
+    def _velocity(self, instant: float) -> FloatArray:
+        """Return the (3, 3) logarithm of the motion per frame, in pixels of the frame."""
+        start, weights = (array[0] for array in self._weights(np.array([instant])))
+        # Each weight is itself a spline, whose coefficients step from 0 to 1.
+        steps = np.greater_equal.outer(np.arange(len(self._controls)), start + np.arange(self._degree + 1))
+        rates = BSpline(self._knots, steps.astype(np.float64), self._degree).derivative()(instant)
+        velocity = np.zeros((1, 3, 3))
+        for order in range(1, self._degree + 1):
+            step = self._steps[[start + order - 1]]
+            velocity = exponential(-weights[order] * step) @ velocity @ exponential(weights[order] * step) + rates[order] * step
+        return velocity

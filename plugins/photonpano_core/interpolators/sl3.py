@@ -48,9 +48,8 @@ def exponential(matrices: FloatArray) -> FloatArray:
 def logarithm(matrices: FloatArray) -> FloatArray:
     """Return the principal logarithms of (N, 3, 3) matrices of determinant 1.
 
-    Returns:
-        (N, 3, 3); NaN where there is no real logarithm, or one with an eigenvalue above pi: the matrix mirrors, turns by half a
-        turn or more, or magnifies more than twentyfold.
+    They are NaN where there is none that is real, or one has an eigenvalue above pi: the matrix mirrors, turns by half a turn
+    or more, or magnifies more than twentyfold.
     """
     with np.errstate(divide="ignore"):
         size = np.abs(np.log(np.linalg.eigvals(matrices).astype(complex))).max(axis=-1)

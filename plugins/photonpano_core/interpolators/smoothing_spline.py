@@ -10,9 +10,9 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded, hadamard, solveh_banded
 
 from photonpano import FloatArray
-from photonpano.geometry import apply, corners, from_parameters, jacobian, parameters
+from photonpano.geometry import corners, from_parameters, jacobian, parameters, transform_points
 from photonpano_core.configs import InterpolatorConfig
-from photonpano_core.interpolators.trajectories import ParameterTrajectory, SplinePath, interpolating_spline
+from photonpano_core.interpolators.interpolating import ParameterTrajectory, SplinePath, interpolating_spline
 
 ORDER = 3  # of the derivative that is penalised: parabolas, which fit any three knots, are not
 # Candidates for the scale of the jerk, from a parabola to interpolation. The number of knots averaged grows with the sixth
@@ -46,10 +46,7 @@ class SmoothingSplineInterpolator:
         self._corners = corners(frame_shape)
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> ParameterTrajectory:
-        """Smooth; without information, all corners of all knots have equal and independent errors.
-
-        Up to three knots are interpolated.
-        """
+        """Smooth; without information, corners have equal, independent errors. Up to three knots are interpolated."""
         if len(instants) > ORDER:
             homographies = self._smoothed(instants, homographies, information)
         return ParameterTrajectory(instants, interpolating_spline(instants, parameters(homographies)), self._config.hold_frames)
@@ -76,7 +73,7 @@ class SmoothingSplineInterpolator:
         if information is not None:
             derivatives = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
             covariances = _covariances(information, _TO_MODES @ derivatives)
-        paths = apply(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
+        paths = transform_points(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
         moved = _smoothed_modes(instants, paths, covariances, _QUIET) @ _TO_MODES
         return _from_corners(self._corners, moved.reshape(-1, 4, 2))
 
@@ -87,14 +84,8 @@ def _smoothed_modes(
     """Return a smoothing spline at its knots: (N, K).
 
     With normal noise of the knots, and white noise as the jerk, third differences are normally distributed. The part of them
-    that the jerk does not explain is noise (Reinsch 1967; de Hoog and Hutchinson 1987).
-
-    Args:
-        instants: (N,), more than three.
-        knots: (N, K) modes, such as those of the corners.
-        covariances: (N, K, K) of the knots, up to a common factor.
-        quiet: modes by which that factor is estimated.
-        noise: the factor, where it is known.
+    that the jerk does not explain is noise (Reinsch 1967; de Hoog and Hutchinson 1987). The (N, K, K) covariances of the knots
+    are known up to a factor, `noise`, which is estimated from the `quiet` modes where it is None.
     """
     n_knots, n_modes = knots.shape
     times = instants * ((n_knots - 1) / (instants[-1] - instants[0]))
@@ -116,13 +107,7 @@ class _Mode:
     """Likelihood of the third differences of one mode, for each scale of its jerk.
 
     With the noise variance s and the jerk's variance s l, they are normally distributed with the covariance s (V + l J). The
-    deviance is n log s + squares(l) / s + determinant(l), up to a constant.
-
-    Attributes:
-        n_observed: n.
-        scales: (L,) values of l.
-        squares: (L,) of the third differences, divided by V + l J.
-        determinants: (L,) logarithms of those of V + l J.
+    deviance is n log s + squares(l) / s + determinants(l), up to a constant.
     """
 
     def __init__(self, observed: FloatArray, noise: sparse.csr_array, jerk: sparse.csr_array) -> None:
@@ -184,8 +169,7 @@ def _third_differences(times: FloatArray) -> sparse.csr_array:
 def _jerk_covariance(times: FloatArray) -> sparse.csr_array:
     """Return the covariance of third differences of a motion whose jerk is white noise of unit density: (N - 3, N - 3).
 
-    Each difference is the average of the jerk, weighted by a B-spline over four instants (Peano kernel); so the covariances are
-    integrals of products of B-splines.
+    Each is the average of the jerk, weighted by a B-spline over four instants (Peano kernel).
     """
     nodes, weights = np.polynomial.legendre.leggauss(ORDER)
     halves = np.diff(times)[:, None] / 2

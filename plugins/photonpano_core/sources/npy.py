@@ -229,7 +229,7 @@ def _frame_shape(config: PackedNpyConfig, header: NpyHeader) -> tuple[int, int]:
 
 
 def _remedy(path: Location, header: NpyHeader) -> str:
-    """Return what to do with an array that is not uint8."""
+    """Return the remedy for an array that is not uint8."""
     content = _contents(path, header)
     if content is None:
         return "pack frames of zeros and ones with numpy.packbits(cube, axis=-1)"
@@ -246,7 +246,7 @@ def _section(path: Location, holds: str, highest: int = 1) -> str:
 
 
 def _contents(path: Location, header: NpyHeader) -> Content | None:
-    """Return what the values of an array are, if they are bool or whole numbers, and not bytes of eight pixels each."""
+    """Return the content of an array of bool or whole numbers; None if it is something else, or bytes of eight pixels each."""
     if header.dtype.kind not in "bui" or len(header.shape) != 3 or min(header.shape) < 1 or header.fortran_order:
         return None
     samples = sampled_frames(path, header)

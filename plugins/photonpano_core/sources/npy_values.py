@@ -20,11 +20,7 @@ class Values:
     """Reads the values of frames in a .npy file, from any thread."""
 
     def __init__(self, path: Location, header: NpyHeader, frames_last: bool) -> None:
-        """Take an array of three dimensions, of which the first or the last is that of the frames.
-
-        Raises:
-            InputError: frames are last in an array at a URL.
-        """
+        """Take an array whose first or last axis is that of frames; raises an `InputError` if it is the last at a URL."""
         n_frames, height, width = header.shape[-1:] + header.shape[:-1] if frames_last else header.shape
         self.path, self.shape, self._dtype = path, (n_frames, height, width), header.dtype
         self._stored: StoredFrames | None = None
@@ -61,11 +57,7 @@ class Values:
 
 
 class NpyBits(BinarySource):
-    """Binary frames, a pixel to a value.
-
-    Raises:
-        InputError: when frames are read: a value is not a bit.
-    """
+    """Binary frames, a pixel to a value; reading them raises an `InputError` for a value that is not a bit."""
 
     def __init__(self, values: Values, frame_rate_hz: float | None) -> None:
         n_frames, height, width = values.shape
@@ -86,11 +78,7 @@ class NpyBits(BinarySource):
 
 
 class NpySums(BlockSource):
-    """Sums of binary frames: a `photonpano.Source`.
-
-    Raises:
-        InputError: when frames are read: a value exceeds the number of binary frames in a sum.
-    """
+    """Sums of binary frames: a `photonpano.Source`; reading one with a value that is too large raises an `InputError`."""
 
     def __init__(self, values: Values, binary_frames: int, frame_rate_hz: float | None) -> None:
         self.info = StreamInfo(*values.shape, frame_rate_hz, "intensity", binary_frames.bit_length())

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
+Image = NDArray[np.float32]
+
 PATCH = 8  # side of a patch, px
 GROUP = 16  # similar patches that are filtered together; a power of 2
 SEARCH = 10  # similar patches are looked for at this distance at most along x and y, px
@@ -19,7 +21,7 @@ STEP = 4  # distance of reference patches, px
 _THRESHOLD = np.float32(2.7)  # coefficients below this many standard deviations of the noise are set to 0
 
 
-def _dct_matrix() -> NDArray[np.float32]:
+def _dct_matrix() -> Image:
     order, at = np.arange(PATCH)[:, None], np.arange(PATCH)
     matrix = np.cos(np.pi * (at + 0.5) * order / PATCH) * np.sqrt(2 / PATCH)
     matrix[0] /= np.sqrt(2)
@@ -30,17 +32,11 @@ _DCT = _dct_matrix()
 
 
 class Patches(NamedTuple):
-    """Reference patches on a regular grid, and the patches that are similar to each.
+    """Reference patches on a regular grid, and the patches that are similar to each."""
 
-    Attributes:
-        rows: (R,) first rows of the reference patches.
-        columns: (C,) their first columns.
-        similar: (R, C, GROUP, 2) first row and column of the similar patches, the reference first.
-    """
-
-    rows: NDArray[np.int32]
-    columns: NDArray[np.int32]
-    similar: NDArray[np.int32]
+    rows: NDArray[np.int32]  # (R,) first rows of the reference patches
+    columns: NDArray[np.int32]  # (C,) their first columns
+    similar: NDArray[np.int32]  # (R, C, GROUP, 2) first row and column of the similar patches, the reference first
 
     @classmethod
     def over(cls, shape: tuple[int, ...]) -> Patches:
@@ -55,7 +51,7 @@ def _places(length: int) -> NDArray[np.int32]:
 
 
 @compiled
-def find_similar(image: NDArray[np.float32], patches: Patches) -> None:
+def find_similar(image: Image, patches: Patches) -> None:
     """Find the patches of an image, (H, W), that differ least from each reference patch."""
     rows, columns, found = patches
     height, width = image.shape
@@ -100,26 +96,26 @@ def find_similar(image: NDArray[np.float32], patches: Patches) -> None:
 
 
 @compiled
-def _transformed(patch: NDArray[np.float32], matrix: NDArray[np.float32], room: NDArray[np.float32]) -> None:
+def _transformed(patch: Image, matrix: Image, scratch: Image) -> None:
     """Multiply a patch with a matrix from the left and with its transpose from the right, in place."""
     for i in range(PATCH):
         for j in range(PATCH):
-            room[i, j] = np.float32(0)
+            scratch[i, j] = np.float32(0)
         for k in range(PATCH):
-            weight, row, out = matrix[i, k], patch[k], room[i]
+            weight, row, out = matrix[i, k], patch[k], scratch[i]
             for j in range(PATCH):
                 out[j] += weight * row[j]
     for i in range(PATCH):
         for j in range(PATCH):
             patch[i, j] = np.float32(0)
         for k in range(PATCH):
-            weight, out = room[i, k], patch[i]
+            weight, out = scratch[i, k], patch[i]
             for j in range(PATCH):
                 out[j] += weight * matrix[j, k]
 
 
 @compiled
-def _mixed(stack: NDArray[np.float32]) -> None:
+def _mixed(stack: Image) -> None:
     """Apply the orthonormal Walsh-Hadamard transform along the patches of a (GROUP, PATCH * PATCH) stack; it inverts itself."""
     half = 1
     while half < GROUP:
@@ -138,26 +134,15 @@ def _mixed(stack: NDArray[np.float32]) -> None:
 
 
 @compiled
-def filter_groups(
-    image: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    patches: Patches,
-    total: NDArray[np.float32],
-    weights: NDArray[np.float32],
-) -> None:
+def filter_groups(image: Image, noise: Image, patches: Patches, total: Image, weights: Image) -> None:
     """Filter each group of similar patches, and add its patches where they lie, weighted by how few coefficients are left.
 
-    Args:
-        image: (H, W).
-        noise: (H, W) standard deviation of the noise to remove.
-        patches: from `find_similar`.
-        total: (H, W) weighted sum of patches, added to.
-        weights: (H, W) sum of weights, added to.
+    `noise` is (H, W), the standard deviation to remove; `total` and `weights`, (H, W), are added to.
     """
     rows, columns, found = patches
     stack = np.empty((GROUP, PATCH, PATCH), np.float32)
     flat = stack.reshape(GROUP, PATCH * PATCH)
-    room = np.empty((PATCH, PATCH), np.float32)
+    scratch = np.empty((PATCH, PATCH), np.float32)
     forth, back = _DCT, np.ascontiguousarray(_DCT.T)
     half = PATCH // 2
     for r in range(len(rows)):
@@ -168,7 +153,7 @@ def filter_groups(
                 for i in range(PATCH):
                     for j in range(PATCH):
                         stack[k, i, j] = image[y + i, x + j]
-                _transformed(stack[k], forth, room)
+                _transformed(stack[k], forth, scratch)
             _mixed(flat)
             sigma = noise[rows[r] + half, columns[c] + half]
             limit, kept = _THRESHOLD * sigma, 0
@@ -182,7 +167,7 @@ def filter_groups(
             _mixed(flat)
             weight = np.float32(1) / (np.float32(kept) * sigma * sigma)
             for k in range(GROUP):
-                _transformed(stack[k], back, room)
+                _transformed(stack[k], back, scratch)
                 y, x = places[k, 0], places[k, 1]
                 for i in range(PATCH):
                     for j in range(PATCH):

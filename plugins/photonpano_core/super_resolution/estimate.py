@@ -8,37 +8,29 @@ import cv2
 import numpy as np
 
 from photonpano import FloatArray, FluxImage
+from photonpano.compiling import compiled
 from photonpano.merging import LitFrames
 from photonpano_core.super_resolution.collaborative import PATCH, Patches, filter_groups, find_similar
-from photonpano_core.super_resolution.observing import counts_in_light, expected, log_likelihood, photon_ratio
 
 # Noise that each round removes, in standard deviations of the photon noise of a cell: details come in from round to round.
 STRENGTHS = (4.0, 3.0, 2.25, 1.7, 1.27, 0.95)
 _STEPS = 6  # steps of expectation-maximisation in a round
 _MATCHED_ROUNDS = 3  # rounds for which similar patches are looked for once
 _FEWEST_FRAMES = 0.25  # frames of a cell, smoothed, below which its noise grows no more
-_KEPT_PX = 8.0  # denoising keeps the photons of surroundings of this width, the standard deviation of a Gaussian
+_KEPT_PX = 8.0  # standard deviation of the Gaussian over which denoising preserves the mean flux
 _DARKEST = 1e-5  # the flux stays above this share of its mean: expectation-maximisation cannot leave 0
 _BRIGHTEST = 1.55  # largest value on the stabilised scale, below pi / 2: a flux of 7.7 photons per frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """The photons of the cells of a grid.
+    """The photons of the cells of a grid."""
 
-    Attributes:
-        lit: (H, W) float32, sums of counts.
-        seen: (H, W) float32, frames in these sums; in changing light the sum of their gains, in frames of mean light.
-        kernel: (2 r + 1,) float32, the area of a pixel along x and along y: see `pixel_area`.
-        binary: whether a count is 1 for one photon or more; otherwise counts are photons.
-        light: frames and gains by the class of their light; None in steady light.
-    """
-
-    lit: FluxImage
-    seen: FluxImage
-    kernel: FluxImage
-    binary: bool
-    light: LitFrames | None = None
+    lit: FluxImage  # (H, W), sums of counts
+    seen: FluxImage  # (H, W), frames in these sums; in changing light the sum of their gains, in frames of mean light
+    kernel: FluxImage  # (2 r + 1,), the area of a pixel along x and along y: see `pixel_area`
+    binary: bool  # whether a count is 1 for one photon or more; otherwise counts are photons
+    light: LitFrames | None = None  # frames and gains by the class of their light; None in steady light
 
     @property
     def frames(self) -> FluxImage:
@@ -61,13 +53,9 @@ class Observations:
         return np.asarray(self.lit * np.log(lit / n) + (n - self.lit) * np.log(dark / n), np.float32) * (self.seen > 0)
 
     def photon_ratio(self, mean: FluxImage, into: FluxImage) -> None:
-        """Return the photons that each cell detected, given its counts, for each photon of the flux: (H, W).
+        """Write the photons that each cell detected, given its counts, for each expected photon of the flux: (H, W).
 
         In changing light it is `k sum_c n_c g_c / sum_c n_c (1 - exp(-g_c mean))` of counts k in n_c frames of gain g_c.
-
-        Args:
-            mean: (H, W) expected photons of a pixel in a frame.
-            into: (H, W) output.
         """
         if self.light is None or not self.binary:
             photon_ratio(self.lit, self.seen, mean, self.binary, into)
@@ -83,13 +71,10 @@ class Observations:
 
 
 def pixel_area(width: float) -> FluxImage:
-    """Return the share of each pixel of a grid in the light of a pixel of the sensor, along one axis.
+    """Return the share of each pixel of a grid in the light of a pixel of the sensor of a width in px, along one axis.
 
-    The light falls on a box. Its middle may lie anywhere within a cell, and the flux is constant within each pixel: the
-    weights are the integrals of two boxes, convolved with each other.
-
-    Args:
-        width: of the light-sensitive area of a pixel, in px of the grid.
+    The light falls on a box. Its middle may lie anywhere within a cell, and the flux is constant within each pixel: the weights
+    are the integrals of two boxes, convolved with each other.
     """
     radius = int(np.ceil(width / 2 + 1))
     offsets = np.arange(-radius, radius + 1)
@@ -105,27 +90,23 @@ def pixel_area(width: float) -> FluxImage:
 def rounds_of(observed: Observations, n_rounds: int) -> list[FluxImage]:
     """Estimate the flux, round by round; the last image is the best of the most rounds.
 
-    Each round increases the likelihood of the flux by some steps of expectation-maximisation,
-    `x <- x B'[k / (1 - exp(-B x))] / B'[n]` with the area B of a pixel, counts k and frames n, and then removes what looks
-    like noise: a plug-and-play prior (Venkatakrishnan et al. 2013).
-
-    Args:
-        observed: the photons.
-        n_rounds: how many rounds, at most those of `STRENGTHS`.
+    Each round increases the likelihood of the flux by some steps of expectation-maximisation, `x <- x B'[k / (1 - exp(-B x))] /
+    B'[n]` with the area B of a pixel, counts k and frames n, and then removes what looks like noise: a plug-and-play prior
+    (Venkatakrishnan et al. 2013).
     """
     seen = observed.weight()
     noise = 0.5 / np.sqrt(np.maximum(cv2.blur(seen, (PATCH, PATCH)), _FEWEST_FRAMES))
-    flux = _started(observed)
+    flux = _initial_flux(observed)
     floor = np.float32(_DARKEST * max(float(flux.mean()), 1e-9))
     patches, results = Patches.over(flux.shape), []
     for number, strength in enumerate(STRENGTHS[:n_rounds]):
-        flux = _likelier(flux, seen, floor, observed)
+        flux = _em_steps(flux, seen, floor, observed)
         stabilised = _stabilised(flux, observed.binary)
         if number % _MATCHED_ROUNDS == 0:
             find_similar(stabilised, patches)
         total, weights = np.zeros_like(flux), np.zeros_like(flux)
         filter_groups(stabilised, np.asarray(strength * noise, np.float32), patches, total, weights)
-        flux = _as_bright(np.maximum(_flux_of(total / weights, observed.binary), floor), flux)
+        flux = _mean_preserved(np.maximum(_flux_of(total / weights, observed.binary), floor), flux)
         results.append(flux)
     return results
 
@@ -136,19 +117,19 @@ def _averaged(image: FluxImage, observed: Observations) -> FluxImage:
     return found
 
 
-def _likelier(flux: FluxImage, seen: FluxImage, floor: np.float32, observed: Observations) -> FluxImage:
-    mean, ratio, room = np.empty_like(flux), np.empty_like(flux), np.empty_like(flux)
+def _em_steps(flux: FluxImage, seen: FluxImage, floor: np.float32, observed: Observations) -> FluxImage:
+    mean, ratio, scratch = np.empty_like(flux), np.empty_like(flux), np.empty_like(flux)
     known = seen > 1e-3 * max(float(seen.max()), 1e-9)
     per_frame = np.divide(1, seen, out=np.zeros_like(seen), where=known)
     for _ in range(_STEPS):
-        expected(flux, observed.kernel, room, mean)
+        expected(flux, observed.kernel, scratch, mean)
         observed.photon_ratio(mean, ratio)
-        expected(ratio, observed.kernel, room, mean)
+        expected(ratio, observed.kernel, scratch, mean)
         flux = np.maximum(np.where(known, flux * mean * per_frame, flux), floor)
     return flux
 
 
-def _started(observed: Observations) -> FluxImage:
+def _initial_flux(observed: Observations) -> FluxImage:
     """Return the flux of smoothed sums; where nothing was seen, that of the surroundings."""
     sigma = 0.25 * len(observed.kernel)
     lit = cv2.GaussianBlur(observed.lit, (0, 0), sigma) + 1e-3 * cv2.GaussianBlur(observed.lit, (0, 0), 8 * sigma)
@@ -162,11 +143,8 @@ def _started(observed: Observations) -> FluxImage:
     return np.asarray(-np.log1p(-lit_share) / gain, np.float32)
 
 
-def _as_bright(flux: FluxImage, before: FluxImage) -> FluxImage:
-    """Return flux that is as bright as before, on average over the surroundings of each pixel.
-
-    The mean on the stabilised scale is below that of the flux by what the noise spreads: by 10 % in a cell of few photons.
-    """
+def _mean_preserved(flux: FluxImage, before: FluxImage) -> FluxImage:
+    """Return flux as bright as before, on average around each pixel: denoising on the stabilised scale lowers the mean."""
     wanted, found = (cv2.GaussianBlur(each, (0, 0), _KEPT_PX) for each in (before, flux))
     return np.asarray(flux * (wanted / found), np.float32)
 
@@ -193,3 +171,94 @@ def gain_of(better: FluxImage, worse: FluxImage) -> tuple[float, float]:
     """Return the sum of the differences of two log-likelihoods, cell by cell, and its standard error."""
     apart: FloatArray = better.astype(np.float64) - worse
     return float(apart.sum()), float(np.sqrt((apart**2).sum()))
+
+
+@compiled
+def expected(flux: FluxImage, kernel: FluxImage, scratch: FluxImage, into: FluxImage) -> None:
+    """Average the flux, (H, W), over the areas of pixels that are centred at each cell; the border is repeated.
+
+    `kernel` (2 r + 1,) are symmetric weights along x and y with the sum 1, so that this is its own adjoint; `scratch` is
+    overwritten.
+    """
+    height, width = flux.shape
+    radius = len(kernel) // 2
+    for y in range(height):
+        row, out = flux[y], scratch[y]
+        for x in range(width):
+            if radius <= x < width - radius:
+                continue
+            total = np.float32(0)
+            for i in range(-radius, radius + 1):
+                total += kernel[i + radius] * row[min(max(x + i, 0), width - 1)]
+            out[x] = total
+        inner = out[radius : width - radius]
+        for t in range(len(inner)):
+            inner[t] = np.float32(0)
+        for i in range(2 * radius + 1):
+            weight, part = kernel[i], row[i : i + len(inner)]
+            for t in range(len(inner)):
+                inner[t] += weight * part[t]
+    for y in range(height):
+        out = into[y]
+        for x in range(width):
+            out[x] = np.float32(0)
+        for i in range(-radius, radius + 1):
+            weight, part = kernel[i + radius], scratch[min(max(y + i, 0), height - 1)]
+            for x in range(width):
+                out[x] += weight * part[x]
+
+
+@compiled
+def _lit_share(light: np.float32) -> np.float32:
+    """Return `1 - exp(-light)`, exact in float32 for a faint light too."""
+    half = np.float32(0.5)
+    return light - half * light * light if light < np.float32(2e-3) else np.float32(1) - np.exp(-light)
+
+
+@compiled
+def photon_ratio(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool, into: FluxImage) -> None:
+    """Write `k / (1 - exp(-mean))` of the counts k of each cell, (H, W), or k / mean of counts that are not binary."""
+    least = np.float32(1e-9)
+    for y in range(lit.shape[0]):
+        k, n, m, out = lit[y], seen[y], mean[y], into[y]
+        for x in range(len(k)):
+            light = max(m[x], least)
+            if k[x] <= 0 or n[x] <= 0:
+                out[x] = np.float32(0)
+            elif binary:
+                out[x] = k[x] / _lit_share(light)
+            else:
+                out[x] = k[x] / light
+
+
+@compiled
+def log_likelihood(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool, into: FluxImage) -> None:
+    """Return the log-likelihood of the counts of each cell, but for a constant: see `photon_ratio` for the arguments."""
+    least = np.float32(1e-9)
+    for y in range(lit.shape[0]):
+        k, n, m, out = lit[y], seen[y], mean[y], into[y]
+        for x in range(len(k)):
+            light = max(m[x], least)
+            if n[x] <= 0:
+                out[x] = np.float32(0)
+            elif binary:
+                out[x] = k[x] * np.log(_lit_share(light)) - (n[x] - k[x]) * light
+            else:
+                out[x] = k[x] * np.log(light) - n[x] * light
+
+
+@compiled
+def counts_in_light(mean: FluxImage, frames: FluxImage, gains: FluxImage, lit: FluxImage, dark: FluxImage) -> None:
+    """Write the expected frames of each cell with and without photons in changing light, (H, W), from the mean flux.
+
+    `frames` and `gains` are (C, H, W): the frames of each class of light, and the sums of their gains.
+    """
+    for y in range(mean.shape[0]):
+        for x in range(mean.shape[1]):
+            lit[y, x] = dark[y, x] = np.float32(0)
+            for c in range(len(frames)):
+                n = frames[c, y, x]
+                if n > 0:
+                    share = _lit_share(gains[c, y, x] / n * mean[y, x])
+                    lit[y, x] += n * share
+                    dark[y, x] += n * (np.float32(1) - share)

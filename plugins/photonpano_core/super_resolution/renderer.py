@@ -32,20 +32,25 @@ _PROBE_PX = 160  # side of the squares on which frames are held out, without the
 _PROBES = (0.25, 0.5, 0.75)  # where these squares lie: in the middles of the frames at these shares of the span
 _HELD_OUT = 8  # one chunk of frames in 8 is held out
 _FEWEST_FRAMES = 1.0  # pixels that fewer frames saw are unknown
-_GATHERING = 5  # one part in 5 of the time is spent on sorting photons, about
-# The first round that reaches this share of the largest gain is the last: the area of pixels hides the noise of fine detail
-# from frames held out, so that the most likely round is a noisy one.
+_GATHERING = 5  # sorting photons takes about one fifth of the time
+# The first round that reaches this fraction of the largest gain is the last: the blur by the area of pixels hides noise of fine
+# detail from held-out frames, so that the most likely round is a noisy one.
 _ENOUGH = 0.93
 _SIGNIFICANT = 2.0  # held-out frames show detail if they are likelier with it than without by this many standard errors
 
 
-@dataclass(frozen=True, slots=True)
-class _Chosen:
-    """What frames held out have shown for a motion: the number of rounds."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scan:
+    """Frames of a span along a motion, in chunks."""
 
+    source: Source
     trajectory: Trajectory
     span: FrameSpan
-    n_rounds: int
+    chunks: Sequence[Chunk]
+
+    def near(self, canvas: Canvas) -> list[Chunk]:
+        """Return the chunks whose frames may reach into a canvas."""
+        return visible(self.chunks, canvas, self.source.info.frame_shape)
 
 
 class SuperResolutionRenderer:
@@ -56,15 +61,10 @@ class SuperResolutionRenderer:
     """
 
     def __init__(self, config: SuperResolutionConfig, threads: int, decide: Decide) -> None:
-        """Prepare to render.
-
-        Args:
-            config: the keys of the spec.
-            threads: how many blocks are estimated at once; the result does not depend on it.
-            decide: records how many rounds were chosen, and why.
-        """
+        """Take the keys of the spec, how many blocks are estimated at once, and what records decisions."""
         self._config, self._threads, self._decide = config, threads, decide
-        self._chosen: _Chosen | None = None
+        # A motion, a span, and the number of rounds that held-out frames support for them.
+        self._chosen: tuple[Trajectory, FrameSpan, int] | None = None
         self._lock = Lock()
 
     def render(
@@ -79,40 +79,31 @@ class SuperResolutionRenderer:
         """Render the frames of a span on a canvas: see `Renderer`."""
         # Frames are sorted by where their pixels lie on the canvas.
         tolerance_px = min(tolerance_px, 0.25 / _scale_of(canvas))
-        chunks = pieces_of(span, trajectory, source.info.frame_shape, tolerance_px)
-        if not visible(chunks, canvas, source.info.frame_shape):
+        scan = _Scan(source, trajectory, span, pieces_of(span, trajectory, source.info.frame_shape, tolerance_px))
+        if not scan.near(canvas):
             advance(len(span))
             return Panorama(np.full(canvas.shape, np.nan, np.float32), np.zeros(canvas.shape, np.float32), canvas.transform)
         with _pool(self._threads) as pool:
             with self._lock:
                 chosen = self._chosen
-                if chosen is None or chosen.trajectory is not trajectory or chosen.span != span:
-                    n_rounds = self._rounds(source, chunks, trajectory, span, canvas, pool)
-                    chosen = self._chosen = _Chosen(trajectory, span, n_rounds)
+                if chosen is None or chosen[0] is not trajectory or chosen[1] != span:
+                    chosen = self._chosen = trajectory, span, self._rounds(scan, canvas, pool)
             wide, left, top = _widened(canvas)
-            seen = visible(chunks, wide, source.info.frame_shape)
+            seen = scan.near(wide)
             progress = _Shares(advance, len(span))
             n_frames = sum(len(chunk.span) for chunk in seen)
             sums = sums_on(source, seen, wide, partial(progress.add, 1 / (n_frames * _GATHERING)), pool)
             blank = np.full(wide.shape, np.nan, np.float32)
             whole = Panorama(blank, np.zeros(wide.shape, np.float32), wide.transform)
             blocks = _blocks(wide)
-            work = partial(self._fill, whole, sums, chunks, source, chosen.n_rounds)
+            work = partial(self._fill, whole, sums, scan, chosen[2])
             for _ in pool.map(work, blocks):
                 progress.add((1 - 1 / _GATHERING) / len(blocks), 1)
             progress.finish()
         inner = slice(top, top + canvas.height), slice(left, left + canvas.width)
         return Panorama(whole.flux[inner].copy(), whole.weight[inner].copy(), canvas.transform)
 
-    def _fill(
-        self,
-        panorama: Panorama,
-        sums: PhotonSums,
-        chunks: Sequence[Chunk],
-        source: Source,
-        n_rounds: int,
-        block: Box,
-    ) -> None:
+    def _fill(self, panorama: Panorama, sums: PhotonSums, scan: _Scan, n_rounds: int, block: Box) -> None:
         """Estimate what frames show of a block of a panorama, if they show anything."""
         part = _seen_part(sums.seen, block)
         if part is None:
@@ -120,13 +111,13 @@ class SuperResolutionRenderer:
         block, inner, around = part
         rows, columns = block
         middle = np.array([(columns.start + columns.stop - 1) / 2, (rows.start + rows.stop - 1) / 2])
-        zoom = _zoom_at(middle, panorama.canvas, chunks, source.info.frame_shape)
-        observed = self._observations(source, sums.part(around), zoom)
-        weight = observed.weight()[inner] * np.float32(zoom**2 / _trials(source))
+        zoom = _zoom_at(middle, panorama.canvas, scan.chunks, scan.source.info.frame_shape)
+        observed = self._observations(scan.source, sums.part(around), zoom)
+        weight = observed.weight()[inner] * np.float32(zoom**2 / _trials(scan.source))
         known = weight >= _FEWEST_FRAMES
         if not known.any():
             return
-        flux = rounds_of(observed, n_rounds)[-1][inner] * np.float32(_trials(source))
+        flux = rounds_of(observed, n_rounds)[-1][inner] * np.float32(_trials(scan.source))
         panorama.flux[block] = np.where(known, flux, np.float32(np.nan))
         panorama.weight[block] = np.where(known, weight, 0)
 
@@ -135,29 +126,22 @@ class SuperResolutionRenderer:
         area = pixel_area(zoom * float(np.sqrt(self._config.fill_factor)))
         return Observations(sums.lit, sums.seen, area, binary, sums.light)
 
-    def _rounds(
-        self,
-        source: Source,
-        chunks: Sequence[Chunk],
-        trajectory: Trajectory,
-        span: FrameSpan,
-        canvas: Canvas,
-        pool: ThreadPoolExecutor,
-    ) -> int:
+    def _rounds(self, scan: _Scan, canvas: Canvas, pool: ThreadPoolExecutor) -> int:
         """Choose the number of rounds by frames held out, record it, and say whether they show the detail of this scale."""
         scores: list[FloatArray] = []
         detail = np.zeros(2)
         for share in _PROBES:
-            probe = _probe(share, source, trajectory, span, canvas)
-            near = visible(chunks, probe, source.info.frame_shape)
+            probe = _probe(share, scan, canvas)
+            near = scan.near(probe)
             held = [chunk for index, chunk in enumerate(near) if index % _HELD_OUT == _HELD_OUT // 2]
             kept = [chunk for index, chunk in enumerate(near) if index % _HELD_OUT != _HELD_OUT // 2]
             if not held:
                 continue
             middle = np.array([(probe.width - 1) / 2, (probe.height - 1) / 2])
-            zoom = _zoom_at(middle, probe.transform, near, source.info.frame_shape)
+            zoom = _zoom_at(middle, probe.transform, near, scan.source.info.frame_shape)
             fitted, tested = (
-                self._observations(source, sums_on(source, part, probe, lambda _: None, pool), zoom) for part in (kept, held)
+                self._observations(scan.source, sums_on(scan.source, part, probe, lambda _: None, pool), zoom)
+                for part in (kept, held)
             )
             inner = slice(_HALO_PX, -_HALO_PX), slice(_HALO_PX, -_HALO_PX)
             results = rounds_of(fitted, len(STRENGTHS))
@@ -192,7 +176,7 @@ class SuperResolutionRenderer:
 
 
 class _Shares:
-    """Turns shares of the work into whole frames for `advance`."""
+    """Reports fractions of the work to `advance` as whole frames."""
 
     def __init__(self, advance: Callable[[int], None], n_frames: int) -> None:
         self._advance, self._n_frames = advance, n_frames
@@ -253,11 +237,7 @@ def _blocks(wide: Canvas) -> list[Box]:
 
 
 def _seen_part(seen: FluxImage, block: Box) -> tuple[Box, Box, Box] | None:
-    """Return the part of a block around which something was seen.
-
-    Returns:
-        The part, rows and columns; where it lies within the third; and the part with its margin. None if nothing was seen.
-    """
+    """Return the part of a block around which something was seen, its place within the third, and the part with its margin."""
     rows, columns = block
     near = seen[rows.start - _HALO_PX : rows.stop + _HALO_PX, columns.start - _HALO_PX : columns.stop + _HALO_PX] > 0
     found = []
@@ -276,15 +256,11 @@ def _seen_part(seen: FluxImage, block: Box) -> tuple[Box, Box, Box] | None:
     return part, inner, around
 
 
-def _probe(share: float, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> Canvas:
-    """Return a square, with its margin, around the middle of the frame at a share of the span.
-
-    It lies on the pixels of the canvas, wherever the canvas begins, so that all tiles find the same.
-    """
-    instant = span.start + share * (len(span) - 1)
-    shape = source.info.frame_shape
-    to_canvas = canvas.transform @ trajectory.at([instant])[0]
-    outline = transform_points(to_canvas, corners(shape))
+def _probe(share: float, scan: _Scan, canvas: Canvas) -> Canvas:
+    """Return a square, with its margin, around the middle of the frame at a share of the span, on pixels of the canvas."""
+    instant = scan.span.start + share * (len(scan.span) - 1)
+    to_canvas = canvas.transform @ scan.trajectory.at([instant])[0]
+    outline = transform_points(to_canvas, corners(scan.source.info.frame_shape))
     # Even sides, so that the detail of a grid half as fine is easily found.
     width, height = (2 * int(min(_PROBE_PX, side) // 2 + _HALO_PX) for side in np.ceil(np.ptp(outline, axis=0)) + 1)
     left, top = np.rint(outline.mean(axis=0) - [width / 2, height / 2])

@@ -1,4 +1,8 @@
-"""Sort the photons of a capture into the cells of a canvas: those that an estimate is made from, and those held out."""
+"""Sort the photons of frames into the cells of a canvas: those that an estimate is made from, and those held out.
+
+Pixels whose centres fall into one cell of the grid see nearly the same light, whatever their frame: their counts are summed,
+and so are their frames. A capture becomes two images, on which each round of an estimate works, not on the frames.
+"""
 
 from __future__ import annotations
 
@@ -9,32 +13,26 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonpano import BoolArray, Capture, FluxImage, FrameSpan, Homography, Source, Trajectory, capture_of
+from photonpano import BoolArray, Capture, FloatArray, FluxImage, FrameSpan, Homography, Source, Trajectory, capture_of
+from photonpano.compiling import compiled
 from photonpano.geometry import Canvas, corners, transform_points
 from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
 from photonpano.photometry import BinaryResponse, BinarySumResponse
-from photonpano_core.super_resolution.observing import add_observations
 
 _BATCH = 16  # chunks that are summed before they are added to the grid
-_PART_ROWS = 64  # rows of the grid, about, that a thread adds to at a time
+_PART_ROWS = 64  # approximate number of rows of the grid that a thread adds to at a time
 _MANY_PIECES = 64  # a span is divided into at least this many chunks, if it has the frames: some of them are held out
+_UP = 0.5 + 1e-6  # a centre on the border of two cells belongs to the second one, whatever the rounding of its coordinates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotonSums:
-    """Sums over the frames whose pixels fall into each cell of a grid.
+    """Sums over the frames whose pixels fall into each cell of a grid."""
 
-    Attributes:
-        lit: (H, W) float32, counts. For a camera that does not count single photons, they are photons.
-        seen: (H, W) float32, frames, or binary frames where a frame is a sum of these; in changing light, their gains.
-        light: frames and gains by the class of their light; None in steady light.
-    """
-
-    lit: FluxImage
-    seen: FluxImage
-    light: LitFrames | None
+    lit: FluxImage  # (H, W), counts. For a camera that does not count single photons, they are photons
+    seen: FluxImage  # (H, W), frames, or binary frames where a frame is a sum of these; in changing light, their gains
+    light: LitFrames | None  # frames and gains by the class of their light; None in steady light
 
     def part(self, box: tuple[slice, slice]) -> PhotonSums:
         """Return some rows and columns."""
@@ -89,14 +87,14 @@ def sums_on(
     return _photons(source, lit, seen[0], lit_frames)
 
 
-def _summed(capture: Capture, terms: LightTerms | None, chunk: Chunk) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _summed(capture: Capture, terms: LightTerms | None, chunk: Chunk) -> tuple[FluxImage, FluxImage]:
     """Return the counts of a chunk, (h, w), and what a pixel adds to each image of frames and gains, (P,)."""
     amounts = np.array([len(chunk.span)], np.float32) if terms is None else terms.amounts(chunk.span).astype(np.float32)
     return np.ascontiguousarray(capture.corrected_counts(chunk.span), np.float32), amounts
 
 
 def _add(
-    summed: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    summed: Sequence[tuple[FluxImage, FluxImage]],
     to_grid: Sequence[Homography],
     usable: BoolArray,
     lit: FluxImage,
@@ -123,3 +121,35 @@ def _photons(source: Source, lit: FluxImage, seen: FluxImage, light: LitFrames |
     some = np.maximum(frames, 1)
     photons = source.response.flux(np.asarray(lit / some, np.float32), some) * frames
     return PhotonSums(np.asarray(np.where(frames > 0, np.maximum(photons, 0), 0), np.float32), seen, light)
+
+
+@compiled
+def add_observations(
+    counts: FluxImage, usable: BoolArray, amounts: FluxImage, to_grid: FloatArray, first: int, lit: FluxImage, seen: FluxImage
+) -> None:
+    """Add the pixels of a sum of frames, (h, w), to the cells that their centres fall into.
+
+    `to_grid` (3, 3) maps pixels of the frame to cells of the whole grid, of which `lit` (H, W) and `seen` (P, H, W) are the
+    rows from `first` on. Each usable pixel adds its count to `lit`, and `amounts` (P,), such as the frames in the sum, to
+    `seen`.
+    """
+    height, width = counts.shape
+    rows, columns = lit.shape
+    present = np.flatnonzero(amounts)
+    for y in range(height):
+        # Along a row of the frame, the grid's coordinates are quotients of linear functions.
+        u0, du = to_grid[0, 1] * y + to_grid[0, 2], to_grid[0, 0]
+        v0, dv = to_grid[1, 1] * y + to_grid[1, 2], to_grid[1, 0]
+        d0, dd = to_grid[2, 1] * y + to_grid[2, 2], to_grid[2, 0]
+        last = width - 1
+        ends = v0 / d0 - first, (v0 + dv * last) / (d0 + dd * last) - first
+        if max(ends[0], ends[1]) < -0.5 or min(ends[0], ends[1]) > rows - 0.5:
+            continue
+        for x in range(width):
+            per_depth = 1 / (d0 + dd * x)
+            column = int(np.floor((u0 + du * x) * per_depth + _UP))
+            row = int(np.floor((v0 + dv * x) * per_depth + _UP)) - first
+            if 0 <= row < rows and 0 <= column < columns and usable[y, x]:
+                lit[row, column] += counts[y, x]
+                for p in present:
+                    seen[p, row, column] += amounts[p]

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Iterable
 from pathlib import Path
 from threading import Lock
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError
 from photonpano.reading import look_first, read_picture, reading, require_readable
-from photonpano_sensors.intensity.configs import ImageFolderConfig
-from photonpano_sensors.intensity.levels import Encoding
-from photonpano_sensors.intensity.recognition import pictures_in
-from photonpano_sensors.intensity.source import IntensitySource, Levels
+from photonpano_sensors.intensity.contributions import ImageFolderConfig, pictures_in
+from photonpano_sensors.intensity.source import Encoding, IntensitySource, Levels
 from photonpano_sensors.looks import spread
 
 Image = NDArray[np.generic]
@@ -41,35 +39,11 @@ class _Form(NamedTuple):
         return f"{self.height}x{self.width} pixels of {self.bits} bits"
 
 
-class _Pictures(Protocol):
-    """Frames that are pictures.
-
-    Attributes:
-        n_frames: number of frames.
-        form: size and bits of each.
-    """
-
-    n_frames: int
-    form: _Form
-
-    def read(self, index: int) -> Image:
-        """Return a frame: (H, W)."""
-        ...
-
-    def close(self) -> None:
-        """Close files."""
-        ...
-
-
 class ImageFolderSource(IntensitySource):
-    """Pictures of grey levels of 8 or 16 bits.
-
-    Raises:
-        InputError: there is no picture, one cannot be read or is not grey, or pictures differ in size or bits.
-    """
+    """Pictures of grey levels of 8 or 16 bits, all of one size; anything else raises an `InputError`."""
 
     def __init__(self, config: ImageFolderConfig) -> None:
-        self._pictures: _Pictures = _Folder(config.path) if config.path.is_dir() else _Pages(config.path)
+        self._pictures: _Folder | _Pages = _Folder(config.path) if config.path.is_dir() else _Pages(config.path)
         form = self._pictures.form
         shape = self._pictures.n_frames, form.height, form.width
         super().__init__(config, shape, None, Encoding.full(form.bits))

@@ -1,8 +1,10 @@
-"""Base class of sources of grey levels: linear levels, and sums that are read in parts."""
+"""Base class of sources of grey levels, which are made linear in flux, so that frames can be summed."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -10,38 +12,28 @@ from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError, StreamInfo
 from photonpano.compiling import compiled
-from photonpano.reading import Closing
-from photonpano_sensors.intensity.configs import IntensityConfig
-from photonpano_sensors.intensity.levels import Encoding, linear_levels
+from photonpano.photometry import IntensityResponse, srgb_to_linear
+from photonpano.reading import Closing, reading
+from photonpano_sensors.intensity.contributions import IntensityConfig, ResponseConfig
 
 Levels: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 _PART_BYTES = 4 * 1024**2  # bytes of the frames that are read at once for a sum
 _MOST_COUNT = 2**32 - 1
 _BLOCK_PIXELS = 4096  # pixels summed at once: their sums stay in the L1 cache
+_HIGHEST = 2**16 - 1  # the highest linear level
 
 
 class IntensitySource(Closing, ABC):
     """Grey levels that are linear in flux: a `photonpano.Source`.
 
-    A saturated pixel counts with the saturation level, so its flux is a lower bound: in a sum, saturated frames cannot be
-    separated from others.
+    A saturated pixel counts with the saturation level, so its flux is a lower bound.
     """
 
     def __init__(
         self, config: IntensityConfig, shape: tuple[int, int, int], frame_rate_hz: float | None, encoding: Encoding
     ) -> None:
-        """Prepare to read.
-
-        Args:
-            config: the keys of the spec.
-            shape: frames, height and width of the capture.
-            frame_rate_hz: frame rate of the file, used unless the spec has one.
-            encoding: encoding of the levels of the file.
-
-        Raises:
-            InputError: the response of the spec does not suit the levels.
-        """
+        """Take (frames, height, width), the frame rate unless the spec has one, and the encoding of the levels of the file."""
         linear = linear_levels(config.response, encoding)
         self.info = StreamInfo(*shape, config.frame_rate_hz or frame_rate_hz, "intensity", linear.bits)
         self.response = linear.response
@@ -52,11 +44,7 @@ class IntensitySource(Closing, ABC):
 
     @abstractmethod
     def _read(self, span: FrameSpan, levels: Levels) -> None:
-        """Fill an array (n, H, W) with the levels of a span as they are in the file; the span is within the capture.
-
-        Raises:
-            InputError: the levels cannot be read.
-        """
+        """Fill (n, H, W) with the levels of a span as they are in the file; raises an `InputError` if they cannot be read."""
 
     def frames(self, span: FrameSpan) -> Levels:
         """Return the frames of a span, in linear levels: (n, H, W)."""
@@ -65,11 +53,7 @@ class IntensitySource(Closing, ABC):
         return levels if self._table is None else self._table[levels]
 
     def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
-        """Sum the frames of a span: (H, W) uint32.
-
-        Raises:
-            InputError: the sum might not fit into uint32.
-        """
+        """Sum the frames of a span: (H, W) uint32; raises an `InputError` if the sum might not fit."""
         self.info.require(span)
         most = _MOST_COUNT // (2**self.info.bit_depth - 1)
         if len(span) > most:
@@ -112,3 +96,80 @@ def _add_linear(frames: Levels, table: NDArray[np.uint16], total: NDArray[np.uin
             levels = frames[index, start : start + _BLOCK_PIXELS]
             for pixel in range(len(block)):
                 block[pixel] += np.uint32(table[levels[pixel]])
+
+
+@dataclass(frozen=True, slots=True)
+class Encoding:
+    """The encoding of the levels of a file."""
+
+    bits: int  # bits of a level
+    black: float  # the level without light
+    white: float  # the level at which a pixel saturates
+
+    @classmethod
+    def full(cls, bits: int) -> Encoding:
+        """Return the encoding that uses all levels."""
+        return cls(bits, 0.0, 2.0**bits - 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearLevels:
+    """The conversion of levels of a file to linear levels, and their response."""
+
+    bits: int  # bits of a linear level
+    # (2^b,), the linear level of each level of a file of b bits; None if these are linear already
+    table: NDArray[np.uint16] | None
+    response: IntensityResponse  # how flux becomes linear levels
+
+
+def linear_levels(config: ResponseConfig, encoding: Encoding) -> LinearLevels:
+    """Return the conversion of the levels of a file to linear levels.
+
+    The curve is continued below black, point-symmetrically, so that noise in the dark is not clipped. Quantisation noise, that
+    of the levels in the middle of the range, is added to the read noise. Raises an `InputError` if the levels, or a file, do
+    not suit.
+    """
+    black = encoding.black if config.black_level is None else config.black_level
+    white = encoding.white if config.white_level is None else config.white_level
+    top = 2**encoding.bits - 1
+    if not black < white <= top:
+        raise InputError(
+            f"black_level {black:g} and white_level {white:g} do not suit levels of {encoding.bits} bits: "
+            f"black must be below white, and white at most {top}"
+        )
+    photons_per_level = config.saturation_photons / (white - black)
+    read_noise = float(np.hypot(config.read_noise, photons_per_level / np.sqrt(12)))
+    if config.curve == "linear" and config.curve_file is None:
+        return LinearLevels(encoding.bits, None, IntensityResponse(photons_per_level, black, white, read_noise))
+    light = _light(config, (np.arange(top + 1) - black) / (white - black))
+    if config.curve_file is not None:
+        at_black, at_white = np.interp([black, white], np.arange(top + 1), light)
+        if not at_black < at_white:
+            raise InputError(f"{config.curve_file}: the curve does not rise from the black level to the white level")
+        light = (light - at_black) / (at_white - at_black)
+    lowest = min(float(light[0]), 0.0)
+    scale = _HIGHEST / (max(float(light[-1]), 1.0) - lowest)
+    table = np.rint((light - lowest) * scale).astype(np.uint16)
+    # Integers, so that the flux of a black frame is exactly 0.
+    zero, one = round(-lowest * scale), round((1 - lowest) * scale)
+    return LinearLevels(16, table, IntensityResponse(config.saturation_photons / (one - zero), zero, one, read_noise))
+
+
+def _light(config: ResponseConfig, encoded: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the light of encoded levels that are 0 at black and 1 at white; in arbitrary units if it comes from a file."""
+    if config.curve_file is not None:
+        return _measured(config.curve_file, len(encoded))
+    size = np.abs(encoded)
+    if isinstance(config.curve, str):
+        return np.sign(encoded) * srgb_to_linear(size)
+    return np.asarray(np.sign(encoded) * size**config.curve)
+
+
+def _measured(path: Path, n_levels: int) -> NDArray[np.float64]:
+    with reading(path, "is not a text file of numbers, one for each level"):
+        light = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
+    if len(light) != n_levels:
+        raise InputError(f"{path} holds {len(light)} numbers; the levels of the capture are {n_levels}")
+    if not (np.all(np.isfinite(light)) and np.all(np.diff(light) >= 0)):
+        raise InputError(f"{path}: the numbers must be finite, and none smaller than the one before")
+    return light

@@ -12,7 +12,7 @@ import numpy as np
 from av import VideoFrame
 
 from photonpano import FrameSpan, InputError, SourceContext
-from photonpano_sensors.intensity.configs import VideoConfig
+from photonpano_sensors.intensity.contributions import VideoConfig
 from photonpano_sensors.intensity.source import IntensitySource, Levels
 from photonpano_sensors.intensity.video_index import VideoIndex, index_of, open_video
 
@@ -20,11 +20,7 @@ _KEPT_BYTES = 256 * 1024**2  # size of the cache of decoded frames
 
 
 class VideoSource(IntensitySource):
-    """Frames of a video in the order in which they are shown; of colours, the luma.
-
-    Raises:
-        InputError: the file is missing, is not a video, or ends early.
-    """
+    """Frames of a video in the order in which they are shown; of colours, the luma."""
 
     def __init__(self, config: VideoConfig, context: SourceContext) -> None:
         index = index_of(config.path)
@@ -41,20 +37,10 @@ class VideoSource(IntensitySource):
 
 
 class _Decoder:
-    """Decodes a video from a key frame on.
-
-    Attributes:
-        next: the frame that is decoded next.
-        turn: lock of the thread that decodes.
-        users: number of threads that decode, or wait for the lock.
-    """
+    """Decodes a video from a key frame on: the frame `next`, in the thread that has the lock `turn`; `users` want it."""
 
     def __init__(self, index: VideoIndex, threads: int) -> None:
-        """Open the video once more.
-
-        Raises:
-            InputError: the file is missing.
-        """
+        """Open the video once more."""
         self._index = index
         self._container = open_video(index.path)
         self._stream = self._container.streams.video[0]
@@ -117,19 +103,10 @@ class DecodedFrames:
     Groups overlap, and the threads that merge them move along the video together, so they share a cache. A thread that needs a
     further frame takes the decoder that reaches it next, and waits if another thread uses it. If no decoder reaches the frame,
     an idle one seeks to a key frame.
-
-    Attributes:
-        n_decoded: number of frames decoded so far.
     """
 
     def __init__(self, index: VideoIndex, threads: int, capacity_bytes: int) -> None:
-        """Prepare to decode.
-
-        Args:
-            index: the index of the video.
-            threads: number of threads that read frames at once.
-            capacity_bytes: size of the cache.
-        """
+        """Take the number of threads that read frames at once, and the size of the cache."""
         self._index = index
         self._threads = threads
         self._kept = max(1, capacity_bytes // (index.height * index.width * (1 if index.encoding.bits <= 8 else 2)))
@@ -139,11 +116,7 @@ class DecodedFrames:
         self.n_decoded = 0
 
     def __getitem__(self, frame: int) -> Levels:
-        """Return a frame, (H, W), read-only.
-
-        Raises:
-            InputError: the frame is damaged or missing.
-        """
+        """Return a frame, (H, W), read-only; raises an `InputError` if it is damaged or missing."""
         while True:
             with self._lock:
                 if (known := self._known(frame)) is not None:

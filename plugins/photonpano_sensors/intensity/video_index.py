@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.reading import look_first, missing_file, reading
-from photonpano_sensors.intensity.levels import Encoding
-from photonpano_sensors.intensity.recognition import refuse_mdat
+from photonpano_sensors.intensity.contributions import refuse_mdat
+from photonpano_sensors.intensity.source import Encoding
 
 _LUMA_FIRST = re.compile(r"(gray|yuvj?a?4\d\dp|nv\d\d)(\d+le)?")  # pixel formats whose first plane is the luma
 _FULL_RANGE = re.compile(r"yuvj|gray")
@@ -28,27 +28,16 @@ _JPEG_RANGE = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VideoIndex:
-    """The frames of a video, from its packets.
-
-    Attributes:
-        path: the file.
-        times: (n,) time of each frame, in units of the stream, increasing.
-        keys: (k,) frames at which decoding can start; the first is 0.
-        height: rows of a frame.
-        width: columns of a frame.
-        pixel_format: format that frames are converted to; its first plane is the luma.
-        encoding: encoding of the luma.
-        frame_rate_hz: frame rate at which the video is played.
-    """
+    """The frames of a video, from its packets."""
 
     path: Path
-    times: NDArray[np.int64]
-    keys: NDArray[np.int64]
+    times: NDArray[np.int64]  # (n,) time of each frame, in units of the stream, increasing
+    keys: NDArray[np.int64]  # (k,) frames at which decoding can start; the first is 0
     height: int
     width: int
-    pixel_format: str
-    encoding: Encoding
-    frame_rate_hz: float | None
+    pixel_format: str  # format that frames are converted to; its first plane is the luma
+    encoding: Encoding  # encoding of the luma
+    frame_rate_hz: float | None  # frame rate at which the video is played
 
     def key_before(self, frame: int) -> int:
         """Return the key frame at which decoding has to start for a frame."""
@@ -56,11 +45,7 @@ class VideoIndex:
 
 
 def index_of(path: Path) -> VideoIndex:
-    """Read the packets of the first video stream of a file.
-
-    Raises:
-        InputError: the file is missing, is not a video, or ends early.
-    """
+    """Read the packets of the first video stream of a file; raises an `InputError` if it is no video, or ends early."""
     refuse_mdat(path)
     look_first(path, "photonpano_sensors.looks:video")
     with reading(path, _DAMAGED), opened(path) as container:
@@ -106,11 +91,7 @@ def index_of(path: Path) -> VideoIndex:
 
 @contextmanager
 def opened(path: Path) -> Iterator[InputContainer]:
-    """Open a video within a block.
-
-    Raises:
-        InputError: see `open_video`.
-    """
+    """Open a video within a block: see `open_video`."""
     container = open_video(path)
     try:
         yield container
@@ -119,11 +100,7 @@ def opened(path: Path) -> Iterator[InputContainer]:
 
 
 def open_video(path: Path) -> InputContainer:
-    """Open a file with a video stream.
-
-    Raises:
-        InputError: the file is missing, or has no video stream.
-    """
+    """Open a file; raises an `InputError` if it is missing, or has no video stream."""
     try:
         container = av.open(str(path), metadata_errors="replace")
     except FileNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Light on a scene: lamps with soft shadows, and light from everywhere that corners get less of."""
+"""Light on a scene: lamps with soft shadows, and ambient light with occlusion."""
 
 from __future__ import annotations
 
@@ -13,25 +13,19 @@ from photonpano_simulator.travel.planes import Planes
 
 _SPACING_M = 0.1  # distance between the places of a plane at which light is computed
 _MOST_PLACES = 90  # places along a side, at most
-_DIRECTIONS, _POINTS = 48, 16  # directions of the light from everywhere, and points of each lamp
+_DIRECTIONS, _POINTS = 48, 16  # directions of ambient light, and points of each lamp
 _GAP_M = 1e-3  # rays begin this far above their plane
 
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """The light of a scene.
+    """The light of a scene."""
 
-    Attributes:
-        lamps: (x, y, z) in m, radius in m, and light: at `reach_m` ahead of the lamp it is this, relative to the ambient light.
-        ambient: light from everywhere.
-        shadow_m: how far away a thing still takes ambient light.
-        reach_m: distance at which the light of the lamps is given.
-    """
-
+    # (x, y, z) in m, radius in m, and light: at `reach_m` ahead of the lamp it is this, relative to the ambient light
     lamps: tuple[tuple[float, float, float, float, float], ...]
-    ambient: float
-    shadow_m: float
-    reach_m: float = 1.0
+    ambient: float  # ambient light without occlusion
+    shadow_m: float  # largest distance of ambient occlusion
+    reach_m: float = 1.0  # distance at which the light of the lamps is given
 
 
 def light_on(planes: Planes, index: int, lighting: Lighting) -> NDArray[np.float32]:
@@ -46,12 +40,12 @@ def light_on(planes: Planes, index: int, lighting: Lighting) -> NDArray[np.float
     inverses = np.linalg.inv(np.stack([planes.along, planes.down, np.cross(planes.along, planes.down)], axis=-1))
     open_share = np.zeros(len(points))
     # Points of a sphere that touches the plane lie in directions that are denser where the light counts more: by the cosine.
-    for direction in _ball(_DIRECTIONS) + towards:
+    for direction in _sphere(_DIRECTIONS) + towards:
         way = direction * (lighting.shadow_m / np.linalg.norm(direction))
         _unblocked(points, np.broadcast_to(way, points.shape), planes.corner, inverses, open_share)
     light = lighting.ambient * open_share / _DIRECTIONS
     for x, y, z, radius, power in lighting.lamps:
-        for offset in _ball(_POINTS):
+        for offset in _sphere(_POINTS):
             ways = np.array([x, y, z]) + radius * offset - points
             squared = (ways**2).sum(axis=1)
             cosine = np.maximum(ways @ towards, 0) / np.sqrt(squared)
@@ -63,7 +57,7 @@ def light_on(planes: Planes, index: int, lighting: Lighting) -> NDArray[np.float
 
 @compiled
 def _unblocked(points: FloatArray, ways: FloatArray, corners: FloatArray, inverses: FloatArray, total: FloatArray) -> None:
-    """Add 1 for each point (N, 3) whose way (N, 3) meets no plane."""
+    """Add 1 for each point (N, 3) from which a segment (N, 3) meets no plane."""
     for n in range(len(points)):
         is_free = True
         for p in range(len(corners)):
@@ -83,7 +77,7 @@ def _unblocked(points: FloatArray, ways: FloatArray, corners: FloatArray, invers
             total[n] += 1.0
 
 
-def _ball(count: int) -> FloatArray:
+def _sphere(count: int) -> FloatArray:
     """Return points on a unit sphere, evenly: (N, 3)."""
     steps = np.arange(count) + 0.5
     y, turn = 1 - 2 * steps / count, np.pi * (3 - 5**0.5) * steps

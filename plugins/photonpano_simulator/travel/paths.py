@@ -17,7 +17,7 @@ from photonpano_simulator.travel.planes import Planes, trace
 from photonpano_simulator.travel_config import TravelConfig, TravelPath
 
 _CHECKED = 2000  # frames at which a path is checked, at most
-_LOOKED = 60  # frames of which it is checked that they see the scene everywhere, at most
+_LOOKED = 60  # largest number of frames that are checked for rays that miss the scene
 _GRID = 9  # points along each side of such a frame
 _REACH = (1.0, 0.45, 0.6)  # how far a random path reaches along x, y and z, relative to each other
 
@@ -30,15 +30,9 @@ def matrix_of(config: TravelConfig) -> FloatArray:
 
 
 def poses_of(config: TravelConfig, middle: FloatArray, seed: int) -> FloatArray:
-    """Return the poses of all frames: (T, 3, 4).
+    """Return the poses of all frames, (T, 3, 4); the camera looks at the `middle`, (3,) in m, by default.
 
-    Args:
-        config: of the simulation.
-        middle: (3,), where the camera looks by default, in m.
-        seed: of the tremor.
-
-    Raises:
-        InputError: the camera is to look at the point where it is, or straight up or down.
+    Raises an `InputError` if it is to look at the point where it is, or straight up or down.
     """
     path, n_frames = config.path, config.n_frames
     target = middle if path.look_at is None else np.array(path.look_at)
@@ -65,17 +59,9 @@ def centres(poses: FloatArray) -> FloatArray:
 
 
 def require_free(poses: FloatArray, matrix: FloatArray, frame_shape: tuple[int, int], planes: Planes, room: FloatArray) -> None:
-    """Require that the camera stays in the scene, passes through no surface, and sees nothing but the scene.
+    """Require that the camera stays in the scene, passes through no surface that rests, and sees nothing but the scene.
 
-    Args:
-        poses: (T, 3, 4).
-        matrix: (3, 3), K.
-        frame_shape: (height, width).
-        planes: of the scene, without those that move.
-        room: (2, 3), the smallest and the largest coordinates that the camera may have, in m.
-
-    Raises:
-        InputError: it does not.
+    `room` (2, 3) are the smallest and the largest coordinates that the camera may have, in m.
     """
     last = len(poses) - 1
     frames = np.unique(np.linspace(0, last, min(len(poses), _CHECKED)).astype(int))

@@ -1,4 +1,4 @@
-"""Rectangles in space, and what lies on the ray of a pixel.
+"""Rectangles in space, and casting of rays on them.
 
 Convention:
     Points of the world are (x, y, z) in m: x right, y down, z ahead. A pose (3, 4) maps them to points of the camera,
@@ -22,21 +22,13 @@ _EDGE_ON = 1e-9  # a rectangle is not seen from its plane: the volume that it sp
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planes:
-    """Rectangles, or the largest discs in them; they may move.
+    """Rectangles, or the largest discs in them; they may move."""
 
-    Attributes:
-        corner: (P, 3), the top left corner in frame 0, in m.
-        along: (P, 3), from there to the top right corner.
-        down: (P, 3), from there to the bottom left corner.
-        velocity: (P, 3), in m per frame.
-        is_disc: (P,) bool.
-    """
-
-    corner: FloatArray
-    along: FloatArray
-    down: FloatArray
-    velocity: FloatArray
-    is_disc: NDArray[np.bool_]
+    corner: FloatArray  # (P, 3), the top left corner in frame 0, in m
+    along: FloatArray  # (P, 3), from there to the top right corner
+    down: FloatArray  # (P, 3), from there to the bottom left corner
+    velocity: FloatArray  # (P, 3), in m per frame
+    is_disc: NDArray[np.bool_]  # (P,)
 
     def __len__(self) -> int:
         return len(self.corner)
@@ -48,15 +40,9 @@ class Planes:
         return np.asarray(np.where(self.is_disc[:, None], sides.min(axis=1, keepdims=True) / sides / 2, 2.0))
 
     def maps(self, pose: FloatArray, matrix: FloatArray, frame: float) -> FloatArray:
-        """Return what maps pixels to places on each plane: (P, 3, 3), from (x, y, 1) to (a, b, 1) / depth.
+        """Return maps of pixels to places on each plane at an instant: (P, 3, 3), from (x, y, 1) to (a, b, 1) / depth.
 
-        Args:
-            pose: (3, 4).
-            matrix: (3, 3), K.
-            frame: the instant, for planes that move.
-
-        Returns:
-            Maps whose third row is the inverse depth along the optical axis: at most 0 for a plane that is not seen.
+        The third row is the inverse depth along the optical axis: at most 0 for a plane that is not seen.
         """
         corner = self.corner + frame * self.velocity
         edges = np.stack([self.along, self.down, corner], axis=-1)
@@ -85,27 +71,17 @@ class Planes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Planes with their textures.
-
-    Attributes:
-        planes: the rectangles.
-        textures: the light that each sends to the camera, up to a factor: (height, width) float16 each.
-    """
+    """Planes with their textures."""
 
     planes: Planes
-    textures: tuple[NDArray[np.float16], ...]
+    textures: tuple[NDArray[np.float16], ...]  # the light that each sends to the camera, up to a factor: (height, width) each
 
 
 @compiled
 def trace(points: FloatArray, maps: FloatArray, radii: FloatArray, owner: NDArray[np.int32], inverse_depth: FloatArray) -> None:
-    """Find the nearest plane on the rays of some points of a frame.
+    """Find the nearest plane on the rays of points of a frame, (N, 2) in px.
 
-    Args:
-        points: (N, 2), x and y in px.
-        maps: (P, 3, 3), from `Planes.maps`.
-        radii: (P, 2), from `Planes.radii`.
-        owner: (N,) output, the index of the plane; -1 for none.
-        inverse_depth: (N,) output, in 1 / m; 0 for none.
+    Writes the index of the plane into `owner` (N,), -1 for none, and its inverse depth, in 1 / m, 0 for none.
     """
     for n in range(len(points)):
         x, y = points[n, 0], points[n, 1]

@@ -22,27 +22,19 @@ from photonpano_simulator.travel.planes import Planes
 _PARTS = 4  # parts of a pixel along each axis, for the edges of planes
 _SAMPLES = 16  # samples of a texture along the longer axis of the area of a pixel, at most
 _LEVELS = 16  # levels of a texture, at most: each has half the size of the one before
-_STRETCH = 0.3  # by how much the area of a sample may be longer than wide
-_BLOCK = 16  # pixels of a row that are averaged in the same way
+_STRETCH = 0.3  # largest aspect ratio of the area of a sample, less 1
+_BLOCK = 16  # pixels of a row that share the level and the steps of their samples
 _SMALLEST = 1e-9  # inverse depth of the furthest point that is seen, in 1 / m
 
 
 class Atlas(NamedTuple):
-    """The levels of all textures in one array.
+    """The levels of all textures in one array."""
 
-    Attributes:
-        texels: float32, all levels of all textures, row by row.
-        starts: (P, L), where a level begins.
-        heights: (P, L), its rows; 0 for none.
-        widths: (P, L), its columns.
-        counts: (P,), how many levels a texture has.
-    """
-
-    texels: NDArray[np.float32]
-    starts: NDArray[np.int64]
-    heights: NDArray[np.int64]
-    widths: NDArray[np.int64]
-    counts: NDArray[np.int64]
+    texels: NDArray[np.float32]  # all levels of all textures, row by row
+    starts: NDArray[np.int64]  # (P, L), where a level begins
+    heights: NDArray[np.int64]  # (P, L), its rows; 0 for none
+    widths: NDArray[np.int64]  # (P, L), its columns
+    counts: NDArray[np.int64]  # (P,), how many levels a texture has
 
 
 def atlas_of(textures: tuple[NDArray[np.float16], ...], gain: float = 1.0) -> Atlas:
@@ -67,27 +59,15 @@ def atlas_of(textures: tuple[NDArray[np.float16], ...], gain: float = 1.0) -> At
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What renders the frames of one camera.
-
-    Attributes:
-        planes: of the scene.
-        atlas: their flux.
-        matrix: (3, 3), K.
-        frame_shape: (height, width).
-    """
+    """Renders the frames of one camera."""
 
     planes: Planes
-    atlas: Atlas
+    atlas: Atlas  # their flux
     matrix: FloatArray
     frame_shape: tuple[int, int]
 
     def flux(self, pose: FloatArray, frame: float) -> NDArray[np.float32]:
-        """Return the flux in a frame: (H, W); 0 where no plane is seen.
-
-        Args:
-            pose: (3, 4).
-            frame: the instant, for planes that move.
-        """
+        """Return the flux in a frame, (H, W), from a (3, 4) pose at an instant; 0 where no plane is seen."""
         image = np.empty(self.frame_shape, np.float32)
         maps = self.planes.maps(pose, self.matrix, frame)
         rows = self.planes.rows(pose, self.matrix, frame, self.frame_shape[0])
@@ -242,9 +222,7 @@ def _add(m: FloatArray, p: int, x: float, y: float, weight: float, atlas: Atlas,
     share = np.float32(exact - level if level < atlas.counts[p] - 1 else 0.0)
     scale = np.float32(weight / n)
     for each in range(2 if share > 0 else 1):
-        start, height, width = atlas.starts[p, level + each], atlas.heights[p, level + each], atlas.widths[p, level + each]
-        part = scale * (share if each else 1 - share)
-        _sample(m, x, y, n, step_a, step_b, part, atlas.texels, start, height, width, pixels)
+        _sample(m, x, y, n, step_a, step_b, scale * (share if each else 1 - share), atlas, p, level + each, pixels)
 
 
 @compiled
@@ -256,13 +234,13 @@ def _sample(
     step_a: float,
     step_b: float,
     scale: np.float32,
-    texels: NDArray[np.float32],
-    start: int,
-    height: int,
-    width: int,
+    atlas: Atlas,
+    p: int,
+    level: int,
     pixels: NDArray[np.float32],
 ) -> None:
     """Add `scale` times `n` samples of a level of a texture, interpolated linearly, for each of successive pixels."""
+    texels, start, height, width = atlas.texels, atlas.starts[p, level], atlas.heights[p, level], atlas.widths[p, level]
     for k in range(len(pixels)):
         depth = 1 / (m[2, 0] * (x + k) + m[2, 1] * y + m[2, 2])
         a, b = m[0, 0] * (x + k) + m[0, 1] * y + m[0, 2], m[1, 0] * (x + k) + m[1, 1] * y + m[1, 2]

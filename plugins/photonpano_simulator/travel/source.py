@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import InputError, SourceContext
-from photonpano_simulator.recording import delivered
+from photonpano import FloatArray, SourceContext
 from photonpano_simulator.source import SimulatedSource
 from photonpano_simulator.travel.paths import matrix_of, poses_of, require_free
 from photonpano_simulator.travel.rendering import View, atlas_of
@@ -18,18 +17,11 @@ _METERED = 9  # frames along the path over which the mean flux is taken
 
 
 class TravelSource(SimulatedSource):
-    """A single-photon camera that travels through a scene with depth.
-
-    Raises:
-        InputError: a file cannot be used, the camera leaves the scene or passes through something, or frames are dropped that
-            do not exist.
-    """
+    """A single-photon camera that travels through a scene with depth."""
 
     def __init__(self, config: TravelConfig, context: SourceContext) -> None:
         super().__init__(config, context)
-        stage, matrix = Stage(config), matrix_of(config)
-        poses = poses_of(config, stage.middle, self._seed)
-        require_free(poses, matrix, config.frame_shape, stage.planes, stage.free)
+        (stage, poses), matrix = placed(config, self._seed), matrix_of(config)
         scene = stage.drawn(context.threads)
         metered = View(scene.planes, atlas_of(scene.textures), matrix, config.frame_shape)
         frames = np.linspace(0, len(poses) - 1, _METERED).astype(int)
@@ -52,46 +44,23 @@ class TravelSource(SimulatedSource):
         return self._exposed(flux, int(self._taken[index]))
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
-        """Return the ground truth of the frames.
+        """Return the ground truth of the frames: `docs/how-to/simulate-depth.md` lists the arrays.
 
         Convention:
             Points of the world are (x, y, z) in m: x right, y down, z ahead. `camera_from_world` maps them to points of the
             camera, X_c = R X_w + t, with the same axes; pixels are K X_c, integers are pixel centres.
-
-        Returns:
-            `camera_from_world` (T, 3, 4), `camera_matrix` (3, 3), `frame_shape` (2,), `frame_rate_hz` (), `seed` (); `taken`
-            (T,), the index of each frame before drops and repeats; `light` (T,), relative to the first of these. The scene, as
-            P rectangles: `plane_corners`, `plane_along`, `plane_down` (P, 3), top left corner and edges in frame 0 in m;
-            `plane_velocities` (P, 3) in m per frame; `plane_is_disc` (P,); `textures` (N,) float16, one after the other, of
-            the shapes `texture_shapes` (P, 2), and the flux of a texel that is 1, `texture_flux` (), photons per pixel per
-            frame that are detected. `dark_rates` (H, W) float32 and `hot_pixels` (H, W) bool; of pixels that differ also
-            `gains` (H, W) float32.
         """
         gains = {"gains": self._sensor.gains} if (self._sensor.gains != 1).any() else {}
         return {**super().truth(), **self._truth.arrays(), **gains}
 
     def sharp_view(self, frame: int) -> NDArray[np.float32]:
-        """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W).
-
-        Raises:
-            InputError: there is no such frame.
-        """
+        """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W)."""
         return sharp_view(self._truth, frame)
 
 
-def problems_of(config: TravelConfig) -> list[str]:
-    """Return what is wrong with drops, repeats, or the path, without its tremor, which depends on the seed of the run."""
-    problems = []
-    try:
-        delivered(config.n_frames, config.drops, config.repeats)
-    except InputError as error:
-        problems.append(str(error))
-    still = config.model_copy(
-        update={"path": config.path.model_copy(update={"tremor": None}), "n_frames": min(config.n_frames, 5000)}
-    )
-    try:
-        stage = Stage(still)
-        require_free(poses_of(still, stage.middle, 0), matrix_of(still), still.frame_shape, stage.planes, stage.free)
-    except InputError as error:
-        problems.append(str(error))
-    return problems
+def placed(config: TravelConfig, seed: int) -> tuple[Stage, FloatArray]:
+    """Place the scene and the poses of all frames, (T, 3, 4); raises an `InputError` if they do not suit each other."""
+    stage = Stage(config)
+    poses = poses_of(config, stage.middle, seed)
+    require_free(poses, matrix_of(config), config.frame_shape, stage.planes, stage.free)
+    return stage, poses

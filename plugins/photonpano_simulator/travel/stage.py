@@ -34,12 +34,12 @@ from numpy.typing import NDArray
 from photonpano import FloatArray
 from photonpano.photometry import srgb_to_linear
 from photonpano_simulator.drawing import Chance, Drawing, Names, pictures_of, read_scene
-from photonpano_simulator.objects import texture_of
 from photonpano_simulator.scenes import photograph
 from photonpano_simulator.sensor import Draw, generator
 from photonpano_simulator.travel.lighting import Lighting, light_on
 from photonpano_simulator.travel.planes import Planes, Scene
 from photonpano_simulator.travel_config import TravelConfig, WorldObject
+from photonpano_simulator.views import texture_of
 
 _NEAREST_M = 0.6  # textures are as fine as pixels at the distance of their plane, but not finer than pixels at this distance
 _MOST_TEXELS = 24_000_000  # beyond, all textures are coarser; texels take 2 bytes each in the truth
@@ -76,16 +76,9 @@ class _Place:
 class Stage:
     """A scene that is placed, and not drawn yet.
 
-    Args:
-        config: of the simulation.
-
     Attributes:
-        planes: the rectangles.
         middle: (3,), where a camera looks by default, in m.
         free: (2, 3), the smallest and the largest coordinates that a camera may have.
-
-    Raises:
-        InputError: the photograph cannot be used.
     """
 
     def __init__(self, config: TravelConfig) -> None:
@@ -212,16 +205,7 @@ def with_objects(
     frame_shape: tuple[int, int],
     mean: float,
 ) -> Scene:
-    """Add what moves on its own.
-
-    Args:
-        scene: without it.
-        objects: what moves.
-        pose: (3, 4) of the first frame, which they face.
-        matrix: (3, 3), K.
-        frame_shape: (height, width).
-        mean: of the light that the scene sends to the camera.
-    """
+    """Add what moves on its own, and faces the first frame, of pose (3, 4); `mean` is that of the light of the scene."""
     if not objects:
         return scene
     height, width = frame_shape

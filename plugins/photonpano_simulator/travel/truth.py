@@ -22,34 +22,33 @@ from photonpano_simulator.lens import pixel_grid
 from photonpano_simulator.travel.planes import Planes, Scene, trace
 from photonpano_simulator.travel.rendering import View, atlas_of
 
-_SAME = 1e-6  # inverse depths that differ by less, relative to each other, are those of one point
+# Names of arrays in a truth file: the fields of `Planes`, and the others.
+_PLANES = {
+    "plane_corners": "corner",
+    "plane_along": "along",
+    "plane_down": "down",
+    "plane_velocities": "velocity",
+    "plane_is_disc": "is_disc",
+}
+_ARRAYS = ["camera_from_world", "camera_matrix", "frame_shape", "taken", "light", "textures", "texture_shapes", "texture_flux"]
+_SAME = 1e-6  # relative difference below which two inverse depths are of the same point
 
 
 @dataclass(frozen=True, eq=False)
 class TravelTruth:
-    """The truth of a capture of a scene with depth.
+    """The truth of a capture of a scene with depth."""
 
-    Attributes:
-        camera_from_world: (T, 3, 4), the pose of each frame of the capture.
-        camera_matrix: (3, 3), K.
-        frame_shape: (height, width).
-        taken: (T,), when each frame was taken: its index before any were dropped or repeated.
-        light: (T,), light of each frame, relative to the first that was taken.
-        scene: its planes and textures.
-        flux: photons per pixel per frame that are detected where a texture is 1.
-    """
-
-    camera_from_world: FloatArray
+    camera_from_world: FloatArray  # (T, 3, 4), the pose of each frame of the capture
     camera_matrix: FloatArray
     frame_shape: tuple[int, int]
-    taken: NDArray[np.int64]
-    light: FloatArray
+    taken: NDArray[np.int64]  # (T,), when each frame was taken: its index before any were dropped or repeated
+    light: FloatArray  # (T,), light of each frame, relative to the first that was taken
     scene: Scene
-    flux: float
+    flux: float  # photons per pixel per frame that are detected where a texture is 1
 
     @cached_property
     def view(self) -> View:
-        """What renders frames."""
+        """The renderer of frames."""
         return View(self.scene.planes, atlas_of(self.scene.textures, self.flux), self.camera_matrix, self.frame_shape)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
@@ -61,11 +60,7 @@ class TravelTruth:
             "frame_shape": np.array(self.frame_shape),
             "taken": self.taken,
             "light": self.light,
-            "plane_corners": planes.corner,
-            "plane_along": planes.along,
-            "plane_down": planes.down,
-            "plane_velocities": planes.velocity,
-            "plane_is_disc": planes.is_disc,
+            **{name: getattr(planes, field) for name, field in _PLANES.items()},
             "textures": np.concatenate([each.ravel() for each in textures]),
             "texture_shapes": np.array([each.shape for each in textures]),
             "texture_flux": np.array(self.flux),
@@ -74,46 +69,24 @@ class TravelTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flow:
-    """Where the pixels of a frame are in another frame.
+    """Where the pixels of a frame are in another frame."""
 
-    Attributes:
-        vectors: (H, W, 2), from the place of a pixel's point in the first frame to its place in the other, (x, y) in px; NaN
-            where the pixel shows nothing, or where its point lies behind the other camera.
-        visible: (H, W) bool, whether the other frame shows the point: within the frame, and not behind another plane.
-    """
-
+    # (H, W, 2), from the place of a pixel's point in the first frame to its place in the other, (x, y) in px; NaN where the
+    # pixel shows nothing, or where its point lies behind the other camera
     vectors: FloatArray
+    # (H, W), whether the other frame shows the point: within the frame, and not behind another plane
     visible: NDArray[np.bool_]
 
 
 def read_truth(path: Path | str) -> TravelTruth:
-    """Read the truth file of a capture of `travel-simulator`.
-
-    Raises:
-        InputError: the file is missing, or is something else.
-    """
+    """Read the truth file of a capture of `travel-simulator`; raises an `InputError` if it is missing, or something else."""
     path = Path(path)
     return truth_of(read_arrays(path, "a truth of travel-simulator"), str(path))
 
 
 def truth_of(arrays: Mapping[str, NDArray[Any]], name: str = "the truth") -> TravelTruth:
-    """Return the truth from its arrays.
-
-    Raises:
-        InputError: an array is missing.
-    """
-    wanted = (
-        "camera_from_world",
-        "camera_matrix",
-        "frame_shape",
-        "taken",
-        "light",
-        "textures",
-        "texture_shapes",
-        "texture_flux",
-    )
-    planes = ("plane_corners", "plane_along", "plane_down", "plane_velocities", "plane_is_disc")
-    missing = [each for each in (*wanted, *planes) if each not in arrays]
+    """Return the truth from its arrays; raises an `InputError` if one is missing."""
+    missing = [each for each in (*_ARRAYS, *_PLANES) if each not in arrays]
     if missing:
         why = "is the truth of a scene without depth" if "homographies" in arrays else "is no truth of travel-simulator"
         raise InputError(f"{name} {why}: it lacks {missing[0]}")
@@ -127,30 +100,22 @@ def truth_of(arrays: Mapping[str, NDArray[Any]], name: str = "the truth") -> Tra
         (height, width),
         arrays["taken"],
         arrays["light"],
-        Scene(Planes(*(arrays[each] for each in planes)), textures),
+        Scene(Planes(**{field: arrays[name] for name, field in _PLANES.items()}), textures),
         float(arrays["texture_flux"]),
     )
 
 
 def depth(truth: TravelTruth, frame: int) -> FloatArray:
-    """Return the depth of what a frame shows at its pixel centres: (H, W), along the optical axis in m; inf for nothing.
-
-    Raises:
-        InputError: the capture has no such frame.
-    """
-    _, inverse_depth = _traced(truth, _require(truth, frame), _pixels(truth))
+    """Return the depth of what a frame shows at its pixel centres: (H, W), along the optical axis in m; inf for nothing."""
+    _, inverse_depth = _traced(truth, _require(truth, frame), pixel_grid(truth.frame_shape).reshape(-1, 2))
     with np.errstate(divide="ignore"):
         return np.asarray((1 / inverse_depth).reshape(truth.frame_shape))
 
 
 def flow(truth: TravelTruth, from_frame: int, to_frame: int) -> Flow:
-    """Return where the points that a frame shows at its pixel centres are in another frame.
-
-    Raises:
-        InputError: the capture has no such frame.
-    """
+    """Return where the points that a frame shows at its pixel centres are in another frame."""
     start, end = _require(truth, from_frame), _require(truth, to_frame)
-    pixels = _pixels(truth)
+    pixels = pixel_grid(truth.frame_shape).reshape(-1, 2)
     owner, inverse_depth = _traced(truth, start, pixels)
     shown = owner >= 0
     matrix, planes = truth.camera_matrix, truth.scene.planes
@@ -172,11 +137,7 @@ def flow(truth: TravelTruth, from_frame: int, to_frame: int) -> Flow:
 
 
 def sharp_view(truth: TravelTruth, frame: int) -> NDArray[np.float32]:
-    """Return the flux of a frame without noise: (H, W), photons that are detected per pixel per frame, without dark counts.
-
-    Raises:
-        InputError: the capture has no such frame.
-    """
+    """Return the flux of a frame, (H, W), without noise and dark counts: photons that are detected per pixel per frame."""
     place = _require(truth, frame)
     return truth.view.flux(truth.camera_from_world[place], float(truth.taken[place])) * np.float32(truth.light[place])
 
@@ -186,10 +147,6 @@ def _require(truth: TravelTruth, frame: int) -> int:
     if not 0 <= frame <= last:
         raise InputError(f"there is no frame {frame}; the capture has the frames 0 to {last}")
     return frame
-
-
-def _pixels(truth: TravelTruth) -> FloatArray:
-    return pixel_grid(truth.frame_shape).reshape(-1, 2)
 
 
 def _traced(truth: TravelTruth, frame: int, points: FloatArray) -> tuple[NDArray[np.int32], FloatArray]:

@@ -19,9 +19,8 @@ pytest.importorskip("gtsam")
 
 from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.posing.adjustment import Observations, adjust
-from photonpano_colmap.posing.depth import inverse_depth_of
 from photonpano_colmap.posing.levels import Merged, Scene, interpolate, locate, merge, resample
-from photonpano_colmap.posing.merging import merge_through_depth
+from photonpano_colmap.posing.merging import inverse_depth_of, merge_through_depth
 from photonpano_colmap.posing.path import Path, PoseSpline, between, moves, posed, positions_of, projected
 from photonpano_colmap.posing.tremor import _beyond_noise, find_tremor
 from photonpano_colmap.stratified import StratifiedEstimator

@@ -12,9 +12,8 @@ from photonpano.lighting import in_light
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource
 from photonpano_core.configs import BurstConfig, PhotonMleConfig
-from photonpano_core.dense_motion.burst import BurstMerger, aligned, at_instant, wiener_mean
-from photonpano_core.dense_motion.patches import PatchGrid
-from photonpano_core.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.burst import BurstMerger, PatchGrid, aligned, at_instant, wiener_mean
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
 
 N, HEIGHT, WIDTH = 200, 72, 100
 GROUP = Group(FrameSpan(0, N), (N - 1) / 2)

@@ -9,7 +9,7 @@ from photonpano import FrameSpan, Group, Source
 from photonpano.geometry import translation
 from photonpano.merging import accumulate, chunks_of
 from photonpano_core.configs import PhotonMleConfig
-from photonpano_core.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
 
 N = 60
 GROUP = Group(FrameSpan(0, N), 29.5)

@@ -8,8 +8,8 @@ import pytest
 from photonpano import FrameSpan, Group, Source, Trajectory
 from photonpano.geometry import translation
 from photonpano_core.configs import PhotonMleConfig, RobustMergeConfig
-from photonpano_core.photon_mle import PhotonMleMerger
-from photonpano_core.robust_merge import RobustMerger
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.robust_merge import RobustMerger
 
 N, HEIGHT, WIDTH = 140, 60, 90
 GROUP = Group(FrameSpan(0, N), (N - 1) / 2)

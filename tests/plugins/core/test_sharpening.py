@@ -6,8 +6,7 @@ import pytest
 
 from photonpano.merging import PhotonSum
 from photonpano.testing import MemorySource
-from photonpano_core.dense_motion.frames import count_variance
-from photonpano_core.dense_motion.sharpening import sharpened
+from photonpano_core.mergers.dense_motion.frames import count_variance, sharpened
 
 SHAPE, N = (96, 128), 5000
 RESPONSE = MemorySource(np.zeros((1, 4, 4), np.uint8)).response

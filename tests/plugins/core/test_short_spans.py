@@ -8,7 +8,7 @@ import pytest
 from photonpano import FrameSpan, SpanResiduals
 from photonpano.geometry import FrameTrajectory
 from photonpano_core.configs import ShortSpansConfig
-from photonpano_core.refiners.short_spans import ShortSpansRefiner
+from photonpano_core.refiners import ShortSpansRefiner
 
 SHAPE = (96, 128)
 N_FRAMES = 4096

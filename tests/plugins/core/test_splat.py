@@ -11,8 +11,8 @@ from photonpano.geometry import inverse, rescaling
 from photonpano.lighting import in_light
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import PhotonMleConfig
-from photonpano_core.photon_mle import PhotonMleMerger
-from photonpano_core.splat import SplatMerger
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.splat import SplatMerger
 
 N, HEIGHT, WIDTH = 24, 30, 41
 GROUP = Group(FrameSpan(2, N - 2), 10.5)
@@ -167,7 +167,7 @@ def test_splat_reads_frames_in_blocks(memory_source: type, frames: np.ndarray, r
             spans.append(span)
             return super().frames(span)
 
-    monkeypatch.setattr("photonpano_core.splat._READ_BYTES", 7 * HEIGHT * WIDTH)
+    monkeypatch.setattr("photonpano_core.mergers.splat._READ_BYTES", 7 * HEIGHT * WIDTH)
     parts = SplatMerger().merge(Told(frames), GROUP, rigid, 1.0)
     assert spans == [FrameSpan(2, 9), FrameSpan(9, 16), FrameSpan(16, 22)]
     np.testing.assert_array_equal(parts.flux, whole.flux)

@@ -16,9 +16,9 @@ from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import SuperResolutionConfig
 from photonpano_core.super_resolution.collaborative import Patches, filter_groups, find_similar
-from photonpano_core.super_resolution.estimate import Observations, pixel_area, rounds_of
-from photonpano_core.super_resolution.observing import add_observations, counts_in_light, expected
+from photonpano_core.super_resolution.estimate import Observations, counts_in_light, expected, pixel_area, rounds_of
 from photonpano_core.super_resolution.renderer import SuperResolutionRenderer
+from photonpano_core.super_resolution.sums import add_observations
 
 SIDE, CHUNKS, FRAMES, FINE = 40, 96, 40, 8
 """Pixels of a side of a frame, its stops, the frames of each, and the samples of the scene along the side of a pixel."""

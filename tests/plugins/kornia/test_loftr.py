@@ -17,7 +17,7 @@ import torch
 
 from photonpano_kornia.configs import KorniaLoftrConfig
 from photonpano_kornia.matched import LoftrLocator
-from photonpano_kornia.weights import loftr_from
+from photonpano_kornia.runtime import loftr_from
 
 SHAPE = (120, 176)
 STILL = np.eye(3)

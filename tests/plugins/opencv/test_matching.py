@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonpano_opencv.matching import match_everywhere, match_nearby, unit_bits, unit_descriptors
+from photonpano_opencv.keypoints import match_everywhere, match_nearby, unit_bits, unit_descriptors
 
 counts = st.integers(0, 12)
 seeds = st.integers(0, 2**32 - 1)

@@ -10,10 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from photonpano import InputError
-from photonpano_sensors.intensity.cih import read_header
-from photonpano_sensors.intensity.configs import FastcamMrawConfig
-from photonpano_sensors.intensity.levels import Encoding
-from photonpano_sensors.intensity.mraw import FastcamMrawSource
+from photonpano_sensors.intensity.contributions import FastcamMrawConfig
+from photonpano_sensors.intensity.mraw import FastcamMrawSource, read_header
+from photonpano_sensors.intensity.source import Encoding
 
 REAL = Path(__file__).parents[2] / "data" / "photron"
 BEAM, CIH = (REAL / "beam.cihx").read_bytes(), (REAL / "sample_60k_16bit.cih").read_bytes()

@@ -9,9 +9,9 @@ from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError
 from photonpano.photometry import srgb_to_linear
-from photonpano_sensors.intensity.configs import FastcamMrawConfig, ResponseConfig
-from photonpano_sensors.intensity.levels import Encoding, LinearLevels, linear_levels
+from photonpano_sensors.intensity.contributions import FastcamMrawConfig, ResponseConfig
 from photonpano_sensors.intensity.mraw import FastcamMrawSource
+from photonpano_sensors.intensity.source import Encoding, LinearLevels, linear_levels
 
 LIMITED = Encoding(8, 16.0, 235.0)
 

@@ -8,7 +8,7 @@ import pytest
 import tifffile
 
 from photonpano import InputError
-from photonpano_sensors.intensity.configs import ImageFolderConfig
+from photonpano_sensors.intensity.contributions import ImageFolderConfig
 from photonpano_sensors.intensity.pictures import ImageFolderSource
 
 

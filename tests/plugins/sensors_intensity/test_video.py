@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError, SourceContext
-from photonpano_sensors.intensity.configs import ResponseConfig, VideoConfig
+from photonpano_sensors.intensity.contributions import ResponseConfig, VideoConfig
 
 pytest.importorskip("av")
 

@@ -13,8 +13,8 @@ from photonpano.geometry import apply, corners
 from photonpano.testing.scenes import z_scores
 from photonpano_simulator.config import FrameObject, Lens, Sensor, SimulatorConfig
 from photonpano_simulator.lens import undistorted
-from photonpano_simulator.objects import DrawnObject
 from photonpano_simulator.sensor import SpadSensor
+from photonpano_simulator.views import DrawnObject
 
 if TYPE_CHECKING:
     from collections.abc import Callable

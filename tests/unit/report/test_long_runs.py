@@ -26,7 +26,7 @@ from photonpano.report.viewer import shared_instant
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained, bounded_std_px, residual_ratio, standing_out, unexplained_px
 from photonpano_core.configs import ShortSpansConfig
-from photonpano_core.refiners.short_spans import ShortSpansRefiner
+from photonpano_core.refiners import ShortSpansRefiner
 
 SHORT, LONG = 20_000, 80_000
 

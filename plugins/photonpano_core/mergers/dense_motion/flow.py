@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from photonpano import BoolArray
 from photonpano.merging import PhotonSum
-from photonpano_core.dense_motion.field import Image, MotionField
-from photonpano_core.dense_motion.polynomials import add_moments, fit_each
-from photonpano_core.dense_motion.sub_exposures import SCALE, Smoothed, SubExposures, blurred
+from photonpano_core.mergers.dense_motion.field import Image, MotionField, add_moments, fit_each
+from photonpano_core.mergers.dense_motion.frames import blurred
+from photonpano_core.mergers.dense_motion.sub_exposures import SCALE, Smoothed, SubExposures
 
 # Sub-exposures of each round. Parallax of a camera in the hand changes its speed too often for fewer in the last.
 _ROUNDS = 3, 9, 17
@@ -28,15 +28,11 @@ _CLIPPED = 0.2, 99.8  # percentiles of the values that are black and white to th
 
 
 def estimate_field(parts: SubExposures, moving: BoolArray) -> MotionField:
-    """Estimate how pixels move beyond the global motion.
+    """Estimate how some pixels, (H, W), of merged sub-exposures move beyond the global motion; the field is 0 elsewhere.
 
     In each round, sub-exposures are merged along the field so far, and joined to 3, then 9, then 17 longer ones. The flow from
     the reference to each of these is added to the field, which is fitted by polynomials of time. So each round has less motion
     that is still unknown, and less of it within a sub-exposure.
-
-    Args:
-        parts: the sub-exposures of the last round, merged along the global motion.
-        moving: (H, W) pixels to estimate; the field is 0 elsewhere.
     """
     field, sums = MotionField.zero(parts.shape), parts.sums
     for n in _ROUNDS:
@@ -49,15 +45,7 @@ def estimate_field(parts: SubExposures, moving: BoolArray) -> MotionField:
 
 
 def _refined(parts: SubExposures, sums: Sequence[PhotonSum], field: MotionField, n: int, moving: BoolArray) -> MotionField:
-    """Return the field after a round.
-
-    Args:
-        parts: the sub-exposures.
-        sums: these along the field so far.
-        field: so far.
-        n: number of sub-exposures of this round.
-        moving: (H, W) pixels to estimate.
-    """
+    """Return the field after a round of `n` sub-exposures, whose `sums` are merged along the field so far."""
     joined = parts.joined(sums, n)
     images = [parts.smoothed(each, _DETAIL_PX) for each in joined.sums]
     shades = _in_8_bits([each.values for each in images])

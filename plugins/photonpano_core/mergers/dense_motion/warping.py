@@ -5,65 +5,42 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from photonpano import BoolArray, FloatArray
 from photonpano.compiling import compiled
+from photonpano_core.mergers.dense_motion.field import Image
 
 
 class Frames(NamedTuple):
-    """A sum of frames.
+    """A sum of frames."""
 
-    Attributes:
-        image: (h, w) float32 sum.
-        weights: (h, w) float32 of a frame of each pixel, from 0 to 1; (0, 0) if it is 1 for all.
-        number: of frames in the sum.
-    """
-
-    image: NDArray[np.float32]
-    weights: NDArray[np.float32]
+    image: Image  # (h, w) sum
+    weights: Image  # (h, w) of a frame of each pixel, from 0 to 1; (0, 0) if it is 1 for all
     number: float
 
 
 class Moved(NamedTuple):
-    """How the pixels of a grid move beyond a homography, in cells of a coarser or finer grid.
+    """Motion of the pixels of a grid beyond a homography, in cells of a coarser or finer grid."""
 
-    Attributes:
-        where: (H, W) pixels of the grid that are added to.
-        cells: cells per pixel, and the row and the column of the first cell. Pixels in one cell move alike.
-        motion: (h', w', 2), x and y by which cells are displaced, in cells.
-        trust: (h', w') weight of the image in each cell.
-    """
-
-    where: NDArray[np.bool_]
+    where: BoolArray  # (H, W) pixels of the grid that are added to
+    # cells per pixel, and the row and the column of the first cell. Pixels in one cell move alike
     cells: tuple[float, int, int]
-    motion: NDArray[np.float32]
-    trust: NDArray[np.float32]
+    motion: Image  # (h', w', 2), x and y by which cells are displaced, in cells
+    trust: Image  # (h', w') weight of the image in each cell
 
 
 class Sums(NamedTuple):
-    """What `add_along` adds to.
+    """Sums that `add_along` adds to."""
 
-    Attributes:
-        counts: (H, W) sums.
-        weight: (H, W) numbers of frames.
-        blur: (H, W) variances of the blur of interpolation, mean of x and y in px^2, times numbers of frames; (0, 0) for none.
-    """
-
-    counts: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    blur: NDArray[np.float32]
+    counts: Image  # (H, W) sums
+    weight: Image  # (H, W) numbers of frames
+    # (H, W) variances of the blur of interpolation, mean of x and y in px^2, times numbers of frames; (0, 0) for none
+    blur: Image
 
 
 @compiled
-def add_along(summed: Frames, to_image: NDArray[np.float64], moved: Moved, sums: Sums) -> None:
-    """Add an image to some pixels of a grid, interpolated bilinearly; the image is 0 outside of its border.
-
-    Args:
-        summed: frames.
-        to_image: (3, 3), pixels of the grid to pixels of the image.
-        moved: how pixels move beyond that.
-        sums: added to.
-    """
+def add_along(summed: Frames, to_image: FloatArray, moved: Moved, sums: Sums) -> None:
+    """Add a sum of frames to some pixels of a grid, which (3, 3) maps to the image, bilinearly; 0 outside of its border."""
     image, weights, where, trust = summed.image, summed.weights, moved.where, moved.trust
     counts, weight, blur = sums.counts, sums.weight, sums.blur
     scale, first_row, first_column = moved.cells
@@ -110,7 +87,7 @@ def add_along(summed: Frames, to_image: NDArray[np.float64], moved: Moved, sums:
 
 
 @compiled
-def _map(to_image: NDArray[np.float64], us: NDArray[np.float64], vs: NDArray[np.float64]) -> None:
+def _map(to_image: FloatArray, us: FloatArray, vs: FloatArray) -> None:
     """Replace places (x, y) on a grid by those in an image."""
     xx, xy, x1 = to_image[0, 0], to_image[0, 1], to_image[0, 2]
     yx, yy, y1 = to_image[1, 0], to_image[1, 1], to_image[1, 2]
@@ -123,7 +100,7 @@ def _map(to_image: NDArray[np.float64], us: NDArray[np.float64], vs: NDArray[np.
 
 
 @compiled
-def _between(image: NDArray[np.float32], top: int, left: int, a: np.float32, b: np.float32) -> np.float32:
+def _between(image: Image, top: int, left: int, a: np.float32, b: np.float32) -> np.float32:
     """Interpolate between four pixels, at fractions of a pixel to the right and down of the first."""
     upper = image[top, left] + a * (image[top, left + 1] - image[top, left])
     lower = image[top + 1, left] + a * (image[top + 1, left + 1] - image[top + 1, left])
@@ -131,25 +108,11 @@ def _between(image: NDArray[np.float32], top: int, left: int, a: np.float32, b: 
 
 
 @compiled
-def mean_of_seen(
-    counts: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    least: float,
-    steepest: float,
-    area: float,
-    mean: NDArray[np.float32],
-    frames: NDArray[np.float32],
-) -> None:
-    """Divide counts by weights where these are large and even.
+def mean_of_seen(counts: Image, weight: Image, least: float, steepest: float, area: float, mean: Image, frames: Image) -> None:
+    """Divide counts by weights, (H, W), where these exceed `least`, and their gradient is below `steepest` relative to them.
 
-    Args:
-        counts: (H, W) sums.
-        weight: (H, W) numbers of frames.
-        least: weight above which a pixel is seen.
-        steepest: largest gradient of the weight, relative to it.
-        area: pixels that are averaged.
-        mean: (H, W) output, mean count of a frame; 0 where unseen.
-        frames: (H, W) output, number of frames of one pixel with the same noise, 1 or more; 0 where unseen.
+    Writes the mean count of a frame, and the frames of one pixel whose noise equals that of an average over `area` pixels, 1 or
+    more; both 0 where unseen.
     """
     height, width = counts.shape
     for row in range(height):

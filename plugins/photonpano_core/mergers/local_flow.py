@@ -8,36 +8,34 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import BoolArray, FrameSpan, Group, InputError, Source, Trajectory, VirtualExposure, capture_of
+from photonpano import BoolArray, FrameSpan, Group, Source, Trajectory, VirtualExposure
 from photonpano.geometry import inverse
 from photonpano.merging import PhotonSum, accumulate, chunks_of, clipped
 from photonpano_core.configs import LocalFlowConfig
-from photonpano_core.dense_motion.flow import estimate_field
-from photonpano_core.dense_motion.frames import WeightedFrames, rescaled
-from photonpano_core.dense_motion.ghosts import GhostMap, compared
-from photonpano_core.dense_motion.robust_sum import weighted
-from photonpano_core.dense_motion.sharpening import sharpened
-from photonpano_core.dense_motion.sub_exposures import SCALE, SubExposures
-from photonpano_core.dense_motion.warping import Frames, Moved, Sums, add_along
-from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
+from photonpano_core.mergers.dense_motion.flow import estimate_field
+from photonpano_core.mergers.dense_motion.frames import WeightedFrames, rescaled, sharpened
+from photonpano_core.mergers.dense_motion.ghosts import GhostMap, compared, weighted
+from photonpano_core.mergers.dense_motion.sub_exposures import SCALE, SubExposures
+from photonpano_core.mergers.dense_motion.warping import Frames, Moved, Sums, add_along
+from photonpano_core.mergers.photon_mle import exposure_of, exposure_shape, require_plain, to_exposure, unwarped_sum
 
 # Numbers of sub-exposures that are tried for a group, with the photons per pixel that each must have.
 _NUMBERS = {33: 8.0, 17: 8.0, 9: 2.0, 5: 2.0, 3: 2.0}
 _USUAL = 17  # sub-exposures, at most, unless something moves fast
 _COMPARED = 9  # sub-exposures, at most, whose differences show what moves: fewer have more light each
-_SAMPLED = 16  # frames from which the light of a group is measured
-_AROUND_PX = 6  # surroundings of what moves that are merged along the field as well, in px of a frame
-_SWEPT_PX = 6.0  # way of an outline within a sub-exposure, in px of a frame, from which on more of them are weighted
-_MARGIN_PX = 32  # surroundings of these in which flow is estimated, in px of a frame
+_SAMPLED = 16  # frames that are sampled for the mean flux of a group
+_AROUND_PX = 6  # dilation of the moving pixels that are merged along the field, in px of a frame
+_SWEPT_PX = 6.0  # motion within a sub-exposure, in px of a frame, above which a group is divided into more of them
+_MARGIN_PX = 32  # margin around these in which flow is estimated, in px of a frame
 
 
 class LocalFlowMerger:
     """Warps the counts of a group along the global motion, and where they contradict it, along a dense field beyond it.
 
-    A group is divided into sub-exposures of half the size. Where these agree, as everywhere in a still scene, all frames are
-    merged as `photon-mle` does, to the same flux. Elsewhere optical flow is estimated in rounds. Sub-exposures that still
-    differ from the one around the reference instant, such as those in which a pixel is occluded, get less weight. Then counts
-    are warped along the sum of both motions, in one interpolation, at full size, and its blur is undone where noise allows it.
+    A group is divided into sub-exposures of half the size. Where these agree, all frames are merged as `photon-mle` does, to
+    the same flux. Elsewhere optical flow is estimated in rounds. Sub-exposures that still differ from the one around the
+    reference instant, such as those in which a pixel is occluded, get less weight. Then counts are warped along the sum of both
+    motions, in one interpolation at full size, and its blur is undone where noise allows it.
 
     In a group with too few photons, and while no motion is known, frames are merged as `photon-mle` does.
     """
@@ -46,32 +44,20 @@ class LocalFlowMerger:
         self._config = config
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
-        """Merge a group; see `photonpano.Merger`.
-
-        Raises:
-            InputError: the lens of the source distorts, or its light changes.
-        """
+        """Merge a group; see `photonpano.Merger`. Raises an `InputError` if the lens distorts, or the light changes."""
         if trajectory is None:
             return exposure_of(unwarped_sum(source, group, scale), source, group, scale)
         photons = self._merged(source, group, trajectory, max(scale, 1.0))
         return exposure_of(rescaled(photons, scale) if scale < 1 else photons, source, group, scale)
 
     def ghost_map(self, source: Source, group: Group, trajectory: Trajectory) -> GhostMap:
-        """Find the pixels of a group whose photons contradict the global motion, on the grid of a frame.
-
-        Raises:
-            InputError: the lens of the source distorts, or its light changes.
-        """
+        """Find the pixels of a group whose photons contradict the global motion, on the grid of a frame."""
         found = self._ghosts(self._divided(source, group, trajectory))
         shape = source.info.frame_shape
         return GhostMap(enlarged(found.significance, shape), enlarged(found.moving, shape))
 
     def _divided(self, source: Source, group: Group, trajectory: Trajectory) -> SubExposures:
-        capture = capture_of(source)
-        if capture.camera is not None and capture.camera.distorts:
-            raise InputError("merge.use: local-flow does not warp through a lens that distorts; use robust-merge or photon-mle")
-        if capture.light is not None:
-            raise InputError("merge.use: local-flow does not divide by light that changes; use robust-merge or photon-mle")
+        require_plain(source, "local-flow", "robust-merge or photon-mle")
         wanted = self._config.sub_exposures
         number = min(number_of(source, group), _USUAL) if wanted == "auto" else wanted
         return SubExposures(source, group, trajectory, number)
@@ -105,7 +91,7 @@ class LocalFlowMerger:
         for span, trust in zip(parts.spans, best.trusts, strict=True):
             for chunk, motion in parts.moving(clipped(chunks, span, trajectory), best.field, fastest_px, tolerance_px):
                 to_image = inverse(onto @ chunk.homography)
-                summed = Frames(frames(chunk.span), frames.worth, float(len(chunk.span)))
+                summed = Frames(frames(chunk.span), frames.weights, float(len(chunk.span)))
                 add_along(summed, to_image, Moved(inside, cells, motion, trust), sums)
         photons = PhotonSum(sums.counts, sums.weight)
         if scale > 1:

@@ -11,21 +11,21 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from photonpano import BoolArray, FloatArray, FrameSpan, Group, Response, Source, Trajectory
+from photonpano import BoolArray, FloatArray, Group, Response, Source, Trajectory
 from photonpano.geometry import inverse, rescaling, transform_points, translation
 from photonpano.merging import Chunk, PhotonSum, chunks_of, clipped, divided
-from photonpano_core.dense_motion.field import Image, MotionField
-from photonpano_core.dense_motion.frames import WeightedFrames
-from photonpano_core.dense_motion.warping import Frames, Moved, Sums, add_along, mean_of_seen
-from photonpano_core.photon_mle import to_exposure
+from photonpano_core.mergers.dense_motion.field import Image, MotionField
+from photonpano_core.mergers.dense_motion.frames import WeightedFrames, blurred
+from photonpano_core.mergers.dense_motion.warping import Frames, Moved, Sums, add_along, mean_of_seen
+from photonpano_core.mergers.photon_mle import equal_spans, parts_of, to_exposure
 
 SCALE = 0.5  # pixels of the grid per pixel of a frame
 _TOLERANCE_PX = 1.5  # motion within which frames are summed before they are warped, in px of a frame
-_PLACES = 5  # places along an axis, about, at which the blur of interpolation is looked at
+_PLACES = 5  # about how many samples along an axis give the mean blur of interpolation
 _CACHE_BYTES = 64 * 1024**2  # memory for halved sums of frames, which are warped again in each round
-# Largest displacement, by uneven weights, of what a smoothed pixel shows, in px of a frame; less at a smaller scale.
+# Largest shift of the centroid of a smoothed pixel by uneven weights, in px of a frame; less at a smaller scale.
 _SHIFT_PX = 0.2
-_MOST = 95.0  # percentile of the speeds of a field by which frames are summed
+_MOST = 95.0  # percentile of the speeds of a field that limits how many frames are summed before they are warped
 _SAMPLED = 3  # step, along each axis, of the pixels whose speeds are compared
 _REACH = 4  # standard deviations at which a Gaussian ends
 _SEEN = 0.1  # a pixel is seen by a sub-exposure if this share of its frames, smoothed, shows it
@@ -33,15 +33,10 @@ _SEEN = 0.1  # a pixel is seen by a sub-exposure if this share of its frames, sm
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
-    """A sub-exposure on the scale on which photon noise is uniform.
+    """A sub-exposure on the scale on which photon noise is uniform."""
 
-    Attributes:
-        values: (H, W) float32, stabilised flux of the smoothed counts; 0 where unseen.
-        frames: (H, W) float32, number of frames of one pixel whose noise equals that of the smoothed value; 0 where unseen.
-    """
-
-    values: Image
-    frames: Image
+    values: Image  # (H, W), stabilised flux of the smoothed counts; 0 where unseen
+    frames: Image  # (H, W), number of frames of one pixel whose noise equals that of the smoothed value; 0 where unseen
 
     def squared_difference(self, other: Smoothed, response: Response) -> Image:
         """Return (H, W): the squared difference, in units of its photon noise; 0 where one of both is unseen."""
@@ -53,17 +48,11 @@ class Smoothed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joined:
-    """Sub-exposures that are joined to longer ones.
+    """Sub-exposures that are joined to longer ones."""
 
-    Attributes:
-        sums: counts and weights of each.
-        times: the middle of each: see `SubExposures.elapsed`.
-        reference: index of the one that contains the reference instant.
-    """
-
-    sums: list[PhotonSum]
-    times: list[float]
-    reference: int
+    sums: list[PhotonSum]  # counts and weights of each
+    times: list[float]  # the middle of each: see `SubExposures.elapsed`
+    reference: int  # index of the one that contains the reference instant
 
 
 class SubExposures:
@@ -74,26 +63,18 @@ class SubExposures:
         shape: (height, width) of the grid.
         sums: counts and weights of each along the global motion.
         reference: index of the one that contains the reference instant.
-        response: of the camera.
         spread: mean of f (1 - f) over the fractions f of a pixel at which frames are interpolated.
     """
 
     def __init__(self, source: Source, group: Group, trajectory: Trajectory, n: int) -> None:
-        """Merge along the global motion.
-
-        Args:
-            source: the capture.
-            group: its frames are divided.
-            trajectory: the global motion.
-            n: number of sub-exposures; fewer if the group has fewer frames.
-        """
+        """Merge `n` sub-exposures along the global motion; fewer if the group has fewer frames."""
         self._group, self._trajectory = group, trajectory
         self._frames = WeightedFrames(source)
-        self._weights = halved(self._frames.worth) if self._frames.worth.size else self._frames.worth
+        self._weights = halved(self._frames.weights) if self._frames.weights.size else self._frames.weights
         self._onto = to_exposure(group, trajectory, SCALE)
         height, width = source.info.frame_shape
         self.shape, self.response = (height // 2, width // 2), source.response
-        self._halved = lru_cache(max(1, _CACHE_BYTES // (height * width)))(self._summed)
+        self._halved = lru_cache(max(1, _CACHE_BYTES // (height * width)))(lambda span: halved(self._frames(span)))
         self._chunks = chunks_of(group.span, trajectory, source.info.frame_shape, _TOLERANCE_PX)
         self._trusted = np.ones(self.shape, np.float32)
         self._divide(n)
@@ -102,9 +83,7 @@ class SubExposures:
 
     def _divide(self, n: int) -> None:
         """Merge `n` sub-exposures along the global motion."""
-        start = self._group.span.start
-        self.spans = [FrameSpan(start + part.start, start + part.stop) for part in divided(len(self._group.span), n)]
-        self.reference = next(place for place, span in enumerate(self.spans) if self._group.reference < span.stop)
+        self.spans, self.reference = parts_of(self._group, n)
         nothing = PhotonSum(*np.zeros((2, *self.shape), np.float32))
         self.sums = [nothing] * len(self.spans)
         self.sums = self.along(MotionField.zero(self.shape), np.ones(self.shape, np.bool_))
@@ -127,12 +106,7 @@ class SubExposures:
         return crop
 
     def joined(self, sums: Sequence[PhotonSum], n: int) -> Joined:
-        """Join sub-exposures to `n` longer ones.
-
-        Args:
-            sums: of all sub-exposures.
-            n: number of longer ones, at most that of all.
-        """
+        """Join the sums of all sub-exposures to `n` longer ones."""
         groups = divided(len(self.spans), n)
         times = [self.elapsed((self.spans[each.start].start + self.spans[each.stop - 1].stop - 1) / 2) for each in groups]
         reference = next(place for place, each in enumerate(groups) if self.reference in each)
@@ -148,13 +122,7 @@ class SubExposures:
         return (instant - reference) / max(reference - span.start, span.stop - 1 - reference, 1)
 
     def along(self, field: MotionField, where: BoolArray, others: Sequence[PhotonSum] | None = None) -> list[PhotonSum]:
-        """Merge along the global motion and a field.
-
-        Args:
-            field: the motion beyond the global one, in px of the grid.
-            where: (H, W) pixels that are merged again, one at least.
-            others: the sums elsewhere; those along the global motion by default.
-        """
+        """Merge some pixels, (H, W), along the global motion and a field in px of the grid; `others` are the sums elsewhere."""
         merged, unwanted = [], np.zeros((0, 0), np.float32)
         fastest_px = self.fastest_px(field, where)
         for span, other in zip(self.spans, others or self.sums, strict=True):
@@ -169,7 +137,7 @@ class SubExposures:
 
     @staticmethod
     def fastest_px(field: MotionField, where: BoolArray) -> float:
-        """Return the speed of nearly the fastest pixels, of some (H, W), in px of a frame per unit of time."""
+        """Return the 95th percentile of the speeds of some pixels, (H, W), in px of a frame per unit of time."""
         step = _SAMPLED if where[::_SAMPLED, ::_SAMPLED].any() else 1
         sample = MotionField(field.coefficients[:, ::step, ::step])
         return float(np.percentile(sample.way_px[where[::step, ::step]], _MOST)) / SCALE
@@ -177,22 +145,14 @@ class SubExposures:
     def moving(
         self, chunks: Sequence[Chunk], field: MotionField, fastest_px: float, tolerance_px: float
     ) -> Iterator[tuple[Chunk, Image]]:
-        """Divide the chunks of a sub-exposure, so that a field moves by less than a tolerance within each.
+        """Divide the chunks of a sub-exposure so that a field moves by less than a tolerance within each.
 
-        Args:
-            chunks: to divide.
-            field: the motion beyond the global one, which is linear within a sub-exposure.
-            fastest_px: its speed.
-            tolerance_px: the tolerance.
-
-        Returns:
-            Each with the displacement at its centre, (H, W, 2).
+        Yields each with the displacement at its centre, (H, W, 2); the field is linear in time within a sub-exposure.
         """
         finer: list[Chunk] = []
         for chunk in chunks:
-            start, way_px = chunk.span.start, fastest_px * abs(self.elapsed(chunk.span.stop) - self.elapsed(chunk.span.start))
-            parts = divided(len(chunk.span), max(1, math.ceil(way_px / tolerance_px)))
-            spans = [FrameSpan(start + part.start, start + part.stop) for part in parts]
+            way_px = fastest_px * abs(self.elapsed(chunk.span.stop) - self.elapsed(chunk.span.start))
+            spans = equal_spans(chunk.span, math.ceil(way_px / tolerance_px))
             homographies = self._trajectory.at([span.centre for span in spans]) if len(spans) > 1 else [chunk.homography]
             finer += map(Chunk, spans, homographies)
         times = [self.elapsed(chunk.span.centre) for chunk in finer]
@@ -206,9 +166,6 @@ class SubExposures:
         """Return the maps of pixels of the grid to halved frames."""
         return rescaling(SCALE) @ inverse(self._onto @ homographies)
 
-    def _summed(self, span: FrameSpan) -> Image:
-        return halved(self._frames(span))
-
 
 def halved(image: Image) -> Image:
     """Average two by two pixels; a last odd row or column is left out."""
@@ -217,12 +174,7 @@ def halved(image: Image) -> Image:
 
 
 def _spread(to_image: FloatArray, shape: tuple[int, int]) -> float:
-    """Return the mean of `f (1 - f)` over the fractions f of a pixel at which images are interpolated.
-
-    Args:
-        to_image: (N, 3, 3), pixels of the grid to pixels of frames.
-        shape: (height, width) of the grid.
-    """
+    """Return the mean of `f (1 - f)` over the fractions f of a pixel at which (N, 3, 3) maps interpolate a grid."""
     places = np.stack(np.meshgrid(*(np.arange(0, side, max(1, side // _PLACES)) for side in shape[::-1])), axis=-1)
     found = transform_points(to_image, places.reshape(-1, 2))
     fraction = found - np.floor(found)
@@ -239,15 +191,7 @@ def total_of(sums: Sequence[PhotonSum]) -> PhotonSum:
 
 
 def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: float, spread: float) -> Smoothed:
-    """Blur a sub-exposure, and stabilise its noise.
-
-    Args:
-        photons: the sub-exposure.
-        response: the camera's response.
-        blur_px: standard deviation of the Gaussian, in px of a frame.
-        scale: pixels of the sub-exposure per pixel of a frame.
-        spread: of the interpolation that has blurred the noise before: see `SubExposures`.
-    """
+    """Blur a sub-exposure by a Gaussian in px of a frame, at `scale` px per px of a frame, and stabilise its noise."""
     counts, weight = (blurred(each, blur_px * scale) for each in (photons.counts, photons.weight))
     mean, frames = np.empty_like(counts), np.empty_like(counts)
     area = noise_area_px2(blur_px, scale, spread)
@@ -261,14 +205,9 @@ def smoothed(photons: PhotonSum, response: Response, blur_px: float, scale: floa
 def noise_area_px2(blur_px: float, scale: float, spread: float) -> float:
     """Return the number of pixels of a frame whose average has the noise of a smoothed pixel; arguments as in `smoothed`.
 
-    Along an axis, noise is lowered by the sum of the squares of the kernel. Interpolation at a fraction f of a pixel takes
-    `2 f (1 - f)` of it from the products of neighbours.
+    Along an axis, noise is lowered by the sum of the squares of the kernel. Interpolation at a fraction f of a pixel takes `2 f
+    (1 - f)` of it from the products of neighbours.
     """
     kernel = cv2.getGaussianKernel(2 * math.ceil(_REACH * blur_px * scale) + 1, blur_px * scale)[:, 0]
     squares, products = float(kernel @ kernel), float(kernel[1:] @ kernel[:-1])
     return float((squares - 2 * spread * (squares - products)) * scale) ** -2
-
-
-def blurred(image: Image, blur_px: float) -> Image:
-    """Blur with a Gaussian; the image is 0 outside of its border."""
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px, borderType=cv2.BORDER_CONSTANT), np.float32)

@@ -7,21 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import (
-    FloatArray,
-    FrameSpan,
-    Group,
-    InputError,
-    Source,
-    Trajectory,
-    VirtualExposure,
-    capture_of,
-)
+from photonpano import BoolArray, FloatArray, FrameSpan, Group, InputError, Source, Trajectory, VirtualExposure, capture_of
 from photonpano.compiling import compiled
-from photonpano.geometry import apply, corners, inverse, visible_columns
+from photonpano.geometry import corners, inverse, transform_points, visible_columns
 from photonpano.merging import PhotonSum, gain_image
-from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
+from photonpano_core.mergers.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
 
+Image = NDArray[np.float32]
 Frames = NDArray[np.unsignedinteger[Any]]
 
 _WORD = np.uint64
@@ -39,11 +31,7 @@ class SplatMerger:
     """
 
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
-        """Merge a group; see `photonpano.Merger`.
-
-        Raises:
-            InputError: the source corrects sums of frames, which this merger does not make, or its lens distorts.
-        """
+        """Merge a group; see `photonpano.Merger`. Raises an `InputError` if sums are corrected, or the lens distorts."""
         capture = capture_of(source)
         if capture.corrects_sums:
             raise InputError(
@@ -76,7 +64,7 @@ def _splatted(source: Source, span: FrameSpan, to_grid: FloatArray, shape: tuple
     return PhotonSum(_without_margin(counts), _weight(source.valid, to_grid, shape))
 
 
-def _weight(valid: NDArray[np.bool_], to_grid: FloatArray, shape: tuple[int, int]) -> NDArray[np.float32]:
+def _weight(valid: BoolArray, to_grid: FloatArray, shape: tuple[int, int]) -> Image:
     """Return the sum of splats of the valid pixels of frames of ones: (H, W)."""
     weight = np.zeros(shape, np.float32)
     rigid = _rigid(to_grid, valid.shape)
@@ -96,32 +84,24 @@ def _weight(valid: NDArray[np.bool_], to_grid: FloatArray, shape: tuple[int, int
 def _rigid(to_grid: FloatArray, frame_shape: tuple[int, int]) -> bool:
     """Return whether the pixels of all frames stay 1 px apart, so that weights need not be splatted."""
     neighbours = corners(frame_shape)[:, None] + np.array([[0, 0], [1, 0], [0, 1]])
-    placed = apply(to_grid, neighbours.reshape(-1, 2)).reshape(len(to_grid), 4, 3, 2)
+    placed = transform_points(to_grid, neighbours.reshape(-1, 2)).reshape(len(to_grid), 4, 3, 2)
     return bool(np.abs(placed[:, :, 1:] - placed[:, :, :1] - np.eye(2)).max() < _RIGID)
 
 
-def _with_margin(shape: tuple[int, int]) -> NDArray[np.float32]:
+def _with_margin(shape: tuple[int, int]) -> Image:
     return np.zeros((shape[0] + 2, shape[1] + 2), np.float32)
 
 
-def _without_margin(grid: NDArray[np.float32]) -> NDArray[np.float32]:
+def _without_margin(grid: Image) -> Image:
     return np.ascontiguousarray(grid[1:-1, 1:-1])
 
 
-def splat(frames: Frames, used: NDArray[np.bool_], to_grid: NDArray[np.float64], total: NDArray[np.float32]) -> None:
-    """Add the counts of frames to a grid, each with bilinear weights to four pixels, times the area of a frame's pixel there.
+def splat(frames: Frames, used: BoolArray, to_grid: FloatArray, total: Image) -> None:
+    """Add the (n, h, w) counts of frames to a grid, each with bilinear weights to four pixels, times the area of its pixel.
 
-    This is the adjoint of bilinear interpolation: a pixel of a frame adds to a pixel of the grid with the weight with which it
-    would interpolate from it.
-
-    Convention:
-        Points are (x, y), integers are pixel centres. The depth `h31 x + h32 y + h33` is positive in front of the camera.
-
-    Args:
-        frames: (n, h, w) counts, most of them 0.
-        used: (h, w), false for pixels to leave out.
-        to_grid: (n, 3, 3), pixels of each frame to pixels of the grid; of determinant 1, so that the area is `1 / depth^3`.
-        total: (H + 2, W + 2), the grid to add to, with a margin of a pixel for photons that cross its border.
+    This is the adjoint of bilinear interpolation. The `to_grid` maps have determinant 1, so that the area is `1 / depth^3` with
+    the depth `h31 x + h32 y + h33`, positive in front of the camera. `total` is (H + 2, W + 2): it has a margin of a pixel for
+    photons that cross its border.
     """
     lanes = _WORD().itemsize // frames.itemsize
     missing = -frames.shape[2] % lanes
@@ -130,13 +110,7 @@ def splat(frames: Frames, used: NDArray[np.bool_], to_grid: NDArray[np.float64],
 
 
 @compiled
-def _splat(
-    frames: Frames,
-    words: NDArray[np.uint64],
-    used: NDArray[np.bool_],
-    to_grid: NDArray[np.float64],
-    total: NDArray[np.float32],
-) -> None:
+def _splat(frames: Frames, words: NDArray[np.uint64], used: BoolArray, to_grid: FloatArray, total: Image) -> None:
     """Splat rows of whole words, and skip words that are 0."""
     n_frames, height, width = frames.shape
     words_a_row = words.shape[2]
@@ -182,16 +156,11 @@ def _splat(
 
 
 @compiled
-def add_coverage(
-    shape: tuple[int, int], to_frame: NDArray[np.float64], total: NDArray[np.float32], steps: NDArray[np.float32]
-) -> None:
-    """Add the sum of splats of frames of ones whose pixels stay 1 px apart: 1 inside a frame, less at its border.
+def add_coverage(shape: tuple[int, int], to_frame: FloatArray, total: Image, steps: Image) -> None:
+    """Add the sum of splats of frames of ones whose pixels stay 1 px apart, 1 inside a frame and less at its border, to (H, W).
 
-    Args:
-        shape: (h, w) of a frame.
-        to_frame: (n, 3, 3), pixels of the grid to pixels of each frame.
-        total: (H, W) the grid.
-        steps: (H, W + 1), row-wise differences, whose cumulative sums are to be added to it in the end.
+    `to_frame` are (n, 3, 3) maps of the grid to frames. `steps` (H, W + 1) are row-wise differences, whose cumulative sums are
+    to be added in the end.
     """
     height, width = shape
     rows, columns = total.shape

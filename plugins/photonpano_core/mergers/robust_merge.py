@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, Group, Response, Source, Trajectory, VirtualExposure
-from photonpano.merging import PhotonSum, accumulate, chunks_of, divided
+from photonpano.merging import PhotonSum, accumulate, chunks_of
 from photonpano_core.configs import RobustMergeConfig
-from photonpano_core.photon_mle import exposure_of, exposure_shape, to_exposure, unwarped_sum
+from photonpano_core.mergers.dense_motion.frames import blurred
+from photonpano_core.mergers.photon_mle import exposure_of, exposure_shape, parts_of, to_exposure, unwarped_sum
 
 Image = NDArray[np.float32]
 
@@ -44,14 +44,11 @@ class RobustMerger:
             chunks = chunks_of(span, trajectory, source.info.frame_shape, self._config.tolerance_px)
             return accumulate(source, chunks, onto, shape)
 
-        start = group.span.start
-        parts = divided(len(group.span), self._config.blocks)
-        blocks = [FrameSpan(start + part.start, start + part.stop) for part in parts]
-        middle = next(block for block in blocks if group.reference < block.stop)
-        reference = summed(middle)
+        blocks, middle = parts_of(group, self._config.blocks)
+        reference = summed(blocks[middle])
         counts, weight = reference.counts.copy(), reference.weight.copy()
-        for block in blocks:
-            if block != middle:
+        for place, block in enumerate(blocks):
+            if place != middle:
                 photons = summed(block)
                 trust = trust_weights(photons, reference, source.response, self._config, scale)
                 counts += trust * photons.counts
@@ -60,27 +57,21 @@ class RobustMerger:
 
 
 def trust_weights(block: PhotonSum, reference: PhotonSum, response: Response, config: RobustMergeConfig, scale: float) -> Image:
-    """Return the weights of a block's pixels: (H, W), from 0 to 1.
+    """Return the weights of a block's pixels, (H, W) from 0 to 1, by its difference from the block at the reference instant.
 
-    Both blocks are smoothed with the same weights, and compared on the scale on which photon noise is uniform.
-
-    Args:
-        block: sum of some frames, on the grid of the exposure.
-        reference: sum of the frames around the reference instant.
-        response: the camera's response.
-        config: tolerances and smoothing, in px of a frame.
-        scale: pixels of the exposure per pixel of a frame.
+    Both are smoothed with the same weights, and compared on the scale on which photon noise is uniform. `scale` is in pixels of
+    the exposure per pixel of a frame.
     """
     blur_px = config.smoothing_px * scale
     # The weights for which the smoothed difference has the least variance; 0 where a block saw nothing.
     both = block.weight * reference.weight / np.maximum(block.weight + reference.weight, np.float32(1e-6))
-    smoothed = _blurred(both, blur_px)
+    smoothed = blurred(both, blur_px)
     seen = smoothed > _MIN_WEIGHT
     norm: Image = np.where(seen, smoothed, np.float32(1))
     # The square of a Gaussian is a narrower Gaussian. Noise is independent between pixels of frames, not of the exposure.
-    squares = _blurred(both, blur_px / math.sqrt(2)) / np.float32(4 * math.pi * config.smoothing_px**2)
+    squares = blurred(both, blur_px / math.sqrt(2)) / np.float32(4 * math.pi * config.smoothing_px**2)
     frames = np.maximum(norm**2 / np.maximum(squares, np.float32(1e-9)), np.float32(1))
-    means: list[Image] = [_blurred(both * _mean(each), blur_px) / norm for each in (block, reference)]
+    means: list[Image] = [blurred(both * _mean(each), blur_px) / norm for each in (block, reference)]
     first, second = (response.stabilised(response.flux(mean, frames), frames) for mean in means)
     variance = response.stabilised_std(frames) ** 2
     slope = np.hypot(*np.gradient(second)) * np.float32(config.tolerated_px * scale)
@@ -92,7 +83,3 @@ def trust_weights(block: PhotonSum, reference: PhotonSum, response: Response, co
 def _mean(photons: PhotonSum) -> Image:
     """Return the mean count per frame; 0 where nothing was seen."""
     return np.divide(photons.counts, photons.weight, out=np.zeros_like(photons.counts), where=photons.weight > 0)
-
-
-def _blurred(image: Image, blur_px: float) -> Image:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px, borderType=cv2.BORDER_CONSTANT), np.float32)

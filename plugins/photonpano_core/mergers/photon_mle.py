@@ -8,9 +8,9 @@ from threading import Lock
 
 import numpy as np
 
-from photonpano import Group, Homography, Source, Trajectory, VirtualExposure
+from photonpano import FrameSpan, Group, Homography, InputError, Source, Trajectory, VirtualExposure, capture_of
 from photonpano.geometry import inverse, rescaling
-from photonpano.merging import Chunk, CountsCache, PhotonSum, accumulate, chunks_of, clipped
+from photonpano.merging import Chunk, CountsCache, PhotonSum, accumulate, chunks_of, clipped, divided
 from photonpano_core.configs import PhotonMleConfig
 
 Decide = Callable[[str, float, str], None]
@@ -26,12 +26,7 @@ class PhotonMleMerger:
     """
 
     def __init__(self, config: PhotonMleConfig, decide: Decide | None = None) -> None:
-        """Prepare to merge.
-
-        Args:
-            config: the keys of the spec.
-            decide: called with the mean length of chunks along each motion, and the reason.
-        """
+        """Take the keys of the spec, and what records the mean length of chunks along each motion, with the reason."""
         self._config, self._decide = config, decide
         self._shared: _Shared | None = None
         self._lock = Lock()
@@ -76,6 +71,26 @@ class _Shared:
     trajectory: Trajectory
     chunks: tuple[Chunk, ...]
     counts: CountsCache
+
+
+def equal_spans(span: FrameSpan, n: int) -> list[FrameSpan]:
+    """Divide a span into `n` spans of nearly the same length; one at least."""
+    return [FrameSpan(span.start + part.start, span.start + part.stop) for part in divided(len(span), max(1, n))]
+
+
+def parts_of(group: Group, n: int) -> tuple[list[FrameSpan], int]:
+    """Divide a group into `n` spans, and return also the index of the one that contains the reference instant."""
+    spans = equal_spans(group.span, n)
+    return spans, next(place for place, span in enumerate(spans) if group.reference < span.stop)
+
+
+def require_plain(source: Source, merger: str, instead: str) -> None:
+    """Raise an `InputError` for a lens that distorts, or light that changes, and name what handles them."""
+    capture = capture_of(source)
+    if capture.camera is not None and capture.camera.distorts:
+        raise InputError(f"merge.use: {merger} does not warp through a lens that distorts; use {instead}")
+    if capture.light is not None:
+        raise InputError(f"merge.use: {merger} does not divide by light that changes; use {instead}")
 
 
 def exposure_shape(source: Source, scale: float) -> tuple[int, int]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, uniform_filter
 
-from photonpano import FloatArray, PanoramaView, Refined, Source, SpanResiduals, Trajectory
+from photonpano import BoolArray, FloatArray, PanoramaView, Refined, Source, SpanResiduals, Trajectory
 from photonpano.filtering import SIGNIFICANT, SLOW, SYSTEMATIC_PX, WINDOW, Filtered, exceeding_noise
-from photonpano.geometry import BLOCK_FRAMES, apply, corners, inverse, normalised, step_motions
+from photonpano.geometry import BLOCK_FRAMES, corners, inverse, normalised, step_motions, transform_points
 from photonpano_core.configs import ShortSpansConfig
-from photonpano_core.refiners.uneven_noise import separated
 
 _FEWEST_SPANS = 16  # fewest spans that have a spectrum
 # The light goes out, as between two flickers, if 5 % of the steps have 10 times the usual variance.
@@ -18,6 +17,9 @@ _DARK, _DARK_SHARE = 10.0, 0.05
 _SMOOTH_SPANS = 16.0  # standard deviation of the Gaussian that smooths a trajectory, in spans
 _NAMED_LINES = 3  # most frequencies named in a summary
 _NAMED_SHARE = 0.003  # a frequency is named if its peak has at least this fraction of the power
+_ROUNDS = 6  # steps of expectation maximisation; more change the motion by less than its noise
+_UNKNOWN = 1e6  # variance of an unknown value, relative to the median of the others
+_NEIGHBOURS = 3, 5  # windows and frequencies over which the power is averaged to test it
 
 
 class ShortSpansRefiner:
@@ -64,10 +66,7 @@ class ShortSpansRefiner:
         )
 
     def _corrected(self, trajectory: Trajectory, n_frames: int, corrections: CubicSpline, instants: FloatArray) -> FloatArray:
-        """Return the homographies of all frames, moved by a spline of (shift x, shift y, roll, zoom), (T, 3, 3).
-
-        Frames before the first instant, and after the last one, are moved as at these.
-        """
+        """Return the homographies of all frames, (T, 3, 3), moved by a spline of (shift x, shift y, roll, zoom)."""
         refined, from_reference = np.empty((n_frames, 3, 3)), np.empty(n_frames)
         for start in range(0, n_frames, BLOCK_FRAMES):
             frames = np.arange(start, min(start + BLOCK_FRAMES, n_frames))
@@ -115,15 +114,10 @@ def _goes_dark(variances: FloatArray) -> bool:
 
 
 def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> Filtered:
-    """Filter one mode where the light goes out.
+    """Filter one mode, (S,) steps in px, where the light goes out.
 
-    What the motion does in the dark follows from what it does before and after, and not from the steps, which vanish there once
-    the trajectory is right: so the wiggles of the trajectory are part of what is filtered.
-
-    Args:
-        steps: (S,) in px.
-        wiggles: (S,) what the trajectory does faster than a smooth one.
-        variances: (S,) of the photon noise of the steps.
+    The motion in the dark follows from that before and after, not from the steps, which vanish there once the trajectory is
+    right. So the high-frequency part of the trajectory, `wiggles`, is added before filtering, and subtracted after.
     """
     size = min(WINDOW, len(steps))
     noise = variances + SYSTEMATIC_PX**2
@@ -132,10 +126,10 @@ def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatAr
 
 
 def _wiggles(trajectory: Trajectory, instants: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
-    """Return by which steps a trajectory differs from a smooth one: (S, 4), shift in px, roll in radians, and zoom."""
+    """Return the high-frequency part of a trajectory as steps: (S, 4), shift in px, roll in radians, and zoom."""
     homographies = trajectory.at(instants)
     middle = corners(frame_shape).mean(axis=0)
-    points = apply(homographies, middle + np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0]]))
+    points = transform_points(homographies, middle + np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0]]))
     place, along = points[:, 0], points[:, 2] - points[:, 1]
     angle, size = np.unwrap(np.arctan2(along[:, 1], along[:, 0])), np.hypot(*along.T)
     parameters = np.column_stack([place, angle, np.log(size)])
@@ -147,3 +141,62 @@ def _wiggles(trajectory: Trajectory, instants: FloatArray, frame_shape: tuple[in
     x, y = wiggles[:, 0].copy(), wiggles[:, 1].copy()
     wiggles[:, 0], wiggles[:, 1] = cosine * x + sine * y, cosine * y - sine * x
     return wiggles
+
+
+def separated(values: FloatArray, variances: FloatArray, size: int, significant: float, slow: tuple[int, float]) -> Filtered:
+    """Estimate a motion (S,) whose spectrum is not known, in windows of `size` that overlap by half.
+
+    In each window the motion is a Gaussian process. Its power at the frequencies that stand out from the noise by the factor
+    `significant` is estimated by expectation and maximisation (Dempster et al. 1977), and the motion as its expectation (Wiener
+    1949), also where nothing was measured and the variance is infinite. `slow` is the number of the lowest frequencies that
+    must also exceed a constant of a size, and this size.
+    """
+    n = len(values)
+    known = np.isfinite(variances)
+    noise = np.where(known, variances, _UNKNOWN * float(np.median(variances[known])))
+    measured = np.where(known, values, 0.0)
+    starts = sorted({*range(0, n - size + 1, max(1, size // 2)), n - size})
+    windows = [slice(start, start + size) for start in starts]
+    standing = _standing_out([(measured[each], noise[each]) for each in windows], significant, slow)
+    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    signal, variance, total = np.zeros(n), np.zeros(n), np.zeros(n)
+    for window, allowed in zip(windows, standing, strict=True):
+        mean, spread = _expected(measured[window], noise[window], allowed)
+        signal[window] += taper * mean
+        variance[window] += taper * spread
+        total[window] += taper
+    return Filtered(signal / total, np.sqrt(np.maximum(variance / total, 0)))
+
+
+def _standing_out(windows: list[tuple[FloatArray, FloatArray]], significant: float, slow: tuple[int, float]) -> BoolArray:
+    """Return the frequencies of each window whose power exceeds that of the noise: (W, size + 1)."""
+    lowest, floor = slow
+    excess = []
+    for values, noise in windows:
+        precision = float((1 / noise).sum())
+        power = np.abs(np.fft.rfft(values / noise, 2 * len(values))) ** 2 / precision
+        power[: 2 * lowest] /= 1 + floor**2 * precision
+        excess.append(power)
+    return np.asarray(uniform_filter(np.array(excess), _NEIGHBOURS, mode="nearest") > significant)
+
+
+def _expected(values: FloatArray, noise: FloatArray, allowed: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the expected motion in a window, half of a period of the process, and its variance: (size,) each."""
+    size, period = len(values), 2 * len(values)
+    if not allowed.any():
+        return np.zeros(size), np.zeros(size)
+    lag = np.arange(size)[:, None] - np.arange(size)
+    weight = 1 / noise
+    power = np.full(len(allowed), max(float((weight * (values**2 - noise)).sum() / weight.sum()), 1e-12))
+    power[~allowed] = 0
+    for round_ in range(_ROUNDS + 1):
+        covariance = np.fft.irfft(power, period)[np.abs(lag)]
+        inverted = np.linalg.inv(covariance + np.diag(noise))
+        if round_ == _ROUNDS:
+            break
+        amplitude = np.abs(np.fft.rfft(inverted @ values, period)) ** 2
+        # The sums along the diagonals of the inverse have the spectrum of the information about each frequency.
+        sums = np.bincount((lag % period).ravel(), inverted.ravel(), period)
+        power = np.maximum(power + power**2 * (amplitude - np.fft.rfft(sums).real) / period, 0)
+    mean = covariance @ (inverted @ values)
+    return mean, covariance[0, 0] - np.einsum("ij,jk,ki->i", covariance, inverted, covariance, optimize=True)

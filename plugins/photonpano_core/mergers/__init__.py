@@ -1,0 +1,1 @@
+"""Mergers: the flux of a group of frames along its motion."""

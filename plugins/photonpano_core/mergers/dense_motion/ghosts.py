@@ -1,0 +1,148 @@
+"""Find pixels whose photons contradict the global motion, and weight sub-exposures along the motion that explains most."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from photonpano import BoolArray
+from photonpano.merging import PhotonSum
+from photonpano_core.mergers.dense_motion.field import Image, MotionField
+from photonpano_core.mergers.dense_motion.frames import blurred
+from photonpano_core.mergers.dense_motion.sub_exposures import SCALE, SubExposures, noise_area_px2
+
+_DETAIL_PX = 1.2  # blur of sub-exposures before they are compared: the finest detail that is seen, in px of a frame
+_WINDOW_PX = 2.0  # standard deviation of the window over which differences are summed up, in px of a frame
+_SMALLEST_PX = 16  # fewer connected pixels, of a frame, are a false alarm: less than the window
+_WEAKER = 0.6  # hysteresis: fraction of the threshold above which pixels connected with a moving one move, too
+# Radius of the disc by which gaps are closed, in px of a frame: where texture is missing, nothing shows that it moves.
+_GAP_PX = 6
+_FEWEST = 0.5  # fewest degrees of freedom, on average over the window, of a pixel that is tested
+# The same two for differences from the reference, by which sub-exposures are weighted.
+_WEIGHTED_DETAIL_PX, _WEIGHTED_WINDOW_PX = 0.9, 1.2
+_TOLERATED = 1.5  # squared difference, in units of the photon noise, that costs no weight
+_EXPLAINED = 0.8  # fraction of the frames that must agree, or other motions are tried
+_MOVES_PX = 1.0  # minimum motion within a group that is propagated to neighbours, in px of a frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GhostMap:
+    """Where photons of a group contradict the global motion, on the grid of the exposure at the reference instant."""
+
+    # (H, W), at least 0: by how many standard deviations of photon noise the sub-exposures differ from each other; 0 where
+    # fewer than two saw a pixel
+    significance: Image
+    # (H, W), where it exceeds the threshold, over an area of some pixels, with connected pixels of slightly less significance,
+    # and gaps between these
+    moving: BoolArray
+
+
+def compared(parts: SubExposures, n: int, threshold: float, tolerated_px: float) -> GhostMap:
+    """Compare sub-exposures that are merged along the global motion, joined to `n` longer ones for more light.
+
+    Of K sub-exposures of a still scene, the squared differences from their mean, in units of the photon noise, add up to
+    chi-squared with K - 1 degrees of freedom, here averaged over a window. The cube root of the average is nearly normal
+    (Wilson and Hilferty 1931), from which the significance follows. A pixel moves from the `threshold` of significance on; an
+    error of the global motion by `tolerated_px` of a frame is not significant.
+    """
+    response = parts.response
+    images = [parts.smoothed(each, _DETAIL_PX) for each in parts.joined(parts.sums, n).sums]
+    seen = np.maximum(sum(each.frames for each in images), np.float32(1))
+    mean = np.asarray(sum(each.frames * each.values for each in images) / seen, np.float32)
+    tolerated = (np.float32(tolerated_px * SCALE) * np.hypot(*np.gradient(mean))) ** 2
+    energy, freedom = np.zeros_like(mean), np.full_like(mean, -1)
+    for each in images:
+        variance = response.stabilised_std(np.maximum(each.frames, 1)) ** 2
+        energy += np.where(each.frames > 0, ((each.values - mean) ** 2 - tolerated) / variance, np.float32(0))
+        freedom += each.frames > 0
+    freedom = np.maximum(blurred(np.maximum(freedom, 0), _WINDOW_PX * SCALE), np.float32(1e-6))
+    ratio = np.maximum(blurred(energy, _WINDOW_PX * SCALE) / freedom, 0)
+    # Squares of neighbouring pixels are correlated, since their blurs overlap.
+    detail = noise_area_px2(_DETAIL_PX, SCALE, parts.spread) / (4 * math.pi)
+    correlated = detail / (2 * _WINDOW_PX**2 + detail)
+    spread = np.float32(2 / 9 * correlated) / freedom
+    significance = np.maximum((np.cbrt(ratio) - (1 - spread)) / np.sqrt(spread), 0)
+    significance = np.where(freedom > _FEWEST, significance, np.float32(0)).astype(np.float32)
+    return GhostMap(significance, _moving(significance, threshold))
+
+
+def _moving(significance: Image, threshold: float) -> BoolArray:
+    """Return the pixels that move: see `GhostMap`."""
+    likely = (significance > _WEAKER * threshold).astype(np.uint8)
+    _, labels, _, _ = cv2.connectedComponentsWithStats(likely, connectivity=8)
+    certain = _without_specks(significance > threshold, _SMALLEST_PX * SCALE**2)
+    found = np.isin(labels, np.unique(labels[certain])) & (likely > 0)
+    gap = round(_GAP_PX * SCALE)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * gap + 1, 2 * gap + 1))
+    # Gaps at the border of the image are closed as well.
+    padded = cv2.copyMakeBorder(found.astype(np.uint8), gap, gap, gap, gap, cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[gap:-gap, gap:-gap] > 0)
+
+
+def _without_specks(found: BoolArray, smallest: float) -> BoolArray:
+    """Drop connected pixels that are fewer than `smallest`."""
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
+    large = statistics[:, cv2.CC_STAT_AREA] >= smallest
+    large[0] = False
+    return np.asarray(large[labels])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weighted:
+    """Motion of each pixel, and weights of the sub-exposures along it."""
+
+    field: MotionField
+    trusts: Image  # (K, H, W), weights from 0 to 1
+    explained: Image  # (H, W), share of the frames of a pixel that remain
+
+    def improved(self, other: Weighted, where: BoolArray) -> Weighted:
+        """Return, within `where`, the motion and weights of the one that explains more frames of a pixel."""
+        better = where & (other.explained > self.explained)
+        return Weighted(
+            MotionField(np.where(better[..., None], other.field.coefficients, self.field.coefficients)),
+            np.where(better, other.trusts, self.trusts),
+            np.where(better, other.explained, self.explained),
+        )
+
+
+def weighted(parts: SubExposures, field: MotionField, where: BoolArray) -> Weighted:
+    """Find, for each of some pixels (H, W), the motion beyond the global one that explains most of its frames.
+
+    A field is smooth, but the motion jumps at the border of an object. Where the field explains too few frames, a pixel may
+    move as its nearest neighbour that moves and is explained, or not at all beyond the global motion.
+    """
+    sums = parts.along(field, where)
+    best = _weighted(parts, field, sums)
+    poor = where & (best.explained < _EXPLAINED)
+    if not poor.any():
+        return best
+    movers = where & ~poor & (field.way_px > _MOVES_PX * SCALE)
+    if movers.any():
+        nearest = field.filled(movers)
+        best = best.improved(_weighted(parts, nearest, parts.along(nearest, poor, sums)), poor)
+    still = MotionField(np.zeros_like(field.coefficients))
+    return best.improved(_weighted(parts, still, parts.sums), poor)
+
+
+def _weighted(parts: SubExposures, field: MotionField, sums: Sequence[PhotonSum]) -> Weighted:
+    """Weight sub-exposures where they differ from the reference by more than photon noise.
+
+    D^2 is the squared difference in units of its variance, averaged over a window. If it exceeds the tolerance by e, the weight
+    is `1 / (1 + e)`, the gain of a Wiener filter; it is 1 where either is unseen.
+    """
+    fixed = parts.smoothed(sums[parts.reference], _WEIGHTED_DETAIL_PX)
+    trusts = np.ones((len(sums), *parts.shape), np.float32)
+    weight, frames = sums[parts.reference].weight.copy(), sums[parts.reference].weight.copy()
+    for place, each in enumerate(sums):
+        if place == parts.reference:
+            continue
+        image = parts.smoothed(each, _WEIGHTED_DETAIL_PX)
+        error = blurred(image.squared_difference(fixed, parts.response), _WEIGHTED_WINDOW_PX * SCALE)
+        trusts[place] = 1 / (1 + np.maximum(error - np.float32(_TOLERATED), 0))
+        weight += trusts[place] * each.weight
+        frames += each.weight
+    return Weighted(field, trusts, np.asarray(weight / np.maximum(frames, np.float32(1e-3)), np.float32))

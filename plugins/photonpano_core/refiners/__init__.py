@@ -1,1 +1,0 @@
-"""Refiners: a trajectory made finer after the loop."""
