@@ -1,6 +1,6 @@
 """Measure runs that follow a capture: delay, rate and memory; the tables of docs/how-to/as-it-arrives.md.
 
-    python tests/benchmarks/following.py docs/how-to/as-it-arrives.md [--frames 60000] [--long 1000000]
+    python tests/benchmarks/following.py docs/how-to/as-it-arrives.md [--frames 60000] [--long 1000000] [--rates 1000 3000]
 
 A writer, a process of its own, passes frames through a pipe at a rate. It reads a simulated capture to and fro. Each run is
 ended when all frames have arrived, but one, which is compared with a run of the same frames without `--follow`. Simulating
@@ -9,7 +9,6 @@ takes a minute, and the spools 1.6 GB for each 100,000 frames of 254 x 496 px, o
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -17,14 +16,14 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pages import write_tables
+from harness import Study, command, passing, require_places, simulator, table, write_tables
 
 PROGRAM = [sys.executable, "-m", "photonpano"]
 SIMULATED = 10_000
@@ -52,21 +51,17 @@ class Measured:
     cpu_s: float
 
 
-def simulate(folder: Path, shape: tuple[int, int]) -> Path:
+def simulated(study: Study, shape: tuple[int, int]) -> Path:
     """Write a capture of a trembling hand."""
-    cube = folder / f"{shape[0]}.npy"
     shake = {"rms_px": 2.0, "frequencies_hz": [25, 120, 400]}
-    simulator = {
-        "scene": {"kind": "street", "width": 2048, "height": 1365},
-        "path": {"kind": "random-spline", "length_px": 200, "shake": shake},
-        "flux": 0.3,
-        "n_frames": SIMULATED,
-        "frame_shape": list(shape),
-    }
-    spec = folder / "simulate.yaml"
-    spec.write_text(json.dumps({"version": 1, "source": {"use": "simulator", "with": simulator}}))
-    subprocess.run([*PROGRAM, "simulate", str(spec), "--output", str(cube)], check=True, stdout=subprocess.DEVNULL)
-    return cube
+    capture = simulator(
+        scene={"kind": "street", "width": 2048, "height": 1365},
+        path={"kind": "random-spline", "length_px": 200, "shake": shake},
+        flux=0.3,
+        n_frames=SIMULATED,
+        frame_shape=list(shape),
+    )
+    return study.capture("hand", capture)
 
 
 def write(cube: Path, rate: float, n_frames: int) -> None:
@@ -142,14 +137,17 @@ def cpu_seconds(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def row(shape: str, rate: float, measured: Measured) -> str:
+def row(shape: str, rate: float, measured: Measured) -> Sequence[str]:
     """Return a row of the table of delays."""
     figures = measured.figures
-    asked = f"{rate:,.0f}" if rate else "as many as come"
     return (
-        f"| {shape} | {asked} | {figures['frames']:,} | {figures['located']:,} | {figures['delay_mean_s']:.2f} s | "
-        f"{figures['delay_95_s']:.2f} s | {figures['delay_longest_s']:.2f} s | {figures['behind_s']:.1f} s | "
-        f"{1e3 * measured.cpu_s / figures['frames'] * 1e3:,.0f} ms |"
+        shape,
+        f"{rate:,.0f}" if rate else "as many as come",
+        f"{figures['frames']:,}",
+        f"{figures['located']:,}",
+        *(f"{figures[key]:.2f} s" for key in ("delay_mean_s", "delay_95_s", "delay_longest_s")),
+        f"{figures['behind_s']:.1f} s",
+        f"{1e3 * measured.cpu_s / figures['frames'] * 1e3:,.0f} ms",
     )
 
 
@@ -171,37 +169,37 @@ def compared(folder: Path, cube: Path, n_frames: int) -> str:
     )
 
 
-def main() -> None:
+DELAYS = (
+    "Frames of", "a second", "arrived", "located", "mean delay", "95 %", "greatest", "behind at the end", "CPU time of 1,000",
+)  # fmt: skip
+
+
+def memory_of(study: Study, n_frames: int) -> Iterator[Sequence[str]]:
+    """Yield the rows of the table of memory: after a hundredth, a tenth, a half and all of a long capture of small frames."""
+    measured = follow(study.folder, simulated(study, (64, 96)), 6000, n_frames)
+    print(*row("64x96", 6000, measured), sep=", ")
+    for share in (0.01, 0.1, 0.5, 1):
+        frames, memory_mib = measured.memory[np.abs(measured.memory[:, 0] - share * n_frames).argmin()]
+        yield f"{frames:,.0f}", f"{memory_mib:.0f} MiB"
+
+
+def main(
+    page: Path | None, frames: int = 60_000, long: int = 1_000_000, rates: Sequence[float] = (1000.0, 3000.0, 5000.0, 0.0)
+) -> None:
     """Measure, and write the tables into a page."""
-    if sys.argv[1:2] == ["--write"]:
-        write(Path(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4]))
-        return
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", type=Path)
-    parser.add_argument("--frames", type=int, default=60_000)
-    parser.add_argument("--long", type=int, default=1_000_000)
-    given = parser.parse_args()
-    lines = [
-        "| Frames of | a second | arrived | located | mean delay | 95 % | greatest | behind at the end | CPU time of 1,000 |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        large = simulate(folder, (254, 496))
-        for rate in (1000, 3000, 5000, 0):
-            lines.append(row("254x496", rate, follow(folder, large, rate, given.frames)))
-            print(lines[-1], flush=True)
-        lines += ["", compared(folder, large, SIMULATED)]
+    require_places(page, ["delays"])
+    with passing() as study:
+        large = simulated(study, (254, 496))
+        lines = table(DELAYS, (row("254x496", rate, follow(study.folder, large, rate, frames)) for rate in rates))
+        lines += ["", compared(study.folder, large, SIMULATED)]
         print(lines[-1], flush=True)
-        if given.long:
-            small = simulate(folder, (64, 96))
-            measured = follow(folder, small, 6000, given.long)
-            at = [np.abs(measured.memory[:, 0] - share * given.long).argmin() for share in (0.01, 0.1, 0.5, 1)]
-            lines += ["", "| Frames of 64x96 so far | memory of the process |", "| --- | --- |"]
-            lines += [f"| {measured.memory[index, 0]:,.0f} | {measured.memory[index, 1]:.0f} MiB |" for index in at]
-            print("\n".join(lines[-4:]), row("64x96", 6000, measured), flush=True)
-    write_tables(given.page, {"delays": lines})
+        if long:
+            lines += ["", *table(("Frames of 64x96 so far", "memory of the process"), memory_of(study, long))]
+    write_tables(page, {"delays": lines})
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["--write"]:
+        write(Path(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4]))
+    else:
+        command(main)

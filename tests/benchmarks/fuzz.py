@@ -10,22 +10,21 @@ refused, and failures, which are listed with their numbers: `--first 123` begins
 
 from __future__ import annotations
 
-import argparse
 import os
 import random
 import resource
 import select
 import subprocess
 import sys
-import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from fuzz_files import FIXED, KINDS, read, whole
+from harness import command, passing, table
 
 from photonpano import PhotonpanoError
 
@@ -41,6 +40,9 @@ LOOKING = (
     *(f"photonpano_sensors.{module}" for module in ("mat_parts", "ubicept", "intensity.pictures", "intensity.video_index")),
 )
 """Modules that have it look."""
+
+
+OUTCOMES = ("read", "refused", "looked", "failed")
 
 
 def damaged(content: bytes, rng: random.Random) -> bytes:
@@ -78,8 +80,8 @@ def cases(name: str, seed: int, looks: bool) -> Iterator[tuple[int, Callable[[],
         for name_of_module in LOOKING:
             __import__(name_of_module)
             sys.modules[name_of_module].look_first = lambda *_: None
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
+    with passing() as study:
+        folder = study.folder
         path = whole(name, folder)
         fixed = {folder / each for each in FIXED.get(name, ())}
         contents = {file: file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file() and file not in fixed}
@@ -130,7 +132,7 @@ class Worker:
 
     def __init__(self, name: str, seed: int, first: int, *, looks: bool = False, only: bool = False) -> None:
         flags = [flag for flag, is_on in (("--looks", looks), ("--only-one", only)) if is_on]
-        command = [sys.executable, __file__, "--work", name, "--seed", str(seed), "--first", str(first), *flags]
+        command = [sys.executable, __file__, "--work-on", name, "--seed", str(seed), "--first", str(first), *flags]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         self._lines: list[str] = []
         self._rest = b""
@@ -179,11 +181,11 @@ def again_with_look(name: str, seed: int, number: int) -> tuple[str, str]:
     return ("looked" if word == "refused" else word), text
 
 
-def fuzz(name: str, seed: int, seconds: float) -> tuple[Counter[str], dict[str, list[int]]]:
+def fuzz(name: str, seed: int, seconds: float, first: int = 0) -> tuple[Counter[str], dict[str, list[int]]]:
     """Damage files of a kind for some time; return counts, and the numbers of failures by their messages."""
     counts: Counter[str] = Counter()
     failures: dict[str, list[int]] = {}
-    first, end = 0, float("inf")
+    end = float("inf")
     worker = Worker(name, seed, first)
     try:
         while time.monotonic() < end:
@@ -206,34 +208,35 @@ def fuzz(name: str, seed: int, seconds: float) -> tuple[Counter[str], dict[str, 
     return counts, failures
 
 
-def main() -> None:
-    """Fuzz the kinds, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--kinds", nargs="*", default=KINDS, choices=KINDS)
-    parser.add_argument("--seconds", type=float, default=60, help="seconds for each kind")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--work", help=argparse.SUPPRESS)
-    parser.add_argument("--first", type=int, default=0, help="number of the first case")
-    parser.add_argument("--looks", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--only-one", action="store_true", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.work:
-        work(options.work, options.seed, options.first, options.only_one, options.looks)
-        return
-    print("| kind | read | refused | by the first look | failures |\n| --- | --- | --- | --- | --- |", flush=True)
+def rows(kinds: Sequence[str], seed: int, seconds: float, first: int) -> Iterator[Sequence[object]]:
+    """Fuzz the kinds: yield the rows of the table, and list the failures."""
     total: Counter[str] = Counter()
-    for name in options.kinds:
-        counts, failures = fuzz(name, options.seed, options.seconds)
+    for name in kinds:
+        counts, failures = fuzz(name, seed, seconds, first)
         total += counts
-        _print_row(name, counts)
+        yield name, *(counts[word] for word in OUTCOMES)
         for message, numbers in failures.items():
             print(f"  {len(numbers)} of {name}, such as {numbers[:5]}: {message}", file=sys.stderr, flush=True)
-    _print_row("all", total)
+    yield "all", *(total[word] for word in OUTCOMES)
 
 
-def _print_row(name: str, counts: Counter[str]) -> None:
-    print("|", " | ".join([name, *(str(counts[word]) for word in ("read", "refused", "looked", "failed"))]), "|", flush=True)
+def main(
+    kinds: Sequence[str] = tuple(KINDS),
+    seconds: float = 60.0,
+    seed: int = 0,
+    first: int = 0,
+    work_on: str = "",
+    looks: bool = False,
+    only_one: bool = False,
+) -> None:
+    """Fuzz the kinds, and print a table; or be a worker."""
+    if wrong := {*kinds, work_on or KINDS[0]} - {*KINDS}:
+        raise SystemExit(f"no kind is called {', '.join(wrong)}; there are {', '.join(KINDS)}")
+    if work_on:
+        work(work_on, seed, first, only_one, looks)
+    else:
+        table(("kind", "read", "refused", "by the first look", "failures"), rows(kinds, seed, seconds, first))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

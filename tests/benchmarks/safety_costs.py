@@ -7,11 +7,8 @@ The exit code is 1 if it is more than 3 %.
 
 from __future__ import annotations
 
-import argparse
 import os
 import pkgutil
-import sys
-import tempfile
 import threading
 import time
 from collections import Counter
@@ -22,6 +19,7 @@ from typing import Any
 from unittest import mock
 
 from crashes import preload, prepare, warm_up
+from harness import command, passing
 
 COSTS = {
     "fingerprint of the capture": ("photonpano.pipeline.run_steps.fingerprint",),
@@ -114,18 +112,14 @@ def cost(folder: Path, spec: Path) -> bool:
     return share < 0.03
 
 
-def main() -> int:
+def main(spec: Path) -> bool:
     """Measure the run of a spec."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("spec", type=Path)
-    spec = parser.parse_args().spec
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
+    with passing() as study:
         preload()
-        prepare(folder)
-        warm_up(folder)
-        return 0 if cost(folder, spec) else 1
+        prepare(study.folder)
+        warm_up(study.folder)
+        return not cost(study.folder, spec)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command(main)
