@@ -20,20 +20,13 @@ from typing import IO
 import numpy as np
 
 sys.path += [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parents[1] / "tests" / "benchmarks")]
-from harness import IMAGES, groups, simulator
+from harness import IMAGES, groups, hand_held, simulator
 
 from browser import Page, browser
 from photonpano import batch, parse_spec, simulate
 
 RATE_HZ, SHAPE, SHOWN_S = 800, (254, 496), 8
 """The camera, and when the page of the run is drawn, in seconds after the first frame."""
-LIVE = simulator(
-    scene={"kind": "street", "width": 2048, "height": 1365},
-    path={"kind": "random-spline", "length_px": 200, "shake": {"rms_px": 2.0, "frequencies_hz": [25, 120, 400]}},
-    flux=0.3,
-    n_frames=10_000,
-    frame_shape=SHAPE,
-)
 NAMES, CUT = ("bridge", "castle", "harbour", "market", "mill", "station", "tower"), "mill"
 WIDTH, PHONE = 1100, 400
 
@@ -41,7 +34,7 @@ WIDTH, PHONE = 1100, 400
 def live(page: Page, folder: Path) -> None:
     """Simulate a capture, follow it while it is written, and draw the page."""
     cube, spec, out = folder / "capture.npy", folder / "spec.yaml", folder / "hand-held.live"
-    simulate(parse_spec(LIVE), cube)
+    simulate(parse_spec(hand_held(SHAPE)), cube)
     pipe = {"path": "-", "height": SHAPE[0], "width": SHAPE[1], "frame_rate_hz": RATE_HZ}
     spec.write_text(json.dumps({"version": 1, "source": {"use": "packed-raw", "with": pipe}, "resample": groups(250)}))
     command = [sys.executable, "-m", "photonpano", "run", str(spec), "--follow", "--output", str(out.with_suffix(""))]

@@ -10,7 +10,7 @@ import av
 import cv2
 import numpy as np
 import picture_parts as draw
-from harness import Compared, Study, packed, simulator
+from harness import RATE_HZ, Compared, Study, packed, simulator
 from paper.figures.light import fine_images, fine_pictures
 from paper.figures.others import draw_found, true_centres
 
@@ -31,15 +31,6 @@ GROUP_SIZE, FIRST = 30, 300
 ESTIMATORS = {"colmap-averages": "tab:orange", "stratified-pose": "tab:blue"}
 """Pose estimators, with the colours of their lines."""
 MAGNIFIED = 1.7
-FINE = simulator(
-    scene={"kind": "street", "width": 2400, "height": 1600},
-    scene_scale=2,
-    path={"kind": "loop", "length_px": 160, "centre": [900, 1000], "shake": {"rms_px": 0.6, "roll_rms_deg": 0.02}},
-    flux=0.2,
-    n_frames=6000,
-    frame_shape=[128, 160],
-)
-"""A camera whose pixels average a scene that is twice as fine."""
 HIGH_SPEED = simulator(
     "camera-simulator",
     path={"kind": "pan", "length_px": 900, "angle_deg": 4, "shake": {"rms_px": 3.0, "frequencies_hz": [3, 5, 8]}},
@@ -138,7 +129,7 @@ def paths(runs: dict[str, Path], cube: Path, width: int) -> draw.Picture:
 
 def super_resolution(study: Study) -> Iterator[tuple[str, draw.Picture]]:
     """Yield a part of a panorama: interpolated, merged on a fine grid, by super-resolution, and the true scene."""
-    cube = study.capture("fine", FINE)
+    cube = study.capture("fine", study.spec("paper/fig7", {"source.with.frame_rate_hz": RATE_HZ}))
     spec = packed(cube, render={"use": "super-resolution", "scale": 2.0})
     of = fine_images(Compared.of(finished(study, "super-resolution", spec, cube), cube))
     named = {"scale 1, interpolated": of["interpolated"], "merge": of["merged"], "super-resolution": of["fine"]}

@@ -13,10 +13,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import matplotlib.pyplot as plt
 import numpy as np
-from harness import IMAGES, Study, command, packed, passing, require_places, scores_of, simulator, table, write_tables
+from harness import IMAGES, Study, command, packed, passing, require_places, scores_of, seen, simulator, table, write_tables
 
 from photonpano import PhotonpanoError
 from photonpano.captures.writing import truth_path
@@ -56,8 +55,7 @@ def bound_px(cube: Path) -> float:
     """Return the mean, over the capture, of the Cramer-Rao bound of an exposure of a known scene."""
     truth = load_truth(truth_path(cube))
     assert truth.scene is not None
-    size, flags = truth.frame_shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    views = (cv2.warpPerspective(truth.scene, to_scene, size, flags=flags) for to_scene in truth.homographies[::200])
+    views = (seen(truth.scene, to_scene, truth.frame_shape) for to_scene in truth.homographies[::200])
     return float(np.mean([exposure_bound_px(view, BinaryResponse(), GROUP_SIZE) for view in views]))
 
 

@@ -40,6 +40,7 @@ from harness import (
     record_of,
     rendered,
     scores_of,
+    seen,
     simulator,
     table,
     to_reference,
@@ -118,15 +119,15 @@ def measured(photograph: Path, filters: str, seed: int, camera: Camera, study: S
 
 def demosaicked(frames: np.ndarray, places: np.ndarray, motion: FrameTrajectory, canvas: Canvas) -> np.ndarray:
     """Demosaick groups whose image moves by less than a pixel, and average them along a motion: (H, W, 3) flux."""
-    total, seen, shape = np.zeros((*canvas.shape, 3)), np.zeros(canvas.shape), places.shape
+    total, covering, shape = np.zeros((*canvas.shape, 3)), np.zeros(canvas.shape), places.shape
     for group in chunks_of(FrameSpan(0, len(frames)), motion, shape, GROUP_PX):
         mean = frames[group.span.start : group.span.stop].mean(axis=0, dtype=np.float32)
         colours = edge_aware(mean) if places.max() < 3 else interpolated(mean, places)
         onto = canvas.transform @ group.homography
         size = canvas.width, canvas.height
         total += len(group.span) * cv2.warpPerspective(colours, onto, size, flags=cv2.INTER_LINEAR)
-        seen += len(group.span) * cv2.warpPerspective(np.ones(shape, np.float32), onto, size, flags=cv2.INTER_LINEAR)
-    mean = np.divide(total, seen[..., None], out=np.full(total.shape, np.nan), where=seen[..., None] > 1)
+        covering += len(group.span) * cv2.warpPerspective(np.ones(shape, np.float32), onto, size, flags=cv2.INTER_LINEAR)
+    mean = np.divide(total, covering[..., None], out=np.full(total.shape, np.nan), where=covering[..., None] > 1)
     return BinaryResponse().flux(mean.astype(np.float32), len(frames))
 
 
@@ -158,8 +159,10 @@ def three_sensors(
         encoded = 65535 * linear_to_srgb(scene / scene.max())
         cv2.imwrite(str(folder / f"{name}.png"), np.rint(encoded).astype(np.uint16))
         keys = camera | {"seed": camera["seed"] + 1000 + place, "path": {"kind": "file", "file": str(folder / "path.npy")}}
-        seen = simulator(scene={"kind": "photo", "file": str(folder / f"{name}.png")}, flux=share * float(scene.mean()), **keys)
-        with open_source(parse_spec(seen | {"corrections": []})) as source:
+        capture = simulator(
+            scene={"kind": "photo", "file": str(folder / f"{name}.png")}, flux=share * float(scene.mean()), **keys
+        )
+        with open_source(parse_spec(capture | {"corrections": []})) as source:
             images.append(rendered(source, FrameTrajectory(motion), canvas).flux / share)
     return np.stack(images, axis=-1)
 
@@ -168,9 +171,8 @@ def chances_of(scene: np.ndarray, motion: np.ndarray, places: np.ndarray) -> lis
     """Return the probability that each pixel is lit behind the array, and on each of three sensors: (T, H, W) each."""
     chances = [np.empty((len(motion), *places.shape), np.float32) for _ in range(4)]
     for index, homography in enumerate(motion):
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        seen = cv2.warpPerspective(scene, homography, places.shape[::-1], flags=flags)
-        lights = [np.take_along_axis(seen, places[..., None].astype(int), axis=-1)[..., 0], *np.moveaxis(SHARE * seen, -1, 0)]
+        view = seen(scene, homography, places.shape)
+        lights = [np.take_along_axis(view, places[..., None].astype(int), axis=-1)[..., 0], *np.moveaxis(SHARE * view, -1, 0)]
         for chance, light in zip(chances, lights, strict=True):
             chance[index] = -np.expm1(-light)
     return chances

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import multiprocessing
 import os
 import random
 import resource
@@ -30,12 +29,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import numpy as np
-from harness import command, passing, simulator
+from harness import command, in_child, passing, simulator
 
 SPEC = """version: 1
 source: {{use: packed-npy, with: {{path: cube.npy, frame_rate_hz: 96800}}}}
@@ -62,44 +62,34 @@ class Run:
 
     def __init__(self, folder: Path, *options: str, dies: Callable[[], object] = lambda: None) -> None:
         self._printed = tempfile.TemporaryFile("w+")  # noqa: SIM115  # closed with the object
-        self._pid = os.fork()
-        self.code: int | None = None
-        if not self._pid:
-            self._work(folder, options, dies)
+        self._process = get_context("fork").Process(target=self._work, args=(folder, options, dies))
+        self._process.start()
 
     def _work(self, folder: Path, options: tuple[str, ...], dies: Callable[[], object]) -> None:
+        from photonpano.cli import main
+
         os.chdir(folder)
         for stream in (1, 2):
             os.dup2(self._printed.fileno(), stream)
         sys.argv = ["photonpano", "run", "scan.yaml", *options]
-        code = 1
-        try:
-            from photonpano.cli import main
-
-            dies()
-            main()
-        except SystemExit as ended:
-            code = ended.code if isinstance(ended.code, int) else 1
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
+        dies()
+        main()
 
     def kill_after(self, seconds: float) -> None:
         """Kill the process after a time, unless it ends before."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            if os.waitid(os.P_PID, self._pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
-                return
-            time.sleep(0.002)
-        os.kill(self._pid, signal.SIGKILL)
+        self._process.join(seconds)
+        self._process.kill()
 
     def wait(self) -> str:
-        """Wait for the end, and return what was printed; `code` is the exit code then."""
-        _, status = os.waitpid(self._pid, 0)
-        self.code = os.waitstatus_to_exitcode(status)
+        """Wait for the end, and return what was printed."""
+        self._process.join()
         self._printed.seek(0)
         return self._printed.read()
+
+    @property
+    def code(self) -> int | None:
+        """The exit code of the process, negative of a signal."""
+        return self._process.exitcode
 
 
 def dying_at_change(number: int) -> None:
@@ -352,9 +342,7 @@ def main(trial: Path, number: int = 20, seed: int = 0, at_once: int = 2, writing
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
     with passing() as study:
         preload()
-        simulation = multiprocessing.get_context("spawn").Process(target=prepare, args=(study.folder,))
-        simulation.start()  # in a process of its own: a forked process keeps the locks of threads that it has not got
-        simulation.join()
+        in_child(prepare, study.folder)  # a forked process keeps the locks of threads that it has not got
         warm_up(study.folder)
         more = {"races": {"at_once": at_once}, "resumes": {"writing": writing}}.get(str(trial), {})
         if "writing" in more:

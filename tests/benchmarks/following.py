@@ -10,7 +10,6 @@ takes a minute, and the spools 1.6 GB for each 100,000 frames of 254 x 496 px, o
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import signal
@@ -18,15 +17,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from harness import Study, command, passing, require_places, simulator, table, write_tables
+import psutil
+from harness import HELD_FRAMES, Study, command, groups, hand_held, passing, require_places, table, write_tables
 
 PROGRAM = [sys.executable, "-m", "photonpano"]
-SIMULATED = 10_000
 RESULTS = ("panorama.tiff", "coverage.tiff", "trajectory.npz", "panorama.png")
 BATCH = 64
 """Frames that the writer writes at once."""
@@ -34,34 +32,13 @@ STARTED_S = 15.0
 """The writer waits for the program to start; a camera is started after it, too."""
 
 
-@dataclass(frozen=True)
-class Measured:
-    """A run that was followed.
-
-    Attributes:
-        figures: the last of `live.json` while frames came.
-        memory: (N, 2) of frames that had arrived, and the memory of the process, in MiB.
-        waiting: (N, 2) of seconds since the first frame, and how long the first frame that was not located had waited.
-        cpu_s: time of all cores that the process has used.
-    """
+class Measured(NamedTuple):
+    """A run that was followed: the last `live.json` while frames came; frames that had arrived, and MiB of its memory, (N, 2);
+    and seconds of all cores."""
 
     figures: dict[str, Any]
     memory: np.ndarray
-    waiting: np.ndarray
     cpu_s: float
-
-
-def simulated(study: Study, shape: tuple[int, int]) -> Path:
-    """Write a capture of a trembling hand."""
-    shake = {"rms_px": 2.0, "frequencies_hz": [25, 120, 400]}
-    capture = simulator(
-        scene={"kind": "street", "width": 2048, "height": 1365},
-        path={"kind": "random-spline", "length_px": 200, "shake": shake},
-        flux=0.3,
-        n_frames=SIMULATED,
-        frame_shape=list(shape),
-    )
-    return study.capture("hand", capture)
 
 
 def write(cube: Path, rate: float, n_frames: int) -> None:
@@ -86,7 +63,7 @@ def spec_for(folder: Path, shape: tuple[int, int], path: str = "-") -> Path:
     """Write a spec."""
     spec = folder / "spec.yaml"
     source = {"use": "packed-raw", "with": {"path": path, "height": shape[0], "width": shape[1], "frame_rate_hz": 96_800}}
-    spec.write_text(json.dumps({"version": 1, "source": source, "resample": {"with": {"group_size": 250}}, "levels": 3}))
+    spec.write_text(json.dumps({"version": 1, "source": source, "resample": groups(250), "levels": 3}))
     return spec
 
 
@@ -97,44 +74,35 @@ def follow(folder: Path, cube: Path, rate: float, n_frames: int, to_the_end: boo
     shutil.rmtree(live.parent, ignore_errors=True)
     command = [*PROGRAM, "run", str(spec_for(folder, shape)), "--follow", "--overwrite", "--output", str(folder / "run")]
     written = [sys.executable, __file__, "--write", str(cube), str(rate), str(n_frames)]
-    memory, waiting, figures = [], [], {"state": "waiting"}
+    memory, figures, cpu_s = [], {"state": "waiting"}, float("nan")
     with (
         subprocess.Popen(written, stdout=subprocess.PIPE) as writer,
         subprocess.Popen(command, stdin=writer.stdout, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as program,
     ):
         assert writer.stdout is not None
         writer.stdout.close()
-        start = None
+        process = psutil.Process(program.pid)
         while program.poll() is None:
             time.sleep(0.25)
             seen = json.loads(live.read_text()) if live.exists() else {"state": "waiting"}
+            if seen["state"] in ("following", "finishing"):
+                figures, cpu_s = seen, sum(process.cpu_times()[:2])
             if seen["state"] == "following":
-                start = start or time.monotonic()
-                figures = seen
                 memory.append((seen["frames"], resident_mib(program.pid)))
-                waiting.append((time.monotonic() - start, seen["behind_s"]))
             elif seen["state"] == "finishing":
-                figures = seen
                 break
-        cpu_s = cpu_seconds(program.pid) if program.poll() is None else float("nan")
         if not to_the_end:
             program.send_signal(signal.SIGINT)
         errors = program.communicate()[1].decode()
     if to_the_end and program.returncode:
         raise SystemExit(errors)
-    return Measured(figures, np.array(memory), np.array(waiting), cpu_s)
+    return Measured(figures, np.array(memory), cpu_s)
 
 
 def resident_mib(process: int) -> float:
     """Return the memory of a process, its pages of files left out."""
     status = Path(f"/proc/{process}/status").read_text()
     return int(re.search(r"^RssAnon:\s+(\d+)", status, re.MULTILINE)[1]) / 1024
-
-
-def cpu_seconds(process: int) -> float:
-    """Return the time of all cores that a process has used."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def row(shape: str, rate: float, measured: Measured) -> Sequence[str]:
@@ -176,7 +144,7 @@ DELAYS = (
 
 def memory_of(study: Study, n_frames: int) -> Iterator[Sequence[str]]:
     """Yield the rows of the table of memory: after a hundredth, a tenth, a half and all of a long capture of small frames."""
-    measured = follow(study.folder, simulated(study, (64, 96)), 6000, n_frames)
+    measured = follow(study.folder, study.capture("hand", hand_held((64, 96))), 6000, n_frames)
     print(*row("64x96", 6000, measured), sep=", ")
     for share in (0.01, 0.1, 0.5, 1):
         frames, memory_mib = measured.memory[np.abs(measured.memory[:, 0] - share * n_frames).argmin()]
@@ -189,9 +157,9 @@ def main(
     """Measure, and write the tables into a page."""
     require_places(page, ["delays"])
     with passing() as study:
-        large = simulated(study, (254, 496))
+        large = study.capture("hand", hand_held((254, 496)))
         lines = table(DELAYS, (row("254x496", rate, follow(study.folder, large, rate, frames)) for rate in rates))
-        lines += ["", compared(study.folder, large, SIMULATED)]
+        lines += ["", compared(study.folder, large, HELD_FRAMES)]
         print(lines[-1], flush=True)
         if long:
             lines += ["", *table(("Frames of 64x96 so far", "memory of the process"), memory_of(study, long))]

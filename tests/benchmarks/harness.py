@@ -18,6 +18,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
@@ -45,6 +46,7 @@ from photonpano.record.environment import peak_memory_bytes
 EXAMPLES = Path(__file__).parents[2] / "examples"
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 RATE_HZ = 96_800
+HELD_FRAMES = 10_000
 
 
 def simulator(use: str = "simulator", **camera: Any) -> dict[str, Any]:
@@ -61,6 +63,23 @@ def packed(cube: Path, rate_hz: float | None = RATE_HZ, **sections: Any) -> dict
 def groups(size: int | str) -> dict[str, Any]:
     """Return the section `resample` of a group size."""
     return {"use": "midpoint", "with": {"group_size": size}}
+
+
+def hand_held(frame_shape: tuple[int, int]) -> dict[str, Any]:
+    """Return a spec that simulates a trembling hand before the street, in `HELD_FRAMES` frames."""
+    return simulator(
+        scene={"kind": "street", "width": 2048, "height": 1365},
+        path={"kind": "random-spline", "length_px": 200, "shake": {"rms_px": 2.0, "frequencies_hz": [25, 120, 400]}},
+        flux=0.3,
+        n_frames=HELD_FRAMES,
+        frame_shape=list(frame_shape),
+    )
+
+
+def seen(scene: NDArray[Any], to_scene: NDArray[np.float64], shape: Sequence[int]) -> NDArray[np.float32]:
+    """Return what a frame of a shape sees of a scene, interpolated linearly, without the light from beyond it."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpPerspective(scene, to_scene, (shape[1], shape[0]), flags=flags), np.float32)
 
 
 @dataclass(frozen=True)
@@ -176,6 +195,14 @@ class Compared:
         """Return the PSNR of flux on a canvas where it is compared."""
         assert self.truth.scene is not None
         return image_score(flux, scene, where, white_flux(self.truth.scene)).psnr_db
+
+    def finer(self) -> tuple[Panorama, NDArray[np.float32]]:
+        """Merge the capture on the canvas of the run, and at the resolution of the sensor, interpolated to that canvas."""
+        canvas, flags = self.canvas, cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        with self.source() as source:
+            coarse, merged = rendered(source, self.motion), rendered(source, self.motion, canvas)
+        to_small = coarse.canvas @ np.linalg.inv(canvas.transform)
+        return merged, cv2.warpPerspective(np.nan_to_num(coarse.flux), to_small, canvas.shape[::-1], flags=flags)
 
     @property
     def plan(self) -> Plan:

@@ -18,9 +18,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from harness import Expected, Study, command, passing, record_of, rendered, simulator, to_reference
+from harness import Expected, Study, command, passing, record_of, rendered, seen, simulator, to_reference
 from numpy.typing import NDArray
 
 from photonpano import load_trajectory, open_source, parse_spec
@@ -96,8 +95,7 @@ def measured(name: str, n_frames: int, seed: int, rms_px: float, dark: float, st
 
         def view(index: int) -> NDArray[np.float64]:
             """Return the flux of the scene in a frame."""
-            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            return cv2.warpPerspective(scene, motion[index], SHAPE[::-1], flags=flags).astype(np.float64)
+            return seen(scene, motion[index], SHAPE).astype(np.float64)
 
         true_motion = found_motion = to_reference(motion)
         if estimated:

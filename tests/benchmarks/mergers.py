@@ -29,7 +29,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from harness import Study, chosen, command, groups, least, packed, passing, require_places, table, write_tables
+from harness import Study, chosen, command, groups, least, packed, passing, require_places, seen, table, write_tables
 
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext, load_trajectory
 from photonpano.geometry import FrameTrajectory, apply, inverse, translation
@@ -104,11 +104,11 @@ def times(folder: Path) -> Iterator[Sequence[str]]:
 
 def view(scene: np.ndarray, to_scene: np.ndarray, instant: float, moving: bool) -> np.ndarray:
     """Return the flux in a frame, with or without a bright square that moves by itself."""
-    seen = cv2.warpPerspective(scene, to_scene, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    image = seen(scene, to_scene, SHAPE)
     if moving:
         left = round(150 + WAY_PX * instant / SEEN_FRAMES)
-        seen[100 : 100 + SIDE_PX, left : left + SIDE_PX] = 2.5 * scene.mean()
-    return seen
+        image[100 : 100 + SIDE_PX, left : left + SIDE_PX] = 2.5 * scene.mean()
+    return image
 
 
 def psnrs(folder: Path) -> Iterator[Sequence[str]]:

@@ -30,6 +30,7 @@ from harness import (
     record_of,
     require_places,
     scores_of,
+    seen,
     simulator,
     table,
     write_tables,
@@ -134,7 +135,7 @@ def merging(cube: Path) -> list[str]:
         reference = trajectory.at([group.reference])[0]
         to_grid = inverse(reference) @ trajectory.at(np.arange(group.span.start, group.span.stop))
         (counts, weight), naive, *_ = least(warped_one_by_one, source, group.span, to_grid, times=1)
-        view = cv2.warpPerspective(scene, reference, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        view = seen(scene, reference, SHAPE)
         inside = weight > 0.9 * len(group.span)
 
         def psnr_db(flux: np.ndarray) -> float:

@@ -11,7 +11,7 @@ pixels. Compared are:
 - true motion: super-resolution along the true motion;
 - thin: super-resolution and bicubic where at most a fifth as many frames as usual saw a pixel.
 
-`--large-canvas` measures the time and the memory of a canvas of 2,048x1,365 px at scale 2 instead.
+`--large` measures the time and the memory of a canvas of 2,048x1,365 px at scale 2 instead.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from harness import (
     packed,
     passing,
     record_of,
-    rendered,
     scores_of,
     simulator,
     table,
@@ -82,11 +81,7 @@ def row(scene: Path, flux: float, frames: int, seed: int, scale: int, fill_facto
         run = Compared.of(study.run("run", packed(capture, render=renderer)), capture)
         scores, canvas, panorama = scores_of(run.folder, capture), run.canvas, run.panorama
         true_image = run.scene(canvas)
-        with run.source() as source:
-            coarse, fine = rendered(source, run.motion), rendered(source, run.motion, canvas)
-        to_small, flags = coarse.canvas @ np.linalg.inv(canvas.transform), cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        size, border = (canvas.width, canvas.height), cv2.BORDER_REPLICATE
-        bicubic = cv2.warpPerspective(np.nan_to_num(coarse.flux), to_small, size, flags=flags, borderMode=border)
+        fine, bicubic = run.finer()
         usual = covered(panorama.weight) & covered(fine.weight) & np.isfinite(true_image)
         usual = cv2.erode(usual.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
         thin = usual & (panorama.weight < THIN * np.median(panorama.weight[usual]))
@@ -118,7 +113,7 @@ def richardson_lucy(image: np.ndarray, width: float, score: Callable[[np.ndarray
     return float(best)
 
 
-def large(scene: Path, frames: int, seed: int) -> str:
+def large_canvas(scene: Path, frames: int, seed: int) -> str:
     """Measure the time and the memory of rendering a canvas of about 2,048x1,365 px along the true motion."""
     with passing() as study:
         path = {"kind": "scan", "length_px": 3560.0, "rows": 6, "row_spacing_px": 85.0}
@@ -149,12 +144,12 @@ def main(
     seed: int = 1,
     scale: int = 2,
     fill_factor: float = 1.0,
-    large_canvas: bool = False,
+    large: bool = False,
 ) -> None:
     """Print the table for photographs; or what a large canvas takes."""
     scenes = tuple(scene.resolve() for scene in scenes)
-    if large_canvas:
-        print(*(large(scene, frames, seed) for scene in scenes), sep="\n")
+    if large:
+        print(*(large_canvas(scene, frames, seed) for scene in scenes), sep="\n")
     else:
         table(HEAD, (row(scene, each, frames, seed, scale, fill_factor) for scene in scenes for each in flux))
 

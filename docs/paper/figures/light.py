@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import picture_parts as draw
-from harness import Compared, Study, record_of, rendered
+from harness import Compared, Study, record_of
 from numpy.typing import NDArray
 from paper.figures.study import (
     Claim,
@@ -49,12 +49,8 @@ DEPTHS = (0.0, 0.5, 0.8, 0.9, 1.0)  # amplitudes of the flicker, relative to the
 
 def fine_images(run: Compared) -> dict[str, NDArray[np.float32]]:
     """Return what a run of `super-resolution` is compared with on its canvas: interpolated, merged, and the true scene."""
-    canvas = run.canvas
-    with run.source() as source:
-        coarse, merged = rendered(source, run.motion), rendered(source, run.motion, canvas).flux
-    to_small, flags = coarse.canvas @ np.linalg.inv(canvas.transform), cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    bicubic = cv2.warpPerspective(np.nan_to_num(coarse.flux), to_small, (canvas.width, canvas.height), flags=flags)
-    return {"interpolated": bicubic, "merged": merged, "fine": run.panorama.flux, "true": run.scene(canvas)}
+    merged, bicubic = run.finer()
+    return {"interpolated": bicubic, "merged": merged.flux, "fine": run.panorama.flux, "true": run.scene(run.canvas)}
 
 
 def fine_pictures(images: dict[str, NDArray[np.float32]], radius: tuple[int, int]) -> draw.Picture:

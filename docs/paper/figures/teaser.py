@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import picture_parts as draw
-from harness import Compared, Study
+from harness import Compared, Study, seen
 from numpy.typing import NDArray
 from paper.figures.study import Claim, FigureOf, Numbers, frames_of, group_size, rounded, scores_of
 
@@ -65,8 +64,7 @@ def exposure_at(run_folder: Path, level: int, instant: float) -> tuple[float, ND
 def psnr_db(run: Compared, flux: NDArray[np.float32], instant: float) -> float:
     """Return the PSNR of an exposure against the view of the true scene at its instant, where the brightest 0.5 % are white."""
     assert run.truth.scene is not None
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    view = cv2.warpPerspective(run.truth.scene, run.truth.homographies[round(instant)], flux.shape[::-1], flags=flags)
+    view = seen(run.truth.scene, run.truth.homographies[round(instant)], flux.shape)
     white = draw.white_of(view)
     known = np.isfinite(flux)
     squared = np.square(np.clip(flux[known] / white, 0, 1) - np.clip(view[known] / white, 0, 1)).mean()
