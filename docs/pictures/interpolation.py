@@ -22,8 +22,7 @@ INTERPOLATORS = {
     "smoothing-spline": ("tab:blue", "-"),
 }
 """Interpolators, with the colour and style of their lines."""
-SPACINGS = (125, 31)
-"""Frames between knots at the first and at the third level of the street."""
+SPACINGS = (125, 31)  # frames between knots at the first and at the third level of the street
 
 
 def interpolation(cube: Path) -> draw.Picture:

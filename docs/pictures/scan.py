@@ -13,10 +13,8 @@ from photonpano.geometry import apply
 
 from . import finished
 
-WAYS = ("scan", "constant-groups", "naive-average")
-"""Specs of examples/pipelines, for the capture beside them."""
-PLACE = (235, 85)
-"""Centre of the compared place, in pixels of the reference frame, which is the same for all specs."""
+WAYS = ("scan", "constant-groups", "naive-average")  # specs of examples/pipelines, for the capture beside them
+PLACE = (235, 85)  # centre of the compared place, in pixels of the reference frame, which is the same for all specs
 
 
 def pictures(study: Study) -> Iterator[tuple[str, draw.Picture]]:

@@ -23,11 +23,9 @@ from photonpano_simulator.travel.truth import depth, sharp_view, truth_of
 
 from . import finished
 
-NIGHT_FLUX = 12.0
-"""Flux of the brightest lamp in the night scene, photons per pixel per frame."""
+NIGHT_FLUX = 12.0  # flux of the brightest lamp in the night scene, photons per pixel per frame
 NIGHT_FRAMES = 100_000
-GROUP_SIZE, FIRST = 30, 300
-"""Frames of an average of the room, and the first frame of the exposures that are shown."""
+GROUP_SIZE, FIRST = 30, 300  # frames of an average of the room, and the first frame of the exposures that are shown
 ESTIMATORS = {"colmap-averages": "tab:orange", "stratified-pose": "tab:blue"}
 """Pose estimators, with the colours of their lines."""
 MAGNIFIED = 1.7

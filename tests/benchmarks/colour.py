@@ -60,8 +60,7 @@ from photonpano.testing import MemorySource
 
 GROUP_SIZE, GROUP_PX = 120, 1.0
 FLUXES = (0.5, 0.1, 0.02)  # without --limits, the first
-SHARE = np.array([0.25, 0.5, 0.25], np.float32)
-"""Of the pixels of a Bayer array that are red, green and blue."""
+SHARE = np.array([0.25, 0.5, 0.25], np.float32)  # of the pixels of a Bayer array that are red, green and blue
 BLURS_PX = (0.0, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5, 2.0)
 
 

@@ -26,10 +26,8 @@ from harness import HELD_FRAMES, Study, command, groups, hand_held, passing, req
 
 PROGRAM = [sys.executable, "-m", "photonpano"]
 RESULTS = ("panorama.tiff", "coverage.tiff", "trajectory.npz", "panorama.png")
-BATCH = 64
-"""Frames that the writer writes at once."""
-STARTED_S = 15.0
-"""The writer waits for the program to start; a camera is started after it, too."""
+BATCH = 64  # frames that the writer writes at once
+STARTED_S = 15.0  # the writer waits for the program to start; a camera is started after it, too
 
 
 class Measured(NamedTuple):

@@ -28,10 +28,8 @@ from harness import command, passing, table
 
 from photonpano import PhotonpanoError
 
-HANGS_S = 5.0
-"""A file that takes longer is a failure; also one with a first look, which takes 2 s at most to find a loop."""
-STARTS_S = 1800.0
-"""A worker imports and compiles first, which takes long at a low priority."""
+HANGS_S = 5.0  # a file that takes longer is a failure; also one with a first look, which takes 2 s at most to find a loop
+STARTS_S = 1800.0  # a worker imports and compiles first, which takes long at a low priority
 MEMORY_BYTES = 8 * 1024**3
 LOOKED_AT = {"mask-png", "mat73", "ubicept", "tiff-folder", "tiff", "tiff-zlib", "avi", "mkv", "mp4"}
 """Kinds that a process of its own looks at first."""

@@ -20,8 +20,7 @@ from photonpano.pipeline.components import build_source, open_source
 from photonpano.registry import Catalog
 from photonpano.specs import parse_spec
 
-MOST_READ = 2**26
-"""Pixels of a damaged capture that are summed at most."""
+MOST_READ = 2**26  # pixels of a damaged capture that are summed at most
 FRAMES = np.random.default_rng(0).integers(0, 2, (64, 24, 32), dtype=np.uint8)
 GREY = (np.random.default_rng(1).random((12, 48, 64)) * 255).astype(np.uint8)
 

@@ -1,7 +1,7 @@
 """Compare mergers: the tables of docs/how-to/choose-a-merger.md.
 
     python tests/benchmarks/mergers.py docs/how-to/choose-a-merger.md [--tables psnr times dense]
-    python tests/benchmarks/mergers.py --tables dense --pictures FOLDER --only fast-0.3 --seeds 20
+    python tests/benchmarks/mergers.py --tables dense --only fast-0.3 --seeds 20
 
 `psnr` and `times`: all merge the same groups along the true motion. Times are CPU times of one thread, the minimum of several;
 frames are unpacked and summed from a file in the page cache. PSNR compares the flux of an exposure with the scene at the
@@ -52,8 +52,7 @@ SPEEDS_PX = (0.02, 0.15, 0.6)
 FLUXES = (0.005, 0.02, 0.1, 0.5)
 TIMED_FRAMES = 200
 SEEN_FRAMES = 500
-SIDE_PX, WAY_PX = 40, 100
-"""Size of the moving object, and its path within a group."""
+SIDE_PX, WAY_PX = 40, 100  # size of the moving object, and its path within a group
 MERGERS: dict[str, Merger] = {
     "photon-mle, 1 px": PhotonMleMerger(PhotonMleConfig()),
     "photon-mle, 0.25 px": PhotonMleMerger(PhotonMleConfig(tolerance_px=0.25)),
@@ -229,7 +228,7 @@ ESTIMATED = {"slow-0.1": "slow-estimated", "small": "small-estimated"}
 CASES |= {new: (f"{CASES[old][0]}, estimated motion", CASES[old][1]) for old, new in ESTIMATED.items()}
 
 
-def measured(study: Study, capture: Simulated, title: str, pictures: Path | None, estimate: bool) -> np.ndarray:
+def measured(study: Study, capture: Simulated, title: str, estimate: bool) -> np.ndarray:
     """Return what mergers reach: PSNR where something moves and elsewhere, in dB, and CPU time in s, of each: (M, 3)."""
     inside = np.zeros(SHAPE, bool)
     inside[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
@@ -242,18 +241,12 @@ def measured(study: Study, capture: Simulated, title: str, pictures: Path | None
             spec = packed(study.folder / f"{title}.npy", None, resample=groups(250), merge={"use": "local-flow"})
             motion = FrameTrajectory(load_trajectory(study.run("run", spec)).homographies)
         found = []
-        for name, merger in DENSE.items():
+        for merger in DENSE.values():
             merger.merge(source, Group(FrameSpan(0, 300), 149.5), motion, 1.0)  # compiled before it is timed
             cost = least(merger.merge, source, capture.group, motion, 1.0, times=2)
             flux = cost.result.flux
             both = (psnr_db(flux, capture.view, where & np.isfinite(flux), 0.999) for where in (moving, still))
             found.append((*both, cost.processor_s))
-            if pictures:
-                high = np.percentile(capture.view, 99.7)
-                tones = [np.clip(np.nan_to_num(each) / high, 0, 1) ** (1 / 2.2) for each in (flux, capture.view)]
-                error = 0.5 + 2 * (np.nan_to_num(flux) - capture.view) / high
-                picture = np.vstack([*tones, np.clip(error, 0, 1)])
-                cv2.imwrite(str(pictures / f"{title}, {name}.png".replace(" ", "-")), np.uint8(255 * picture))
         marked = FLOW.ghost_map(source, capture.group, motion).moving & inside
     both = (marked & moving).sum()
     share = f"precision {both / max(marked.sum(), 1):.3f}, recall {both / max(moving.sum(), 1):.3f}"
@@ -261,11 +254,11 @@ def measured(study: Study, capture: Simulated, title: str, pictures: Path | None
     return np.array(found)
 
 
-def moved(study: Study, names: Sequence[str], seeds: Sequence[int], pictures: Path | None) -> Iterator[Sequence[str]]:
+def moved(study: Study, names: Sequence[str], seeds: Sequence[int]) -> Iterator[Sequence[str]]:
     """Yield the rows of the table of what moves by itself: of each case, the mergers."""
     for case in names:
         title, capture_of = CASES[case]
-        given = [(capture_of(seed), f"{title}, seed {seed}", pictures, case in ESTIMATED.values()) for seed in seeds]
+        given = [(capture_of(seed), f"{title}, seed {seed}", case in ESTIMATED.values()) for seed in seeds]
         found = np.array([measured(study, *each) for each in given])  # of seeds and mergers
         for index, (name, (there, elsewhere, took_s)) in enumerate(zip(DENSE, found.mean(axis=0), strict=True)):
             gain = (found[:, index, 0] - found[:, list(DENSE).index("burst"), 0]).min()
@@ -285,14 +278,13 @@ def main(
     tables: Sequence[str] = tuple(TABLES),
     only: Sequence[str] = tuple(CASES),
     seeds: Sequence[int] = SEEDS,
-    pictures: Path | None = None,
 ) -> None:
     """Measure the tables, and write the page."""
     require_places(page, TABLES)
     cv2.setNumThreads(1)
     with passing() as study:
         rows = {"psnr": psnrs(study.folder), "times": times(study.folder)}
-        rows["dense"] = moved(study, chosen(only, CASES), seeds, pictures)
+        rows["dense"] = moved(study, chosen(only, CASES), seeds)
         write_tables(page, {name: table(TABLES[name], rows[name]) for name in chosen(tables, TABLES)})
 
 

@@ -84,12 +84,9 @@ def _sharp(cube: Path, truth: Path) -> PoseScore:
 def _figures(score: PoseScore) -> dict[str, Any]:
     return {
         "ate": 100 * score.ate_share,
-        "rotation": score.rotation_deg,
         "turned": score.turns_deg,
-        "rpe": score.rpe_deg,
         "located": 100 * score.located_share,
         "within": None if score.honest_shares is None else 100 * score.honest_shares[1],
-        "ratio": score.std_ratio,
     }
 
 

@@ -41,8 +41,7 @@ from photonpano.pipeline.executors import as_read
 from photonpano_dask.configs import DaskConfig
 
 DASK = discover().find("executor", "dask").contribution
-LONG = 60_000_000
-"""Ten minutes at 100,000 frames per second."""
+LONG = 60_000_000  # ten minutes at 100,000 frames per second
 WORKERS = 1, 8, 64, 512
 EMPTY_TASKS = 2000
 PATH_FRAMES = 400_000

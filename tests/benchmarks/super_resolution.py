@@ -49,8 +49,7 @@ from photonpano.record.environment import peak_memory_bytes
 
 FLUXES = (0.5, 0.1, 0.02)
 THREADS = 2
-STEPS = 60
-"""Steps of Richardson-Lucy, of which the best is taken."""
+STEPS = 60  # steps of Richardson-Lucy, of which the best is taken
 THIN = 0.2
 HEAD = (
     "scene", "flux", "motion px", "bicubic", "Richardson-Lucy", "super-resolution", "true motion", "thin: bicubic", "thin",

@@ -61,8 +61,7 @@ CASES = [
 FAST = Case(0.5, 0.5, below_oracle_db=1.0, path_px=3000, n_frames=4000)
 REVISITS = Case(0.5, 0.08, path_px=3000, n_frames=20_000, kind="scan")
 TREMBLING = Case(0.5, 0.08, shake=True, path_px=750)
-STRETCHES = 10
-"""Parts of a path that are compared with each other."""
+STRETCHES = 10  # parts of a path that are compared with each other
 NEIGHBOURS = {"skips": [], "closure_overlap": None}
 HEADER = (
     "| scene | path px | frames | group | flux | shake | variant "

@@ -67,8 +67,7 @@ CAUSES: dict[str, tuple[str, ...]] = {
     "along the height": ("axis", "height", "packed"),
 }
 """For words in the names of rows: words of which a right reason of a doubt or a refusal has one."""
-Result: TypeAlias = dict[str, Any]
-"""What was measured of one run; see `measured`."""
+Result: TypeAlias = dict[str, Any]  # what was measured of one run; see `measured`
 
 
 def simulated(row: Row, seed: int, size: Size, study: Study) -> Path:

@@ -27,8 +27,7 @@ class Size:
 
 
 FULL, SMALL = Size((254, 496), (10_000, 1500.0)), Size((128, 192), (4000, 600.0))
-TINY = Size((96, 144), (1600, 240.0))
-"""Of captures for cuts."""
+TINY = Size((96, 144), (1600, 240.0))  # of captures for cuts
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from harness import Compared, Study, middles
 from numpy.typing import NDArray
 from paper.figures.study import (
     Claim,
-    FigureOf,
     Numbers,
     averaged_in_place,
     frames_of,
@@ -251,7 +250,3 @@ def claims(numbers: Numbers) -> list[Claim]:
             ),
         ]
     return rows
-
-
-FIGURE = FigureOf(make, claims)
-LIGHT = FigureOf(darker, darker_claims)

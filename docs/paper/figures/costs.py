@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import picture_parts as draw
 from harness import Compared, Study
-from paper.figures.study import Claim, FigureOf, Numbers, frames_of, levels_of, rounded
+from paper.figures.study import Claim, Numbers, frames_of, levels_of, rounded
 
 from photonpano import PhotonpanoError
 from photonpano_core.configs import MidpointConfig
@@ -161,7 +161,3 @@ def run_time_claims(numbers: Numbers) -> list[Claim]:
             numbers["seconds"] < 600,
         ),
     ]
-
-
-SIZES_FIGURE = FigureOf(group_sizes, sizes_claims)
-RUN_TIME = FigureOf(run_time, run_time_claims)

@@ -11,7 +11,6 @@ from harness import Compared, Study
 from numpy.typing import NDArray
 from paper.figures.study import (
     Claim,
-    FigureOf,
     Numbers,
     averaged_in_place,
     frames_of,
@@ -221,9 +220,3 @@ def ends_claims(numbers: Numbers) -> list[Claim]:
             at_ends["level 3"] < at_ends["constant"],
         ),
     ]
-
-
-FIG3 = FigureOf(loop, loop_claims)
-FIG5 = FigureOf(without_new_groups, groups_claims)
-FIG6 = FigureOf(refinement, refinement_claims)
-S2 = FigureOf(ends, ends_claims)

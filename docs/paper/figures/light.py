@@ -13,7 +13,6 @@ from harness import Compared, Study, record_of
 from numpy.typing import NDArray
 from paper.figures.study import (
     Claim,
-    FigureOf,
     Numbers,
     fails,
     frames_of,
@@ -191,8 +190,3 @@ def flicker_claims(numbers: Numbers) -> list[Claim]:
             fails(out[1]) and not fails(numbers["auto"]),
         ),
     ]
-
-
-FIG7 = FigureOf(super_resolution, super_resolution_claims)
-FIG8 = FigureOf(dynamic_range, range_claims)
-FIG10 = FigureOf(flicker, flicker_claims)

@@ -9,7 +9,7 @@ import numpy as np
 import picture_parts as draw
 from harness import Study
 from numpy.typing import NDArray
-from paper.figures.study import Claim, FigureOf, Numbers, rounded
+from paper.figures.study import Claim, Numbers, rounded
 
 from photonpano import FrameSpan, Group, Located, StageContext, discover, open_source, parse_spec
 from photonpano.geometry import FrameTrajectory, apply, corner_displacements, inverse
@@ -17,8 +17,7 @@ from photonpano.geometry import FrameTrajectory, apply, corner_displacements, in
 BLUR_PX = (0, 3, 6, 12, 20, 30)  # blur of the frames, which are 30 px apart
 PHOTONS = (3000, 300, 100, 30, 10, 3)  # per pixel per frame, from little noise to much
 LOCATORS = ("opencv-sift", "direct")
-CORRECT_PX, LOST_PX = 3.0, 10.0
-"""Largest error of a match that counts; the error with which a lost pair is drawn and averaged."""
+CORRECT_PX, LOST_PX = 3.0, 10.0  # largest error of a match that counts; the error with which a lost pair is drawn and averaged
 QUICK = {"source.with.frame_shape": [128, 192], "source.with.scene": {"kind": "street", "width": 1024, "height": 682}}
 
 
@@ -115,8 +114,7 @@ def heat_maps(numbers: Numbers, width: int) -> draw.Picture:
     return draw.in_bgr(figure)
 
 
-BOX = {"facecolor": "black", "alpha": 0.35, "linewidth": 0, "pad": 1.0}
-"""Behind the numbers of the heat maps."""
+BOX = {"facecolor": "black", "alpha": 0.35, "linewidth": 0, "pad": 1.0}  # behind the numbers of the heat maps
 
 
 def claims(numbers: Numbers) -> list[Claim]:
@@ -143,6 +141,3 @@ def claims(numbers: Numbers) -> list[Claim]:
             ),
         ),
     ]
-
-
-FIGURE = FigureOf(make, claims)

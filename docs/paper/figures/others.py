@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from paper.figures.study import (
     Claim,
-    FigureOf,
     Numbers,
     chained,
     fails,
@@ -264,8 +263,3 @@ def bursts_claims(numbers: Numbers) -> list[Claim]:
             ours["psnr_db"] > numbers["one_pass_psnr_db"] + 1,
         )
     ]
-
-
-HIGH_SPEED = FigureOf(high_speed, high_speed_claims)
-POSES = FigureOf(poses, poses_claims)
-BURSTS = FigureOf(bursts, bursts_claims)

@@ -8,7 +8,7 @@ import numpy as np
 import picture_parts as draw
 from harness import Compared, Study, seen
 from numpy.typing import NDArray
-from paper.figures.study import Claim, FigureOf, Numbers, frames_of, group_size, rounded, scores_of
+from paper.figures.study import Claim, Numbers, frames_of, group_size, rounded, scores_of
 
 from photonpano import FrameSpan
 
@@ -92,6 +92,3 @@ def claims(numbers: Numbers) -> list[Claim]:
             numbers["below_oracle_db"] < 1,
         ),
     ]
-
-
-FIGURE = FigureOf(make, claims)
