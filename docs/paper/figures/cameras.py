@@ -13,6 +13,7 @@ import picture_parts as draw
 from harness import Compared, Study, middles
 from numpy.typing import NDArray
 from paper.figures.study import (
+    QUICK_STREET,
     Claim,
     Numbers,
     averaged_in_place,
@@ -32,10 +33,6 @@ SLOW = CASES["slow, 6 times darker"][0]
 DARKER = (1, 6, 24, 60, 120, 240)  # how many times darker than the first column it gets
 READ_NOISES = (5, 20)  # standard deviations, in photons
 PAPER_DARKER = 6  # how much darker the paper makes it until the conventional camera fails
-QUICK = {
-    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
-    "source.with.frame_shape": [128, 192],
-}
 QUICK_PATH_PX = 200.0
 QUICK_FRAMES = 3000
 QUICK_GROUP = {"fig4": 200, "fig4-camera": 1}
@@ -93,7 +90,7 @@ def case(study: Study, name: str, length: float, light: float) -> tuple[list[dra
 
 def scaled(study: Study, name: str, length: float, light: float) -> dict[str, Any]:
     """Return a spec of Fig. 4 with another length of the path and another light."""
-    spec = study.spec(f"paper/{name}", {}, QUICK)
+    spec = study.spec(f"paper/{name}", {}, QUICK_STREET)
     camera = spec["source"]["with"]
     if study.quick:
         camera["n_frames"] = QUICK_FRAMES if name == "fig4" else QUICK_FRAMES // 1000 * 4

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import picture_parts as draw
 from harness import Compared, Study
-from paper.figures.study import Claim, Numbers, frames_of, levels_of, rounded
+from paper.figures.study import QUICK_STREET, Claim, Numbers, frames_of, levels_of, rounded
 
 from photonpano import PhotonpanoError
 from photonpano_core.configs import MidpointConfig
@@ -19,11 +19,7 @@ LENGTHS_PX = (120, 480)
 FLUXES = (0.2, 0.01)
 USUAL = 250, 750  # group sizes that the paper recommends
 GOOD_PX = 0.5  # largest mean error of a result of high quality
-QUICK = {
-    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
-    "source.with.frame_shape": [96, 144],
-    "source.with.n_frames": 3000,
-}
+QUICK = {**QUICK_STREET, "source.with.frame_shape": [96, 144], "source.with.n_frames": 3000}
 QUICK_SIZES, QUICK_LENGTHS_PX, QUICK_FLUXES = (60, 250), (40, 100), (0.3,)
 QUICK_TIME = {**QUICK, "source.with.path.length_px": 100, "source.with.flux": 0.3, "resample.with.group_size": 200}
 QUICK_WINDOWS = {**QUICK_TIME, "resample.with.step_frames": 50}

@@ -12,6 +12,7 @@ import picture_parts as draw
 from harness import Compared, Study, record_of
 from numpy.typing import NDArray
 from paper.figures.study import (
+    QUICK_STREET,
     Claim,
     Numbers,
     fails,
@@ -35,10 +36,10 @@ QUICK_NIGHT = {
     "resample.with.group_size": 250,
 }
 QUICK_FLICKER = {
+    **QUICK_STREET,
     "source.with.n_frames": 1200,
     "source.with.frame_rate_hz": 20000,
     "source.with.frame_shape": [96, 144],
-    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
     "source.with.path": {"kind": "pan", "length_px": 60},
     "source.with.flux": 0.5,
     "resample.with.group_size": 100,

@@ -9,7 +9,7 @@ import numpy as np
 import picture_parts as draw
 from harness import Study
 from numpy.typing import NDArray
-from paper.figures.study import Claim, Numbers, rounded
+from paper.figures.study import QUICK_STREET, Claim, Numbers, rounded
 
 from photonpano import FrameSpan, Group, Located, StageContext, discover, open_source, parse_spec
 from photonpano.geometry import FrameTrajectory, apply, corner_displacements, inverse
@@ -18,7 +18,6 @@ BLUR_PX = (0, 3, 6, 12, 20, 30)  # blur of the frames, which are 30 px apart
 PHOTONS = (3000, 300, 100, 30, 10, 3)  # per pixel per frame, from little noise to much
 LOCATORS = ("opencv-sift", "direct")
 CORRECT_PX, LOST_PX = 3.0, 10.0  # largest error of a match that counts; the error with which a lost pair is drawn and averaged
-QUICK = {"source.with.frame_shape": [128, 192], "source.with.scene": {"kind": "street", "width": 1024, "height": 682}}
 
 
 def make(study: Study) -> tuple[draw.Picture, Numbers]:
@@ -46,7 +45,7 @@ def make(study: Study) -> tuple[draw.Picture, Numbers]:
 
 def pairs_of(study: Study, flux: float, blur: float) -> dict[str, Any]:
     """Return the spec of frames with so many photons per pixel and so many px of blur."""
-    spec = study.spec("paper/fig2", {"source.with.flux": flux}, QUICK)
+    spec = study.spec("paper/fig2", {"source.with.flux": flux}, QUICK_STREET)
     spec["source"]["with"]["sensor"] |= {"exposure": blur / 30, "full_well": 4 * flux + 100}
     return spec
 

@@ -13,6 +13,7 @@ from harness import Compared, Study, simulator
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from paper.figures.study import (
+    QUICK_STREET,
     Claim,
     Numbers,
     chained,
@@ -38,7 +39,7 @@ APERTURES = {"f/8": 1 / 8, "f/5.6": 1 / 4, "f/4": 1 / 2, "f/2.8": 1.0}  # and th
 SHOWN = ("f/5.6", "f/2.8")  # the paper's apertures
 METHODS = {"single": "SIFT on single frames", "SIFT": "SIFT on averages", "direct": "direct on averages"}
 QUICK_CAMERA = {
-    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
+    **QUICK_STREET,
     "source.with.frame_shape": [128, 160],
     "source.with.path": {"kind": "pan", "length_px": 120},
     "source.with.n_frames": 60,

@@ -16,6 +16,11 @@ from photonpano.evaluation import corner_errors, covered
 from photonpano.geometry import Canvas, FrameTrajectory
 
 FAILED_DB = 3.0  # a panorama that is further below the one along the true motion has failed
+QUICK_STREET = {
+    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
+    "source.with.frame_shape": [128, 192],
+}
+"""What makes most captures of a quick study small."""
 Numbers: TypeAlias = dict[str, Any]
 """Figures by name: numbers, words, and lists and mappings of them, which do not depend on the machine."""
 

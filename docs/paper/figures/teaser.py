@@ -8,18 +8,17 @@ import numpy as np
 import picture_parts as draw
 from harness import Compared, Study, seen
 from numpy.typing import NDArray
-from paper.figures.study import Claim, Numbers, frames_of, group_size, rounded, scores_of
+from paper.figures.study import QUICK_STREET, Claim, Numbers, frames_of, group_size, rounded, scores_of
 
 from photonpano import FrameSpan
 
 QUICK = {
+    **QUICK_STREET,
     "source.with.path.length_px": 300,
     "source.with.path.row_spacing_px": 50,
     "source.with.path.centre": None,
     "source.with.flux": 0.3,
     "source.with.n_frames": 3000,
-    "source.with.frame_shape": [128, 192],
-    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
     "resample.with.group_size": 150,
 }
 
