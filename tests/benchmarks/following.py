@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
-from harness import HELD_FRAMES, Study, command, groups, hand_held, passing, require_places, table, write_tables
+from harness import HELD_FRAMES, Study, command, groups, hand_held, passing, table, write_tables
 
 PROGRAM = [sys.executable, "-m", "photonpano"]
 RESULTS = ("panorama.tiff", "coverage.tiff", "trajectory.npz", "panorama.png")
@@ -153,7 +153,6 @@ def main(
     page: Path | None, frames: int = 60_000, long: int = 1_000_000, rates: Sequence[float] = (1000.0, 3000.0, 5000.0, 0.0)
 ) -> None:
     """Measure, and write the tables into a page."""
-    require_places(page, ["delays"])
     with passing() as study:
         large = study.capture("hand", hand_held((254, 496)))
         lines = table(DELAYS, (row("254x496", rate, follow(study.folder, large, rate, frames)) for rate in rates))
@@ -168,4 +167,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--write"]:
         write(Path(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4]))
     else:
-        command(main)
+        command(main, "delays")

@@ -6,7 +6,6 @@ import argparse
 import hashlib
 import inspect
 import json
-import os
 import sys
 import tempfile
 import time
@@ -315,30 +314,22 @@ def write_tables(page: Path | None, tables: Mapping[str, Iterable[str]]) -> None
     """Replace tables of a page, each given by its name and its lines; without a page, they have been printed."""
     if page is None:
         return
-    require_places(page, tables)
     text = page.read_text(encoding="utf-8")
     for name, lines in tables.items():
         text = filled(text, name, lines)
     page.write_text(text, encoding="utf-8")
 
 
-def require_places(page: Path | None, names: Iterable[str]) -> None:
-    """Refuse a page that lacks the place of a table, before hours are spent on measuring it."""
-    text = page.read_text(encoding="utf-8") if page else ""
-    for begin, end in map(_marks, names if page else ()):
-        if not 0 <= text.find(begin) < text.find(end):
-            raise SystemExit(f"{page}: a table has no place; mark it with {begin} and {end}")
-
-
 def _marks(name: str) -> tuple[str, str]:
     return f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
 
 
-def command(main: Callable[..., object]) -> None:
+def command(main: Callable[..., object], *tables: str) -> None:
     """Run the function of a script with the options of the command line, and exit with what it returns.
 
     Its keyword arguments are options, of the types of their defaults (lists take several values; None stands for a path); its
-    other arguments are paths, and `page` is optional: the page of the docs whose tables are replaced.
+    other arguments are paths, and `page` is optional: the page of the docs whose `tables` are replaced, which must have their
+    places before hours are spent on measuring them.
     """
     parser = argparse.ArgumentParser(
         description=main.__globals__["__doc__"], formatter_class=argparse.RawDescriptionHelpFormatter
@@ -357,10 +348,9 @@ def command(main: Callable[..., object]) -> None:
         else:
             parser.add_argument(flag, type=Path if default is None else type(default), default=default)
     given = vars(parser.parse_args())
+    text = given["page"].read_text(encoding="utf-8") if given.get("page") else ""
+    for begin, end in map(_marks, tables if text else ()):
+        if not 0 <= text.find(begin) < text.find(end):
+            raise SystemExit(f"{given['page']}: a table has no place; mark it with {begin} and {end}")
     paths = [given.pop(name) for name in positional]
     sys.exit(main(*(path for each in paths for path in (each if isinstance(each, list) else [each])), **given))
-
-
-def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0))

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from harness import command, require_places, simulator, table, took, write_tables
+from harness import command, simulator, table, took, write_tables
 from pydantic import ValidationError
 
 from photonpano import (
@@ -144,11 +144,10 @@ def rows(fluxes: Sequence[float], scenes: int) -> Iterator[Sequence[str]]:
 
 def main(page: Path | None, scenes: int = 2, fluxes: Sequence[float] = (0.5, 0.1, 0.02)) -> None:
     """Measure everything, and write the page."""
-    require_places(page, ["table"])
     cv2.setNumThreads(1)
     head = ("Flux", "Locator", "Blurred: error", "lost", "a pair", "Compensated: error", "lost", "a pair")
     write_tables(page, {"table": table(head, rows(fluxes, scenes))})
 
 
 if __name__ == "__main__":
-    command(main)
+    command(main, "table")

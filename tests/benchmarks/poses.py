@@ -18,7 +18,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from harness import Study, chosen, command, in_child, packed, require_places, simulator, table, write_tables
+from harness import Study, chosen, command, in_child, packed, simulator, table, write_tables
 
 from photonpano import CameraGuess, PhotonpanoError, evaluate_poses, parse_spec, simulate
 from photonpano.captures.writing import truth_path
@@ -109,7 +109,6 @@ def main(
     frames: int = N_FRAMES,
 ) -> None:
     """Measure, and write the page."""
-    require_places(page, ["poses"])
     work.mkdir(parents=True, exist_ok=True)
 
     def figures(scene: str, light: str, method: str) -> dict[str, Any]:
@@ -132,4 +131,4 @@ def main(
 
 
 if __name__ == "__main__":
-    command(main)
+    command(main, "poses")

@@ -27,7 +27,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import psutil
 from distributed import Client
-from harness import IMAGES, command, packed, passing, require_places, table, write_tables
+from harness import IMAGES, command, packed, passing, table, write_tables
 from scheduling import Costs, Kind, Measured, prediction
 from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulated
 
@@ -217,7 +217,6 @@ def plot(limits: dict[int, dict[str, float]], file: Path) -> None:
 
 def main(page: Path | None, frames: Sequence[int] = (10_000, 40_000)) -> None:
     """Measure two captures, the shorter first, predict, and write the page."""
-    require_places(page, ["tasks", "costs", "predictions"])
     costs, limits = measured_costs(), dict[int, dict[str, float]]()
     with passing() as study:
         cubes = [simulated(study, number) for number in frames]
@@ -240,4 +239,4 @@ def main(page: Path | None, frames: Sequence[int] = (10_000, 40_000)) -> None:
 
 
 if __name__ == "__main__":
-    command(main)
+    command(main, "tasks", "costs", "predictions")

@@ -28,13 +28,12 @@ from harness import (
     packed,
     passing,
     record_of,
-    require_places,
     scores_of,
     seen,
     simulator,
     table,
     write_tables,
-)  # fmt: skip
+)
 
 from photonpano import FrameSpan, SourceContext
 from photonpano.captures.writing import truth_path
@@ -222,7 +221,6 @@ RUNS = ("Frames", "Whole", "merge", "locate", "panorama", "other", "Peak memory"
 
 def main(page: Path | None, frames: Sequence[int] = (10_000, 30_000, 100_000)) -> None:
     """Measure everything on captures of several lengths, and write the page."""
-    require_places(page, ["sums", "merging", "runs"])
     records: dict[int, dict[str, Any]] = {}
     tables: dict[str, list[str]] = {}
     rate = 0.0
@@ -242,4 +240,4 @@ def main(page: Path | None, frames: Sequence[int] = (10_000, 30_000, 100_000)) -
 
 
 if __name__ == "__main__":
-    command(main)
+    command(main, "sums", "merging", "runs")

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from harness import Cost, command, cores, least, passing, simulator, took
+from harness import Cost, command, least, passing, simulator, took
 
 from photonpano import FrameSpan, Source, capture_plan, convert, parse_spec, run, simulate
 from photonpano.pipeline.components import build_source
@@ -28,7 +28,7 @@ from photonpano.pipeline.components import build_source
 SHAPE = 254, 496
 FLUX = 0.1
 GROUP, SHORT, SHORT_FRAMES = 500, 16, 4000
-THREADS = cores()
+THREADS = len(os.sched_getaffinity(0))
 
 
 def write_frames(path: Path, n_frames: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import picture_parts as draw
 from harness import Compared, Study, seen
@@ -50,7 +51,9 @@ def make(study: Study) -> tuple[draw.Picture, Numbers]:
         "about the same, merged along the motion (level 2)": merged,
     }
     row = draw.beside(draw.all_labelled(above))
-    return draw.in_rows([row, draw.labelled(draw.fitted(draw.picture(flux, white), row.shape[1]), "panorama")]), numbers
+    scale = row.shape[1] / flux.shape[1]
+    small = cv2.resize(draw.picture(flux, white), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return draw.in_rows([row, draw.labelled(small, "panorama")]), numbers
 
 
 def exposure_at(run_folder: Path, level: int, instant: float) -> tuple[float, NDArray[np.float32]]:
