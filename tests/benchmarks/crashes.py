@@ -14,7 +14,6 @@ a kill may fall between any two results. The exit code is 1 if a trial fails.
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import random
@@ -36,6 +35,10 @@ from unittest import mock
 
 import numpy as np
 from harness import command, in_child, passing, simulator
+
+from photonpano import load_spec, parse_spec, run, simulate
+from photonpano.cli import main as program
+from photonpano.record import contents
 
 SPEC = """version: 1
 source: {{use: packed-npy, with: {{path: cube.npy, frame_rate_hz: 96800}}}}
@@ -66,14 +69,12 @@ class Run:
         self._process.start()
 
     def _work(self, folder: Path, options: tuple[str, ...], dies: Callable[[], object]) -> None:
-        from photonpano.cli import main
-
         os.chdir(folder)
         for stream in (1, 2):
             os.dup2(self._printed.fileno(), stream)
         sys.argv = ["photonpano", "run", "scan.yaml", *options]
         dies()
-        main()
+        program()
 
     def kill_after(self, seconds: float) -> None:
         """Kill the process after a time, unless it ends before."""
@@ -122,35 +123,11 @@ def dying_in_file(number: int, part: float) -> None:
     mock.patch("numpy.savez", dying).start()
 
 
-def preload() -> None:
-    """Import what a run needs."""
-    for name in (
-        "photonpano.api.run", "photonpano.pipeline.run", "photonpano.specs", "photonpano.residuals.verdict",
-        "matplotlib.figure", "matplotlib.backends.backend_svg", "scipy.sparse.linalg", "jinja2", "rich.progress", "numba",
-    ):  # fmt: skip
-        importlib.import_module(name)
-    from photonpano import discover
-    from photonpano.pipeline import run
-
-    discover()
-    # Drawing takes longer than the rest of such a run; the files matter here.
-    run.render_report = lambda *_: "<html>" + 200_000 * " "
-
-
-def prepare(folder: Path, seed: int = 0) -> None:
+def prepare(folder: Path) -> None:
     """Simulate the capture, and write the spec."""
-    from photonpano import parse_spec, simulate
-
     capture = simulator(n_frames=200, frame_shape=[48, 64], path={"kind": "pan", "length_px": 16}, flux=0.5)
     simulate(parse_spec(capture), folder / "cube.npy")
-    write_spec(folder, seed)
-
-
-def warm_up(folder: Path) -> None:
-    """Run once in this process, so that those forked from it find the machine code loaded."""
-    from photonpano import load_spec, run
-
-    run(load_spec(folder / "scan.yaml"))
+    write_spec(folder, 0)
 
 
 def write_spec(folder: Path, seed: int) -> None:
@@ -160,8 +137,6 @@ def write_spec(folder: Path, seed: int) -> None:
 
 def state(folder: Path) -> tuple[int | None, list[str]]:
     """Return the seed of the run that the folder holds, None if there is none; and what is wrong with it."""
-    from photonpano.record import contents
-
     directory = folder / "runs" / "scan"
     if not directory.exists():
         return None, []
@@ -340,10 +315,11 @@ def main(trial: Path, number: int = 20, seed: int = 0, at_once: int = 2, writing
         raise SystemExit(f"no trial is called {trial}; there are {', '.join(TRIALS)}")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-    with passing() as study:
-        preload()
+    # Drawing takes longer than the rest of such a run; the files matter here.
+    drawn = mock.patch("photonpano.pipeline.run.render_report", return_value="<html>" + 200_000 * " ")
+    with passing() as study, drawn:
         in_child(prepare, study.folder)  # a forked process keeps the locks of threads that it has not got
-        warm_up(study.folder)
+        run(load_spec(study.folder / "scan.yaml"))  # so that those forked from this process find the machine code loaded
         more = {"races": {"at_once": at_once}, "resumes": {"writing": writing}}.get(str(trial), {})
         if "writing" in more:
             mock.patch("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0).start()
