@@ -53,8 +53,7 @@ def mandrill(study: Study) -> Iterator[tuple[str, draw.Picture]]:
         n_frames = source.info.n_frames
         frame = source.frames(FrameSpan(n_frames // 2, n_frames // 2 + 1))[0] * np.uint8(255)
         average = source.counts(source.info.span) / np.float32(n_frames)
-    known = [np.nan_to_num(flux).astype(np.float32) for flux in (average, load_panorama(folder).flux)]
-    whites = [draw.white_of(flux) for flux in (average, load_panorama(folder).flux)]
-    shown = (frame, *(draw.picture(flux, white) for flux, white in zip(known, whites, strict=True)))
+    fluxes = average, load_panorama(folder).flux
+    shown = frame, *(draw.picture(np.nan_to_num(flux).astype(np.float32), draw.white_of(flux)) for flux in fluxes)
     labels = f"one frame of {n_frames}", f"the {n_frames} frames, averaged", f"the same {n_frames} frames, as a panorama"
     yield "mandrill.png", draw.beside(draw.all_labelled(dict(zip(labels, shown, strict=True))))
