@@ -9,37 +9,31 @@ A quick study has small captures, and leaves its pictures, numbers and page in t
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
+import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import cv2
-import numpy as np
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "benchmarks"))
+from harness import Study, command
+from harness import filled as with_table
 from paper.figures import FIGURES
-from paper.figures.study import Study
-
-if TYPE_CHECKING:
-    from picture_parts import Picture
+from picture_parts import save
 
 PAPER = Path(__file__).parent / "paper"
 MOST_BYTES = 400_000
-WHITE = 250
-"""Brighter levels become white, as is the page."""
 
 
-def main() -> None:
+def main(quick: bool = False, only: Sequence[str] = (), folder: Path = Path("runs/paper")) -> None:
     """Make the figures."""
-    parser = argparse.ArgumentParser(description="Make the figures of the paper.")
-    parser.add_argument("--quick", action="store_true", help="small captures, into the folder instead of docs/paper")
-    parser.add_argument("--only", nargs="+", choices=FIGURES, default=list(FIGURES), metavar="FIGURE", help=", ".join(FIGURES))
-    parser.add_argument("--folder", type=Path, default=Path("runs/paper"), help="for captures, runs and a quick study")
-    arguments = parser.parse_args()
-    study = Study(arguments.folder / ("quick" if arguments.quick else "full"), arguments.quick)
+    if wrong := set(only) - set(FIGURES):
+        raise SystemExit(f"no figure is called {', '.join(wrong)}; there are {', '.join(FIGURES)}")
+    study = Study(folder / ("quick" if quick else "full"), quick)
     study.folder.mkdir(parents=True, exist_ok=True)
-    make(study, arguments.only, study.folder if arguments.quick else PAPER)
+    make(study, only or list(FIGURES), study.folder if quick else PAPER)
 
 
 def make(study: Study, names: list[str], into: Path) -> None:
@@ -53,7 +47,7 @@ def make(study: Study, names: list[str], into: Path) -> None:
         began = time.monotonic()
         image, numbers[name] = FIGURES[name].make(study)
         if image is not None:
-            save(image, into / "images" / f"{name}.png")
+            save(image, into / "images" / f"{name}.png", MOST_BYTES)
         ordered = {each: numbers[each] for each in FIGURES if each in numbers}
         file.write_text(json.dumps(ordered, indent=2) + "\n", encoding="utf-8")
         print(f"{name}: {time.monotonic() - began:.0f} s", flush=True)
@@ -63,33 +57,13 @@ def make(study: Study, names: list[str], into: Path) -> None:
 
 def filled(page: str, numbers: dict[str, Any]) -> str:
     """Return a page with the captures and the tables of the figures whose numbers are known."""
-    for name in numbers:
-        begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-        before, rest = page.split(begin)
-        rows = [claim.row() for claim in FIGURES[name].claims(numbers[name])]
-        taken = captured(numbers[name])
-        table = "\n".join([begin, *taken, "| The paper | Measured here | Agrees |", "| --- | --- | --- |", *rows, end])
-        page = before + table + rest.split(end)[1]
+    for name, of_figure in numbers.items():
+        taken = "Each capture has {n_frames:,} frames at {frame_rate_hz:,} Hz."
+        captured = [taken.format(**of_figure), ""] if "n_frames" in of_figure else []
+        rows = [claim.row() for claim in FIGURES[name].claims(of_figure)]
+        page = with_table(page, name, [*captured, "| The paper | Measured here | Agrees |", "| --- | --- | --- |", *rows])
     return page
 
 
-def captured(numbers: dict[str, Any]) -> list[str]:
-    """Return the lines that say how many frames the captures of a figure have; none where there is no capture."""
-    if "n_frames" not in numbers:
-        return []
-    return [f"Each capture has {numbers['n_frames']:,} frames at {numbers['frame_rate_hz']:,} Hz.", ""]
-
-
-def save(image: Picture, path: Path) -> None:
-    """Write a PNG, grey or BGR, of 32 levels and few enough pixels."""
-    while True:
-        coarse = np.where(image > WHITE, 255, image & 0xF8).astype(np.uint8)
-        encoded = cv2.imencode(".png", coarse, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
-        if len(encoded) < MOST_BYTES:
-            break
-        image = cv2.resize(image, None, fx=0.9, fy=0.9, interpolation=cv2.INTER_AREA).astype(np.uint8)
-    path.write_bytes(encoded)
-
-
 if __name__ == "__main__":
-    main()
+    command(main)

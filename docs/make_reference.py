@@ -30,8 +30,7 @@ from photonpano.specs.settings import LevelSettings
 
 REFERENCE = Path(__file__).parent / "reference"
 BLOCK = re.compile(r"(?<=<!-- generated: )(?P<what>[^>]+) -->\n.*?(?=<!-- end -->)", re.DOTALL)
-COMPUTED = {"directory": "`runs/` and the name of the spec"}
-"""Defaults that are computed, and so are not in the model."""
+COMPUTED = {"directory": "`runs/` and the name of the spec"}  # defaults that are computed, and so are not in the model
 
 
 def main() -> None:

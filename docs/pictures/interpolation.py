@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
-from picture_parts import drawn
+import picture_parts as draw
+from harness import to_reference
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
 from photonpano import StageContext, StreamInfo, discover
+from photonpano import geometry as g
 from photonpano.captures.writing import truth_path
-from photonpano.geometry import (
-    corner_displacements,
-    corners,
-    from_parameters,
-    inverse,
-    jacobian,
-    normalised,
-    parameters,
-    translation,
-)
 from photonpano.photometry import BinaryResponse
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from matplotlib.axes import Axes
-    from numpy.typing import NDArray
-    from picture_parts import Picture
 
 INTERPOLATORS = {
     "geodesic": ("tab:green", "-"),
@@ -36,23 +22,22 @@ INTERPOLATORS = {
     "smoothing-spline": ("tab:blue", "-"),
 }
 """Interpolators, with the colour and style of their lines."""
-SPACINGS = (125, 31)
-"""Frames between knots at the first and at the third level of the street."""
+SPACINGS = (125, 31)  # frames between knots at the first and at the third level of the street
 
 
-def interpolation(cube: Path) -> Picture:
+def interpolation(cube: Path) -> draw.Picture:
     """Return a plot of the errors between knots on the true motion of a capture, and print their means."""
     with np.load(truth_path(cube)) as file:
         truth, shape = file["homographies"], tuple(file["frame_shape"])
-    truth = normalised(inverse(truth[len(truth) // 2]) @ truth)
-    rolling = normalised(truth @ turned(np.linspace(0, 16 * np.pi, len(truth)), shape))
+    truth = to_reference(truth)
+    rolling = g.normalised(truth @ turned(np.linspace(0, 16 * np.pi, len(truth)), shape))
     cases = {
         f"{what}, {spacing} frames apart": (motion, spacing, error_px)
         for what, motion, error_px in (("exact", truth, 0.0), ("off by 0.1 px", truth, 0.1), ("exact, rolled", rolling, 0.0))
         for spacing in SPACINGS
     }
-    figure = Figure(figsize=(10, 5.2), dpi=100, layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True, sharey=True).T.ravel()
+    figure, axes = draw.panels(10, 5.2, 2, 2, sharex=True, sharey=True)
+    panels = [axes[0], axes[2], axes[1], axes[3]]  # column by column
     for place, (label, case) in enumerate(cases.items()):
         errors = {name: between_knots(name, *case, shape) for name in INTERPOLATORS}
         print(f"{label:32}", *(f"{name} {error.mean():.4f} px, worst {error.max():.3f} px;" for name, error in errors.items()))
@@ -61,7 +46,7 @@ def interpolation(cube: Path) -> Picture:
     panels[0].legend(fontsize=8, ncols=2, loc="lower right")
     figure.supxlabel("frame", fontsize=9)
     figure.supylabel("corner error, px", fontsize=9)
-    return drawn(figure)[..., 2::-1]
+    return draw.in_bgr(figure)
 
 
 def between_knots(
@@ -70,13 +55,13 @@ def between_knots(
     """Return the mean corner error of each frame; the corners of knots have normal errors of `error_px` per coordinate."""
     instants = np.arange(spacing // 2, len(motion), spacing)
     noise = np.random.default_rng(0).normal(0, error_px, (len(instants), 8))
-    to_corners = np.array([jacobian(knot, corners(shape)).reshape(8, 8) for knot in motion[instants]])
-    knots = from_parameters(parameters(motion[instants]) + np.linalg.solve(to_corners, noise[..., None])[..., 0])
+    to_corners = np.array([g.jacobian(knot, g.corners(shape)).reshape(8, 8) for knot in motion[instants]])
+    knots = g.from_parameters(g.parameters(motion[instants]) + np.linalg.solve(to_corners, noise[..., None])[..., 0])
     contribution = discover().find("interpolator", name).contribution
     context = StageContext(StreamInfo(len(motion), *shape, None), BinaryResponse())
     trajectory = contribution.build(contribution.config(), context).fit(instants.astype(float), knots, None)
     frames = np.arange(instants[0], instants[-1] + 1)
-    return corner_displacements(trajectory.at(frames), motion[frames], shape).mean(axis=1)
+    return g.corner_displacements(trajectory.at(frames), motion[frames], shape).mean(axis=1)
 
 
 def draw_errors(panel: Axes, title: str, spacing: int, errors: dict[str, NDArray[np.float64]]) -> None:
@@ -95,9 +80,9 @@ def draw_errors(panel: Axes, title: str, spacing: int, errors: dict[str, NDArray
 def turned(angles: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return the maps that rotate a frame about its centre."""
     height, width = shape
-    centred = translation((width - 1) / 2, (height - 1) / 2)
+    centred = g.translation((width - 1) / 2, (height - 1) / 2)
     turns = np.tile(np.eye(3), (len(angles), 1, 1))
     turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angles)
     turns[:, 1, 0] = np.sin(angles)
     turns[:, 0, 1] = -turns[:, 1, 0]
-    return centred @ turns @ inverse(centred)
+    return centred @ turns @ g.inverse(centred)

@@ -1,64 +1,59 @@
-"""The scan of examples/pipelines: its panorama, what other specs make of it, and hot pixels."""
+"""The scan of examples/pipelines, what other specs make of it, and hot pixels; and a real capture."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
-import cv2
 import numpy as np
-import tifffile
-from picture_parts import beside, labelled, picture
+import picture_parts as draw
+from harness import EXAMPLES, Study
 
-from photonpano import load_spec
+from photonpano import FrameSpan, load_panorama, load_spec, open_source, run
+from photonpano.geometry import apply
 
-from .captures import EXAMPLES, done, finish, in_folder, written
+from . import finished
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from picture_parts import Picture
-
-WAYS = ("scan", "constant groups", "naive average")
-"""Specs of examples/pipelines, for the capture beside them."""
-PLACE = (235, 85)
-"""Centre of the compared place, in pixels of the reference frame, which is the same for all specs."""
+WAYS = ("scan", "constant-groups", "naive-average")  # specs of examples/pipelines, for the capture beside them
+PLACE = (235, 85)  # centre of the compared place, in pixels of the reference frame, which is the same for all specs
 
 
-def pictures(folder: Path) -> Iterator[tuple[str, Picture]]:
+def pictures(study: Study) -> Iterator[tuple[str, draw.Picture]]:
     """Yield each picture with its name."""
-    capture = written(load_spec(EXAMPLES / "capture.yaml"), folder / "capture.npy")
-    for name in WAYS:
-        path = EXAMPLES / f"{name.replace(' ', '-')}.yaml"
-        overrides = [f"source.with.path={capture.absolute()}"]
-        finish(load_spec(path, overrides=overrides, output=in_folder(folder, name)), name, capture)
-    yield "first-panorama.png", picture(tifffile.imread(in_folder(folder, "scan") / "panorama.tiff"), 0.67)
-    yield "baselines.png", baselines(folder)
-    yield "hot-pixels.png", hot_pixels(folder)
+    capture = study.capture("capture", study.spec("pipelines/capture"))
+    path = {"source.with.path": str(capture.absolute())}
+    runs = {name: finished(study, name, study.spec(f"pipelines/{name}", path), capture) for name in WAYS}
+    panoramas = {f"{name}.yaml": load_panorama(folder) for name, folder in runs.items()}
+    yield "first-panorama.png", draw.picture(panoramas["scan.yaml"].flux, 0.67)
+    places = {}
+    for name, panorama in panoramas.items():
+        x, y = apply(panorama.canvas, np.array([PLACE]))[0].round().astype(int)
+        places[name] = draw.magnified(draw.picture(draw.around(panorama.flux, (x, y), (54, 54)), 0.67), 3)
+    yield "baselines.png", draw.beside(draw.all_labelled(places))
+    yield "hot-pixels.png", hot_pixels(study)
 
 
-def baselines(folder: Path) -> Picture:
-    """Return the same place of the panoramas of several specs, magnified three times."""
-    pictures = []
-    for name in WAYS:
-        file = f"{name.replace(' ', '-')}.yaml"
-        flux = tifffile.imread(in_folder(folder, name) / "panorama.tiff")
-        with np.load(in_folder(folder, name) / "trajectory.npz") as trajectory:
-            x, y = (trajectory["canvas"] @ (*PLACE, 1))[:2].round().astype(int)
-        crop = picture(flux[y - 54 : y + 54, x - 54 : x + 54], 0.67)
-        pictures.append(labelled(cv2.resize(crop, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST).astype(np.uint8), file))
-    return beside(pictures)
-
-
-def hot_pixels(folder: Path) -> Picture:
+def hot_pixels(study: Study) -> draw.Picture:
     """Return a place of two panoramas of a sensor with hot pixels, magnified three times: uncorrected and corrected."""
-    pictures = []
-    for name, corrections in {"hot pixels": "[]", "hot pixels masked": "[hot-pixels]"}.items():
-        overrides = [f"corrections={corrections}", "source.with.sensor.hot_rate=[0.5, 2]"]
-        plan = load_spec(EXAMPLES / "hot-pixels.yaml", overrides=overrides, output=in_folder(folder, name))
-        flux = tifffile.imread(done(plan) / "panorama.tiff")
-        y, x = flux.shape[0] // 2, flux.shape[1] // 2
-        crop = picture(flux[y - 54 : y + 54, x - 72 : x + 72], 0.67)
-        large = cv2.resize(crop, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST).astype(np.uint8)
-        pictures.append(labelled(large, f"corrections: {corrections}"))
-    return beside(pictures)
+    places = {}
+    for corrections in ([], ["hot-pixels"]):
+        changes = {"corrections": corrections, "source.with.sensor.hot_rate": [0.5, 2]}
+        flux = load_panorama(study.run("hot-pixels", study.spec("pipelines/hot-pixels", changes))).flux
+        part = draw.around(flux, (flux.shape[1] // 2, flux.shape[0] // 2), (72, 54))
+        places[f"corrections: [{', '.join(corrections)}]"] = draw.magnified(draw.picture(part, 0.67), 3)
+    return draw.beside(draw.all_labelled(places))
+
+
+def mandrill(study: Study) -> Iterator[tuple[str, draw.Picture]]:
+    """Yield a binary frame, the average of all frames, and the panorama of a real capture; print how the picture turns."""
+    folder = study.folder / "mandrill"
+    plan = load_spec(EXAMPLES / "pipelines" / "mandrill.yaml", output=folder)
+    if not (folder / "run.json").exists():
+        print(next(each for each in run(plan).record["decisions"] if each["what"] == "start"))
+    with open_source(plan) as source:
+        n_frames = source.info.n_frames
+        frame = source.frames(FrameSpan(n_frames // 2, n_frames // 2 + 1))[0] * np.uint8(255)
+        average = source.counts(source.info.span) / np.float32(n_frames)
+    fluxes = average, load_panorama(folder).flux
+    shown = frame, *(draw.picture(np.nan_to_num(flux).astype(np.float32), draw.white_of(flux)) for flux in fluxes)
+    labels = f"one frame of {n_frames}", f"the {n_frames} frames, averaged", f"the same {n_frames} frames, as a panorama"
+    yield "mandrill.png", draw.beside(draw.all_labelled(dict(zip(labels, shown, strict=True))))

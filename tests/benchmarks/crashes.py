@@ -1,19 +1,20 @@
-"""Kill runs, fill disks, and race runs for one folder; count what is neither wholly old nor wholly new.
+"""Kill runs, fill disks, race runs for one folder, and resume killed runs; count what is neither wholly old nor wholly new.
 
     python tests/benchmarks/crashes.py kills --number 100 --seed 0
     python tests/benchmarks/crashes.py disks --number 20
     python tests/benchmarks/crashes.py races --number 50 --at-once 2
+    python tests/benchmarks/crashes.py resumes --number 100 --writing 30
 
 Every trial works on a simulated capture of 48x64 px in a temporary folder. `disks` mounts file systems in memory, which takes
-the rights of root; without them, it limits the size of files only. The exit code is 1 if a trial fails.
+the rights of root; without them, it limits the size of files only. `resumes` compares the results of killed and resumed runs
+with those of an unbroken run: `--writing` of its runs die in the middle of writing a file of the work folder, of which a part
+is left, the others at random moments, and a quarter of these twice; everything that is found is written at once there, so that
+a kill may fall between any two results. The exit code is 1 if a trial fails.
 """
 
 from __future__ import annotations
 
-import argparse
-import importlib
 import json
-import multiprocessing
 import os
 import random
 import resource
@@ -26,8 +27,18 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest import mock
+
+import numpy as np
+from harness import command, in_child, passing, simulator
+
+from photonpano import load_spec, parse_spec, run, simulate
+from photonpano.cli import main as program
+from photonpano.record import contents
 
 SPEC = """version: 1
 source: {{use: packed-npy, with: {{path: cube.npy, frame_rate_hz: 96800}}}}
@@ -38,6 +49,7 @@ refine: []
 run: {{seed: {seed}, threads: 1}}
 output: {{directory: runs/scan}}
 """
+RESULTS = ("trajectory.npz", "panorama.tiff", "coverage.tiff")
 _CHANGES = ("os.rename", "os.mkdir", "os.rmdir", "os.remove", "os.link", "shutil.rmtree", "ctypes.dlsym")
 """What a process tells its audit hooks before the system changes names of files; `ctypes.dlsym` comes before the exchange."""
 
@@ -48,54 +60,41 @@ class Run:
     Args:
         folder: the current folder of the process.
         options: of `photonpano run`.
-        killed_at: the number of the change of a file at which the process kills itself; 0 for none.
-        largest: the largest size of a file, in bytes; 0 for no limit.
+        dies: called in the process before the run begins: it sees to its death.
     """
 
-    def __init__(self, folder: Path, *options: str, killed_at: int = 0, largest: int = 0) -> None:
+    def __init__(self, folder: Path, *options: str, dies: Callable[[], object] = lambda: None) -> None:
         self._printed = tempfile.TemporaryFile("w+")  # noqa: SIM115  # closed with the object
-        self._pid = os.fork()
-        self.code: int | None = None
-        if not self._pid:
-            if largest:
-                resource.setrlimit(resource.RLIMIT_FSIZE, (largest, resource.RLIM_INFINITY))
-            self._work(folder, options, killed_at)
+        self._process = get_context("fork").Process(target=self._work, args=(folder, options, dies))
+        self._process.start()
 
-    def _work(self, folder: Path, options: tuple[str, ...], killed_at: int) -> None:
+    def _work(self, folder: Path, options: tuple[str, ...], dies: Callable[[], object]) -> None:
         os.chdir(folder)
         for stream in (1, 2):
             os.dup2(self._printed.fileno(), stream)
         sys.argv = ["photonpano", "run", "scan.yaml", *options]
-        if killed_at:
-            sys.addaudithook(_killer(killed_at))
-        code = 1
-        try:
-            main_program()
-        except SystemExit as ended:
-            code = ended.code if isinstance(ended.code, int) else 1
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
+        dies()
+        program()
 
     def kill_after(self, seconds: float) -> None:
         """Kill the process after a time, unless it ends before."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            if os.waitid(os.P_PID, self._pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
-                return
-            time.sleep(0.002)
-        os.kill(self._pid, signal.SIGKILL)
+        self._process.join(seconds)
+        self._process.kill()
 
     def wait(self) -> str:
-        """Wait for the end, and return what was printed; `code` is the exit code then."""
-        _, status = os.waitpid(self._pid, 0)
-        self.code = os.waitstatus_to_exitcode(status)
+        """Wait for the end, and return what was printed."""
+        self._process.join()
         self._printed.seek(0)
         return self._printed.read()
 
+    @property
+    def code(self) -> int | None:
+        """The exit code of the process, negative of a signal."""
+        return self._process.exitcode
 
-def _killer(number: int) -> Callable[[str, tuple[Any, ...]], None]:
+
+def dying_at_change(number: int) -> None:
+    """Have this process kill itself at the change of a file of this number, of those that matter."""
     left = number
 
     def count(event: str, args: tuple[Any, ...]) -> None:
@@ -106,45 +105,29 @@ def _killer(number: int) -> Callable[[str, tuple[Any, ...]], None]:
             if not left:
                 os.kill(os.getpid(), signal.SIGKILL)
 
-    return count
+    sys.addaudithook(count)
 
 
-def main_program() -> None:
-    """Run the command line."""
-    from photonpano.cli import main
+def dying_in_file(number: int, part: float) -> None:
+    """Have this process kill itself when the archive of this number was written, of which only a part reaches the disk."""
+    write, left = np.savez, number
 
-    main()
+    def dying(path: Any, **arrays: Any) -> None:
+        nonlocal left
+        write(path, **arrays)
+        left -= 1
+        if not left:
+            os.truncate(path, int(part * Path(path).stat().st_size))
+            os.kill(os.getpid(), signal.SIGKILL)
 
-
-def preload() -> None:
-    """Import what a run needs."""
-    for name in (
-        "photonpano.api.run", "photonpano.pipeline.run", "photonpano.specs", "photonpano.residuals.verdict",
-        "matplotlib.figure", "matplotlib.backends.backend_svg", "scipy.sparse.linalg", "jinja2", "rich.progress", "numba",
-    ):  # fmt: skip
-        importlib.import_module(name)
-    from photonpano import discover
-    from photonpano.pipeline import run
-
-    discover()
-    # Drawing takes longer than the rest of such a run; the files matter here.
-    run.render_report = lambda *_: "<html>" + 200_000 * " "
+    mock.patch("numpy.savez", dying).start()
 
 
-def prepare(folder: Path, seed: int = 0) -> None:
+def prepare(folder: Path) -> None:
     """Simulate the capture, and write the spec."""
-    from photonpano import parse_spec, simulate
-
-    settings = {"n_frames": 200, "frame_shape": [48, 64], "path": {"kind": "pan", "length_px": 16}, "flux": 0.5}
-    simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": settings}}), folder / "cube.npy")
-    write_spec(folder, seed)
-
-
-def warm_up(folder: Path) -> None:
-    """Run once in this process, so that those forked from it find the machine code loaded."""
-    from photonpano import load_spec, run
-
-    run(load_spec(folder / "scan.yaml"))
+    capture = simulator(n_frames=200, frame_shape=[48, 64], path={"kind": "pan", "length_px": 16}, flux=0.5)
+    simulate(parse_spec(capture), folder / "cube.npy")
+    write_spec(folder, 0)
 
 
 def write_spec(folder: Path, seed: int) -> None:
@@ -154,19 +137,17 @@ def write_spec(folder: Path, seed: int) -> None:
 
 def state(folder: Path) -> tuple[int | None, list[str]]:
     """Return the seed of the run that the folder holds, None if there is none; and what is wrong with it."""
-    from photonpano.record.contents import RESULTS, changed_files, finish_run_folder
-
     directory = folder / "runs" / "scan"
     if not directory.exists():
         return None, []
-    finish_run_folder(directory)
-    changed = changed_files(directory)
+    contents.finish_run_folder(directory)
+    changed = contents.changed_files(directory)
     if changed is None:
         return None, ["run.json is missing or lists nothing"]
     record = json.loads((directory / "run.json").read_text())
     missing = [name for name in record["files"] if not (directory / name).exists()]
     other = sorted({path.name for path in directory.iterdir()} - {*record["files"], "run.json"})
-    lacking = sorted(RESULTS - {"report.html", "run.json", "light.npz", "vignette.npz", *record["files"]})
+    lacking = sorted(contents.RESULTS - {"report.html", "run.json", "light.npz", "vignette.npz", *record["files"]})
     return record["seed"], [*changed, *missing, *(f"more: {name}" for name in other), *(f"lacks {name}" for name in lacking)]
 
 
@@ -177,17 +158,22 @@ def leftovers(folder: Path) -> list[str]:
     return sorted(beside | inside)
 
 
+def duration_s(folder: Path, *options: str) -> float:
+    """Return how long an unbroken run takes, which need not compile."""
+    Run(folder, *options).wait()
+    start = time.perf_counter()
+    Run(folder, *options).wait()
+    return time.perf_counter() - start
+
+
 def kills(folder: Path, number: int, seed: int) -> list[str]:
     """Kill runs at random moments, a third of them while they write, and run again after each tenth."""
     rng, wrong, writing, counts = random.Random(seed), [], 0, {"old": 0, "new": 0}
-    Run(folder).wait()  # which may compile
-    start = time.perf_counter()
-    Run(folder).wait()
-    whole_s, old = time.perf_counter() - start, 0
+    whole_s, old = duration_s(folder), 0
     for index in range(1, number + 1):
         write_spec(folder, index)
         if index % 3 == 0:
-            process = Run(folder, killed_at=rng.randint(1, 60))
+            process = Run(folder, dies=partial(dying_at_change, rng.randint(1, 60)))
         else:
             process = Run(folder)
             process.kill_after(rng.uniform(0, whole_s))
@@ -221,8 +207,8 @@ def disks(folder: Path, number: int, seed: int) -> list[str]:
         Run(folder).wait()
         for index, size in enumerate(sizes, start=1):
             write_spec(folder, index)
-            with way(folder / "runs", size) as largest:
-                process = Run(folder, largest=largest)
+            with way(folder / "runs", size) as dies:
+                process = Run(folder, dies=dies)
                 printed = process.wait()
                 found, problems = state(folder)
             counts[process.code] += 1
@@ -242,7 +228,7 @@ def disks(folder: Path, number: int, seed: int) -> list[str]:
 
 
 @contextmanager
-def _disk(runs: Path, room: int) -> Iterator[int]:
+def _disk(runs: Path, room: int) -> Iterator[Callable[[], object]]:
     """Move the run folder to a file system in memory that has room for some bytes more; afterwards move it back."""
     with tempfile.TemporaryDirectory() as kept:
         shutil.copytree(runs, kept, dirs_exist_ok=True)
@@ -254,7 +240,7 @@ def _disk(runs: Path, room: int) -> Iterator[int]:
             disk = os.statvfs(runs)
             used = (disk.f_blocks - disk.f_bfree) * disk.f_frsize
             subprocess.run(["mount", "-o", f"remount,size={used + room}", runs], check=True)
-            yield 0
+            yield lambda: None
             shutil.rmtree(kept)
             shutil.copytree(runs, kept)
         finally:
@@ -264,10 +250,10 @@ def _disk(runs: Path, room: int) -> Iterator[int]:
 
 
 @contextmanager
-def _limit(runs: Path, room: int) -> Iterator[int]:
+def _limit(runs: Path, room: int) -> Iterator[Callable[[], object]]:
     """Limit the size of files."""
     del runs
-    yield room
+    yield partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
 
 
 def races(folder: Path, number: int, seed: int, at_once: int = 2) -> list[str]:
@@ -288,28 +274,59 @@ def races(folder: Path, number: int, seed: int, at_once: int = 2) -> list[str]:
     return wrong
 
 
-def main() -> int:
+def resumes(folder: Path, number: int, seed: int, writing: int) -> list[str]:
+    """Kill runs, resume them until they are finished, and compare their results with those of an unbroken run."""
+    rng = np.random.default_rng(seed)
+    levels = ("--set", "levels=2", "--set", "resample.with.group_size=20", "--set", "refine=short-spans")
+    whole_s, n_killed, wrong = duration_s(folder, *levels), 0, []
+
+    def results() -> list[bytes]:
+        return [(folder / "runs" / "scan" / name).read_bytes() for name in RESULTS]
+
+    expected = results()
+    for index in range(number):
+        shutil.rmtree(folder / "runs" / "scan")
+        if index < writing:
+            killed = [Run(folder, "--resume", *levels, dies=partial(dying_in_file, rng.integers(1, 35), rng.uniform()))]
+            killed[0].wait()
+        else:
+            killed = []
+            for moment in rng.uniform(0, whole_s, 2 if index % 4 == 0 else 1):
+                killed.append(Run(folder, "--resume", *levels))
+                killed[-1].kill_after(moment)
+                killed[-1].wait()
+        n_killed += sum(process.code == -signal.SIGKILL for process in killed)
+        printed = Run(folder, "--resume", *levels).wait()
+        if any(process.code not in (0, -signal.SIGKILL) for process in killed):
+            wrong.append(f"run {index} failed by itself: {printed}")
+        elif results() != expected or leftovers(folder):
+            wrong.append(f"run {index}: the same bytes: {results() == expected}, left {leftovers(folder)}: {printed}")
+    same = f"{number - len(wrong)} of {number} runs ended with the same bytes and left nothing behind"
+    print(f"{same}; {n_killed} kills hit a run; an unbroken run takes {whole_s:.2f} s")
+    return wrong
+
+
+TRIALS = {"kills": kills, "disks": disks, "races": races, "resumes": resumes}
+
+
+def main(trial: Path, number: int = 20, seed: int = 0, at_once: int = 2, writing: int = 6) -> bool:
     """Run one trial."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("trial", choices=["kills", "disks", "races"])
-    parser.add_argument("--number", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--at-once", type=int, default=2)
-    options = parser.parse_args()
+    if str(trial) not in TRIALS:
+        raise SystemExit(f"no trial is called {trial}; there are {', '.join(TRIALS)}")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        preload()
-        simulation = multiprocessing.get_context("spawn").Process(target=prepare, args=(folder,))
-        simulation.start()  # in a process of its own: a forked process keeps the locks of threads that it has not got
-        simulation.join()
-        warm_up(folder)
-        more = {"at_once": options.at_once} if options.trial == "races" else {}
-        wrong: list[str] = globals()[options.trial](folder, options.number, options.seed, **more)
+    # Drawing takes longer than the rest of such a run; the files matter here.
+    drawn = mock.patch("photonpano.pipeline.run.render_report", return_value="<html>" + 200_000 * " ")
+    with passing() as study, drawn:
+        in_child(prepare, study.folder)  # a forked process keeps the locks of threads that it has not got
+        run(load_spec(study.folder / "scan.yaml"))  # so that those forked from this process find the machine code loaded
+        more = {"races": {"at_once": at_once}, "resumes": {"writing": writing}}.get(str(trial), {})
+        if "writing" in more:
+            mock.patch("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0).start()
+        wrong = TRIALS[str(trial)](study.folder, number, seed, **more)
     print(*wrong, sep="\n")
     return bool(wrong)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command(main)

@@ -10,29 +10,26 @@ refused, and failures, which are listed with their numbers: `--first 123` begins
 
 from __future__ import annotations
 
-import argparse
 import os
 import random
 import resource
-import select
-import subprocess
 import sys
-import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 from fuzz_files import FIXED, KINDS, read, whole
+from harness import command, passing, table
 
 from photonpano import PhotonpanoError
 
-HANGS_S = 5.0
-"""A file that takes longer is a failure; also one with a first look, which takes 2 s at most to find a loop."""
-STARTS_S = 1800.0
-"""A worker imports and compiles first, which takes long at a low priority."""
+HANGS_S = 5.0  # a file that takes longer is a failure; also one with a first look, which takes 2 s at most to find a loop
+STARTS_S = 1800.0  # a worker imports and compiles first, which takes long at a low priority
 MEMORY_BYTES = 8 * 1024**3
 LOOKED_AT = {"mask-png", "mat73", "ubicept", "tiff-folder", "tiff", "tiff-zlib", "avi", "mkv", "mp4"}
 """Kinds that a process of its own looks at first."""
@@ -41,6 +38,9 @@ LOOKING = (
     *(f"photonpano_sensors.{module}" for module in ("mat_parts", "ubicept", "intensity.pictures", "intensity.video_index")),
 )
 """Modules that have it look."""
+
+
+OUTCOMES = ("read", "refused", "looked", "failed")
 
 
 def damaged(content: bytes, rng: random.Random) -> bytes:
@@ -78,8 +78,8 @@ def cases(name: str, seed: int, looks: bool) -> Iterator[tuple[int, Callable[[],
         for name_of_module in LOOKING:
             __import__(name_of_module)
             sys.modules[name_of_module].look_first = lambda *_: None
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
+    with passing() as study:
+        folder = study.folder
         path = whole(name, folder)
         fixed = {folder / each for each in FIXED.get(name, ())}
         contents = {file: file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file() and file not in fixed}
@@ -104,136 +104,106 @@ def _is_of(name: str, file: Path) -> bool:
     return file.name == "cube.truth.npz" if name == "truth" else file.parent.name == "run" and file.suffix != ".png"
 
 
-def work(name: str, seed: int, first: int, only: bool, looks: bool) -> None:
-    """Read damaged files, and print what became of each; the parent ends it."""
+def work(pipe: Connection, name: str, seed: int, first: int, looks: bool) -> None:
+    """Read damaged files, and tell what became of each: its number, a word and a message; the parent ends it."""
+    silent = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(silent, stream)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     for number, case in cases(name, seed, looks):
         if number < first:
             continue
-        print(f"begin {number}", flush=True)
+        pipe.send((number, "begins", ""))
         try:
             case()
-            print(f"read {number}", flush=True)
+            word, text = "read", ""
         except PhotonpanoError as error:
-            one_line = " ".join(str(error).split())
-            print(f"refused {number} {one_line}" if one_line else f"failed {number} an error without a message", flush=True)
+            word, text = ("refused", "") if str(error).strip() else ("failed", "an error without a message")
         except Exception as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
-            message = " ".join(f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})".split())
-            print(f"failed {number} {message}", flush=True)
-        if only:
-            return
+            word, text = "failed", f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno})"
+        pipe.send((number, word, " ".join(text.split())))
 
 
 class Worker:
     """A process that reads damaged files of a kind."""
 
-    def __init__(self, name: str, seed: int, first: int, *, looks: bool = False, only: bool = False) -> None:
-        flags = [flag for flag, is_on in (("--looks", looks), ("--only-one", only)) if is_on]
-        command = [sys.executable, __file__, "--work", name, "--seed", str(seed), "--first", str(first), *flags]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        self._lines: list[str] = []
-        self._rest = b""
+    def __init__(self, name: str, seed: int, first: int, looks: bool = False) -> None:
+        context = get_context("spawn")
+        self._pipe, told = context.Pipe(duplex=False)
+        self._process = context.Process(target=work, args=(told, name, seed, first, looks), daemon=True)
+        self._process.start()
+        told.close()
 
-    def line(self, seconds: float) -> str | None:
-        """Return the next line; "" if the process has ended, None if the time is over."""
-        assert self._process.stdout is not None
-        end = time.monotonic() + seconds
-        while not self._lines:
-            if not select.select([self._process.stdout], [], [], max(0.0, end - time.monotonic()))[0]:
-                return None
-            data = os.read(self._process.stdout.fileno(), 65536)
-            if not data:
-                return ""
-            *lines, self._rest = (self._rest + data).split(b"\n")
-            self._lines += [line.decode(errors="replace") for line in lines]
-        return self._lines.pop(0)
+    def said(self, seconds: float) -> tuple[int, str, str]:
+        """Return what it tells next; or that it is dead, after which it is so if it was not."""
+        text = "the process ended"
+        with suppress(EOFError, OSError):
+            if self._pipe.poll(seconds):
+                return self._pipe.recv()
+            text = f"takes longer than {seconds:g} s"
+        return -1, "dead", f"{text}: {self.end()}"
 
-    def end(self) -> int:
+    def end(self) -> int | None:
         """Kill the process, and return its exit code."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(0.5)
+        self._process.join(0.5)
         self._process.kill()
-        return self._process.wait()
-
-
-def outcome(worker: Worker, seconds: float) -> tuple[str, str]:
-    """Return what became of a case that a worker has begun."""
-    line = worker.line(seconds)
-    if line is None:
-        worker.end()
-        return "failed", f"takes longer than {seconds:g} s"
-    if not line:
-        return "failed", f"the process ended with {worker.end()}"
-    word, _, rest = line.partition(" ")
-    return word, rest.partition(" ")[2]
+        self._process.join()
+        return self._process.exitcode
 
 
 def again_with_look(name: str, seed: int, number: int) -> tuple[str, str]:
     """Read a file that was a failure once more, with a first look."""
-    worker = Worker(name, seed, number, looks=True, only=True)
-    if not worker.line(120):
-        return "failed", f"the worker ended with {worker.end()}"
-    word, text = outcome(worker, HANGS_S + 10)
-    worker.end()
-    return ("looked" if word == "refused" else word), text
+    worker = Worker(name, seed, number, looks=True)
+    _, word, text = worker.said(120)
+    if word != "dead":
+        _, word, text = worker.said(HANGS_S + 10)
+        worker.end()
+    return {"refused": "looked", "dead": "failed"}.get(word, word), text
 
 
-def fuzz(name: str, seed: int, seconds: float) -> tuple[Counter[str], dict[str, list[int]]]:
+def fuzz(name: str, seed: int, seconds: float, first: int = 0) -> tuple[Counter[str], dict[str, list[int]]]:
     """Damage files of a kind for some time; return counts, and the numbers of failures by their messages."""
     counts: Counter[str] = Counter()
     failures: dict[str, list[int]] = {}
-    first, end = 0, float("inf")
-    worker = Worker(name, seed, first)
+    end, worker = float("inf"), Worker(name, seed, first)
     try:
         while time.monotonic() < end:
-            begun = worker.line(STARTS_S)
+            number, word, text = worker.said(STARTS_S)
             end = min(end, time.monotonic() + seconds)  # without the imports of the first file
-            if not begun:
-                raise RuntimeError(f"{name}: the worker ended with {worker.end()}")
-            first = int(begun.split()[1]) + 1
-            word, text = outcome(worker, HANGS_S)
-            dead = text.startswith(("takes longer", "the process ended"))
-            if dead or (word == "failed" and name in LOOKED_AT):  # another process may have taken the time
-                word, text = again_with_look(name, seed, first - 1)
-            if dead:
-                worker = Worker(name, seed, first)
+            if word == "dead":
+                raise RuntimeError(f"{name}: {text}")
+            _, word, text = worker.said(HANGS_S)
+            if word == "dead":
+                worker = Worker(name, seed, number + 1)
+            if word == "dead" or (word == "failed" and name in LOOKED_AT):  # another process may have taken the time
+                word, text = again_with_look(name, seed, number)
             counts[word] += 1
             if word == "failed":
-                failures.setdefault(text, []).append(first - 1)
+                failures.setdefault(text, []).append(number)
     finally:
         worker.end()
     return counts, failures
 
 
-def main() -> None:
-    """Fuzz the kinds, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--kinds", nargs="*", default=KINDS, choices=KINDS)
-    parser.add_argument("--seconds", type=float, default=60, help="seconds for each kind")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--work", help=argparse.SUPPRESS)
-    parser.add_argument("--first", type=int, default=0, help="number of the first case")
-    parser.add_argument("--looks", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--only-one", action="store_true", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.work:
-        work(options.work, options.seed, options.first, options.only_one, options.looks)
-        return
-    print("| kind | read | refused | by the first look | failures |\n| --- | --- | --- | --- | --- |", flush=True)
+def rows(kinds: Sequence[str], seed: int, seconds: float, first: int) -> Iterator[Sequence[object]]:
+    """Fuzz the kinds: yield the rows of the table, and list the failures."""
     total: Counter[str] = Counter()
-    for name in options.kinds:
-        counts, failures = fuzz(name, options.seed, options.seconds)
+    for name in kinds:
+        counts, failures = fuzz(name, seed, seconds, first)
         total += counts
-        _print_row(name, counts)
+        yield name, *(counts[word] for word in OUTCOMES)
         for message, numbers in failures.items():
             print(f"  {len(numbers)} of {name}, such as {numbers[:5]}: {message}", file=sys.stderr, flush=True)
-    _print_row("all", total)
+    yield "all", *(total[word] for word in OUTCOMES)
 
 
-def _print_row(name: str, counts: Counter[str]) -> None:
-    print("|", " | ".join([name, *(str(counts[word]) for word in ("read", "refused", "looked", "failed"))]), "|", flush=True)
+def main(kinds: Sequence[str] = tuple(KINDS), seconds: float = 60.0, seed: int = 0, first: int = 0) -> None:
+    """Fuzz the kinds, each for so many seconds, and print a table."""
+    if wrong := {*kinds} - {*KINDS}:
+        raise SystemExit(f"no kind is called {', '.join(wrong)}; there are {', '.join(KINDS)}")
+    table(("kind", "read", "refused", "by the first look", "failures"), rows(kinds, seed, seconds, first))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -2,63 +2,60 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from functools import cache
 from pathlib import Path
 
+import av
+import cv2
+import h5py
 import numpy as np
+import tifffile
+from harness import groups, packed, simulator
+from scipy.io import savemat
 
-from photonpano import FrameSpan, InputError, SourceContext, discover, evaluate, load_spec, run
+from photonpano import FrameSpan, InputError, SourceContext, discover, evaluate, load_spec, run, simulate
 from photonpano.pipeline.components import build_source, open_source
 from photonpano.registry import Catalog
 from photonpano.specs import parse_spec
 
-MOST_READ = 2**26
-"""Pixels of a damaged capture that are summed at most."""
+MOST_READ = 2**26  # pixels of a damaged capture that are summed at most
 FRAMES = np.random.default_rng(0).integers(0, 2, (64, 24, 32), dtype=np.uint8)
 GREY = (np.random.default_rng(1).random((12, 48, 64)) * 255).astype(np.uint8)
 
 
 def whole(name: str, folder: Path) -> Path:
     """Write a valid file or folder of a kind, and return what is read; all files in the folder may be damaged."""
-    packed = np.packbits(FRAMES, axis=2)
+    bits = np.packbits(FRAMES, axis=2)
     path = folder / "capture"
     match name:
         case "packed-npy":
-            np.save(path := folder / "capture.npy", packed)
+            np.save(path := folder / "capture.npy", bits)
         case "npy":
             np.save(path := folder / "capture.npy", FRAMES)
         case "npy-gz":
-            import gzip
-
-            np.save(folder / "x.npy", packed)
             path = folder / "capture.npy.gz"
-            path.write_bytes(gzip.compress((folder / "x.npy").read_bytes()))
-            (folder / "x.npy").unlink()
+            with gzip.open(path, "wb") as archive:
+                np.save(archive, bits)
         case "spad512-sparse":
             path = folder / "capture.bin"
             path.write_bytes(np.array([5, 17, 262144, 3, 9, 262144], "<u4").tobytes())
         case "mat5" | "mat5-compressed":
-            from scipy.io import savemat
-
             content = {"TEXT": "text", "OUTPUT": np.moveaxis(FRAMES, 0, -1)}
             savemat(folder / "part_1.mat", content, do_compression=name != "mat5")
             path = folder
         case "mat73":
-            import h5py
-
             with h5py.File(folder / "part_1.mat", "w") as file:
                 file.create_dataset("OUTPUT", data=FRAMES.swapaxes(1, 2), chunks=(16, 32, 24), compression="gzip")
             path = folder
         case "ubicept":
-            import h5py
-
             with h5py.File(path := folder / "capture.ubi.h5", "w") as file:
                 for index, frame in enumerate(FRAMES[:12]):
                     file.create_dataset(f"raw/{index}", data=frame[..., None, None], chunks=(12, 32, 1, 1), compression="gzip")
                     file[f"raw/{index}"].attrs["metadata"] = '{"num_integrated_binary_frames": 3}'
         case "visionsim":
-            np.save(folder / "frames.npy", packed)
+            np.save(folder / "frames.npy", bits)
             keys = {"h": 24, "w": 32, "c": 1, "fps": 9.5, "bitpack": True, "bitpack_dim": 2, "file_path": "frames.npy"}
             (folder / "transforms.json").write_text(json.dumps(keys | {"frames": [{}] * 64}))
             path = folder
@@ -69,37 +66,29 @@ def whole(name: str, folder: Path) -> Path:
             path.write_bytes(header.read_bytes())
             (folder / "a.mraw").write_bytes(bytes(7_913_472) if name == "mraw-cih" else (data / "beam.mraw").read_bytes())
         case "png":
-            import cv2
-
             for index, frame in enumerate(GREY[:4]):
                 cv2.imwrite(str(folder / f"{index}.png"), frame)
             path = folder
         case "tiff-folder":
-            import tifffile
-
             for index, frame in enumerate(GREY[:4]):
                 tifffile.imwrite(folder / f"{index}.tif", frame, compression=None if index % 2 else "zlib")
             path = folder
         case "tiff" | "tiff-zlib":
-            import tifffile
-
             path = folder / "capture.tif"
             tifffile.imwrite(path, GREY, compression=None if name == "tiff" else "zlib", photometric="minisblack")
         case "avi" | "mkv" | "mp4":
             path = folder / f"capture.{name}"
             _film(path, {"avi": "mpeg4", "mkv": "ffv1", "mp4": "libx264"}[name])
         case "mask" | "mask-png" | "dark":
-            np.save(folder / "capture.npy", packed)
+            np.save(folder / "capture.npy", bits)
             if name == "mask-png":
-                import cv2
-
                 cv2.imwrite(str(folder / "mask.png"), FRAMES[0] * 255)
             elif name == "mask":
                 np.save(folder / "mask.npy", FRAMES[0].astype(bool))
             else:
                 np.savez_compressed(folder / "dark.npz", rates=np.full((24, 32), 1e-3), n_frames=np.array(9))
         case "spec":
-            np.save(folder / "capture.npy", packed)
+            np.save(folder / "capture.npy", bits)
             path = folder / "scan.yaml"
             path.write_text(SPEC)
         case "truth" | "run":
@@ -135,8 +124,6 @@ KINDS = [*SOURCES, "mask", "mask-png", "dark", "spec", "truth", "run"]
 
 
 def _film(path: Path, codec: str) -> None:
-    import av
-
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=30)
         stream.height, stream.width, stream.pix_fmt = 48, 64, "gray" if codec == "ffv1" else "yuv420p"
@@ -146,14 +133,10 @@ def _film(path: Path, codec: str) -> None:
 
 
 def _make_run(folder: Path) -> None:
-    from photonpano import simulate
-
-    scene = {"kind": "street", "width": 300, "height": 200}
-    source = {"scene": scene, "path": {"kind": "pan", "length_px": 20}, "flux": 1, "n_frames": 120, "frame_shape": [64, 96]}
-    simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": source}}), folder / "cube.npy")
-    keys = {"path": str(folder / "cube.npy")}
-    spec = {"version": 1, "source": {"use": "packed-npy", "with": keys}, "levels": 1, "resample": {"with": {"group_size": 30}}}
-    run(parse_spec(spec, output=folder / "run"))
+    scene, path = {"kind": "street", "width": 300, "height": 200}, {"kind": "pan", "length_px": 20}
+    capture = simulator(scene=scene, path=path, flux=1, n_frames=120, frame_shape=[64, 96])
+    simulate(parse_spec(capture), folder / "cube.npy")
+    run(parse_spec(packed(folder / "cube.npy", levels=1, resample=groups(30)), output=folder / "run"))
 
 
 def read(name: str, path: Path, folder: Path) -> None:

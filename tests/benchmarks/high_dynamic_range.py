@@ -12,25 +12,20 @@ along the true motion.
 
 from __future__ import annotations
 
-import argparse
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
-import cv2
 import numpy as np
+from harness import Expected, Study, command, passing, record_of, rendered, seen, simulator, to_reference
 from numpy.typing import NDArray
 
-from photonpano import FrameSpan, open_source, parse_spec, run
-from photonpano.context import Context
+from photonpano import load_trajectory, open_source, parse_spec
 from photonpano.evaluation import corner_errors
 from photonpano.geometry import Canvas, FrameTrajectory, canvas_of_box, inverse, normalised
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
-from photonpano.merging.panorama import render
-from photonpano.reading import Closing
 from photonpano_simulator.config import NightScene
 from photonpano_simulator.scenes import scene_flux
 
@@ -42,7 +37,6 @@ JUDGED = (1e-4, 10.0)
 LARGEST_ERROR, LEAST_WITHIN = 1.1, 0.95
 BRIGHTEST = 10.0
 DARK = 0.0013
-TOLERANCE_PX = 0.125
 CAMERAS = (
     ("still", 0.0, 0.0, False),
     ("trembling", 3.0, 0.0, False),
@@ -64,26 +58,6 @@ class Measured:
     gathered: DynamicRange
 
 
-class WithoutNoise(Closing):
-    """The expected counts of a simulation in place of its photons."""
-
-    def __init__(self, simulator: Any) -> None:
-        self.info, self.response, self.valid = simulator.info, simulator.response, simulator.valid
-        truth = simulator.truth()
-        self._scene, self._motion = truth["scene"], truth["homographies"]
-
-    def view(self, index: int) -> NDArray[np.float32]:
-        """Return the flux of the scene in a frame."""
-        height, width = self.info.frame_shape
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        seen = cv2.warpPerspective(self._scene, self._motion[index], (width, height), flags=flags)
-        return np.asarray(seen, np.float32)
-
-    def counts(self, span: FrameSpan) -> Any:
-        """Sum the expected counts of a span."""
-        return sum(-np.expm1(-self.view(index).astype(np.float64)) for index in range(span.start, span.stop)).astype(np.float32)
-
-
 def simulated(n_frames: int, seed: int, rms_px: float, dark: float, folder: Path) -> dict[str, Any]:
     """Return the spec of a simulation whose brightest pixel has the flux `BRIGHTEST`."""
     shape = {"width": SCENE[1], "height": SCENE[0], "seed": seed}
@@ -102,7 +76,7 @@ def simulated(n_frames: int, seed: int, rms_px: float, dark: float, folder: Path
         rates = folder / "dark.npy"
         np.save(rates, np.full(SHAPE, dark, np.float32))
         corrections = [{"dark-counts": {"dark": str(rates)}}]
-    return {"version": 1, "source": {"use": "simulator", "with": camera}, "corrections": corrections}
+    return simulator(**camera) | {"corrections": corrections}
 
 
 def uncorrected(source: Any) -> Any:
@@ -112,38 +86,39 @@ def uncorrected(source: Any) -> Any:
     return source
 
 
-def measured(
-    name: str, n_frames: int, seed: int, rms_px: float, dark: float, folder: Path, estimated: bool = False
-) -> Measured:
+def measured(name: str, n_frames: int, seed: int, rms_px: float, dark: float, study: Study, estimated: bool) -> Measured:
     """Simulate and render one capture, along the true motion or along that of a run."""
-    spec = simulated(n_frames, seed, rms_px, dark, folder)
+    spec = simulated(n_frames, seed, rms_px, dark, study.folder)
     with open_source(parse_spec(spec)) as source:
-        clean_frames = WithoutNoise(uncorrected(source))
-        motion: NDArray[np.float64] = uncorrected(source).truth()["homographies"]
-        true_motion = to_reference = normalised(inverse(motion[n_frames // 2]) @ motion)
+        bare = uncorrected(source)
+        scene, motion = bare.truth()["scene"], bare.truth()["homographies"]
+
+        def view(index: int) -> NDArray[np.float64]:
+            """Return the flux of the scene in a frame."""
+            return seen(scene, motion[index], SHAPE).astype(np.float64)
+
+        true_motion = found_motion = to_reference(motion)
         if estimated:
-            done = run(parse_spec(spec, output=folder / "run"), overwrite=True)
-            with np.load(done.directory / "trajectory.npz") as found:
-                to_reference = found["homographies"]
-            errors = corner_errors(to_reference, motion, SHAPE, np.ones(n_frames, np.bool_))
+            folder = study.run("run", spec)
+            found_motion, record = load_trajectory(folder).homographies, record_of(folder)
+            errors = corner_errors(found_motion, motion, SHAPE)
             true_motion = normalised(inverse(errors.alignment) @ motion)
-            print(f"\nerror of the estimated motion: {errors.errors_px.mean():.3f} px, at most {errors.errors_px.max():.3f} px")
-            expected = (done.record["motion"] or {}).get("std_px", np.nan)
-            print(f"expected by the run: {expected:.3f} px; verdict: {done.verdict.status}")
-            for reason in done.verdict.reasons:
-                print(f"  {reason}")
-        trajectory, span = FrameTrajectory(to_reference), source.info.span
+            print(f"\nerror of the estimated motion: {errors.mean_px:.3f} px, at most {errors.max_px:.3f} px")
+            expected = (record["motion"] or {}).get("std_px", np.nan)
+            print(f"expected by the run: {expected:.3f} px; verdict: {record['verdict']}")
+        trajectory = FrameTrajectory(found_motion)
         canvas: Canvas = canvas_of_box((12, 12, SHAPE[1] - 12, SHAPE[0] - 12), 1.0)
-        noise = CanvasNoise.of(source, trajectory, span, canvas)
-        panorama = render(source, trajectory, span, canvas, TOLERANCE_PX, Context(2))
+        noise = CanvasNoise.of(source, trajectory, source.info.span, canvas)
+        panorama = rendered(source, trajectory, canvas)
         if rms_px:
-            clean = render(clean_frames, FrameTrajectory(true_motion), span, canvas, TOLERANCE_PX, Context(2))
+            without_noise = Expected(bare, lambda index: -np.expm1(-view(index)))
+            clean = rendered(without_noise, FrameTrajectory(true_motion), canvas)
             # Of frames without noise, half a dark frame more is a bias.
             weight = clean.weight.astype(np.float64)
             lit = -np.expm1(-clean.flux.astype(np.float64)) * (weight + 0.5) / weight
             true = -np.log1p(-np.minimum(lit, 1 - 1e-9))
         else:
-            true = clean_frames.view(n_frames // 2)[12:-12, 12:-12].astype(np.float64)
+            true = view(n_frames // 2)[12:-12, 12:-12]
     gathered = DynamicRange(noise)
     gathered.add(panorama.flux, panorama.weight, 0, 0)
     std = noise.std(panorama.flux, panorama.weight)
@@ -174,22 +149,17 @@ def table(found: Measured) -> bool:
     return finite and rms <= LARGEST_ERROR and within >= LEAST_WITHIN
 
 
-def main() -> int:
-    """Print a table for each capture."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=100_000, help="frames over each point")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    given = parser.parse_args()
+def main(frames: int = 100_000, seeds: Sequence[int] = (0,)) -> bool:
+    """Print a table for each capture, of so many frames over each point."""
     holds = True
-    for seed in given.seeds:
-        with TemporaryDirectory() as folder:
+    for seed in seeds:
+        with passing() as study:
             for name, rms_px, dark, estimated in CAMERAS:
-                found = measured(f"{name}, seed {seed}", given.frames, seed, rms_px, dark, Path(folder), estimated)
-                holds &= table(found)
+                holds &= table(measured(f"{name}, seed {seed}", frames, seed, rms_px, dark, study, estimated))
     asked = f"error at most {LARGEST_ERROR} of the bound, {100 * LEAST_WITHIN:.0f} % within 2 std"
     print(f"\n{'holds' if holds else 'FAILS'}: {asked}")
-    return 0 if holds else 1
+    return not holds
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command(main)

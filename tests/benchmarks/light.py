@@ -10,23 +10,21 @@ frames at 96.8 kHz. With --false-alarms, small steady captures of many kinds are
 
 from __future__ import annotations
 
-import argparse
-import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
+from harness import Compared, Study, chosen, command, packed, passing, record_of, rendered, scores_of, simulator, table
 
-from photonpano import LocationError, evaluate, parse_spec, run, simulate
-from photonpano.captures.obstacles import timeline_of
+from photonpano import LocationError, parse_spec
+from photonpano.captures.repeats import timeline_of
+from photonpano.captures.writing import truth_path
 from photonpano.context import Context
 from photonpano.corrections import divided_by
 from photonpano.evaluation.images import covered, image_score, true_panorama, white_flux
-from photonpano.evaluation.trajectory import corner_errors
-from photonpano.geometry import Canvas, FrameTrajectory
 from photonpano.lighting import LIGHT_DECISION, find_light, in_light, in_light_of
-from photonpano.merging.panorama import render
 from photonpano.motion.loop import estimate_motion
 from photonpano.photometry import linear_to_srgb
 from photonpano.pipeline.components import build_levels, open_source
@@ -65,18 +63,17 @@ FLAWS: dict[str, Settings] = {
 """What disturbs a steady capture; a third are clean. Vignettes take between 20 and 80 % of the light of the corners."""
 
 
-def captured(folder: Path, name: str, settings: Settings, seed: int) -> Path:
+def captured(study: Study, settings: Settings, seed: int) -> Path:
     """Simulate a capture."""
-    width = settings["frame_shape"][1]
+    height, width = settings["frame_shape"]
     path = {"kind": "pan", "length_px": 1.5 * width, "shake": {"rms_px": 0.5}}
-    scene = {"kind": "street", "seed": seed, "width": 4 * width, "height": 4 * settings["frame_shape"][0]}
-    keys = {"scene": scene, "path": path, "seed": seed, "flux": FLUX, **settings}
-    return simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": keys}}), folder / f"{name}.npy").path
+    scene = {"kind": "street", "seed": seed, "width": 4 * width, "height": 4 * height}
+    return study.capture("light", simulator(**{"scene": scene, "path": path, "seed": seed, "flux": FLUX, **settings}))
 
 
-def source_of(cube: Path, settings: Settings) -> Settings:
-    """Return the section `source` that opens a capture."""
-    return {"use": "packed-npy", "with": {"path": str(cube), "frame_rate_hz": settings["frame_rate_hz"]}}
+def run_of(study: Study, cube: Path, settings: Settings) -> Compared:
+    """Run a capture with default settings."""
+    return Compared.of(study.run("run", packed(cube, settings["frame_rate_hz"])), cube)
 
 
 def true_light(truth: dict[str, np.ndarray], to_scene: FloatArray) -> Light:
@@ -97,50 +94,28 @@ def true_light(truth: dict[str, np.ndarray], to_scene: FloatArray) -> Light:
     return Light(steady.gain, waves, truth["lamps"], to_scene, 0.0, np.zeros(n_frames))
 
 
-def measured(name: str, settings: Settings, size: Settings, seed: int) -> tuple[float, float, float, float, str]:
-    """Return the mean error, that in steady light, what the panorama lacks in dB, the honest share, and the verdict."""
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        settings = size | settings
-        cube = captured(folder, "changing", settings, seed)
-        drift = settings.get("drift", 1.0)
-        as_bright = FLUX * float(np.mean(drift ** np.linspace(0, 1, 1000)))
-        steady = captured(folder, "steady", size | {"flux": as_bright}, seed)
-        errors = []
-        for each in (cube, steady):
-            done = run(parse_spec({"version": 1, "source": source_of(each, size)}, output=folder / each.stem))
-            score = evaluate(done.directory, each.with_suffix(".truth.npz"), oracle=False)
-            errors.append((score.trajectory.mean_px, score.honest_share, done.verdict.status))
-        with np.load(cube.with_suffix(".truth.npz")) as file:
-            truth = dict(file)
-        lacks_db = _below_known_gains(folder / "changing", cube, settings, truth)
-    return errors[0][0], errors[1][0], lacks_db, errors[0][1], errors[0][2]
+def measured(name: str, settings: Settings, size: Settings, seed: int) -> Sequence[str]:
+    """Return the cells of a row: errors with that in steady light, what the panorama lacks, the honest share, the verdict."""
+    with passing() as study:
+        cube = captured(study, size | settings, seed)
+        as_bright = FLUX * float(np.mean(settings.get("drift", 1.0) ** np.linspace(0, 1, 1000)))
+        run, steady = (run_of(study, each, size) for each in (cube, captured(study, size | {"flux": as_bright}, seed)))
+        error, in_steady = run.score.mean_px, steady.score.mean_px
+        honest = scores_of(run.folder, cube, oracle=False).honest_share
+        figures = f"{error:.3f}", f"{in_steady:.3f}", f"{error / in_steady:.2f}", f"{below_known_gains(run, cube):.2f}"
+        return name, str(seed), *figures, f"{honest:.0%}", record_of(run.folder)["verdict"]["status"]
 
 
-def _below_known_gains(directory: Path, cube: Path, settings: Settings, truth: dict[str, np.ndarray]) -> float:
+def below_known_gains(run: Compared, cube: Path) -> float:
     """Return how far the panorama of a run is below that of a merge along the same motion that knows the gains, in dB."""
-    import tifffile
-
-    with np.load(directory / "trajectory.npz") as file:
-        motion = dict(file)
-    alignment = corner_errors(
-        motion["homographies"], truth["homographies"], tuple(motion["frame_shape"].tolist()), motion["located"]
-    ).alignment
-    flux = tifffile.imread(directory / "panorama.tiff")
-    canvas = Canvas(*flux.shape, motion["canvas"])
-    light = true_light(truth, alignment)
-    plan = parse_spec({"version": 1, "source": source_of(cube, settings)})
-    with open_source(plan) as source:
-        known = render(
-            in_light(source, light),
-            FrameTrajectory(motion["homographies"]),
-            source.info.span,
-            canvas,
-            plan.render.tolerance_px,
-            Context(2),
-        )
+    with np.load(truth_path(cube)) as file:
+        truth = dict(file)
+    canvas, flux = run.canvas, run.panorama.flux
+    with run.source() as source:
+        tolerance_px = run.plan.render.tolerance_px
+        known = rendered(in_light(source, true_light(truth, run.score.alignment)), run.motion, canvas, tolerance_px)
     scene = truth["scene"] * float(np.mean(truth.get("light", 1.0)))
-    image = true_panorama(scene, canvas, alignment)
+    image = true_panorama(scene, canvas, run.score.alignment)
     seen = covered(known.weight) & np.isfinite(flux) & np.isfinite(image)
     # Light and scene are known up to a common factor.
     flux = flux * np.float32(known.flux[seen].sum() / flux[seen].sum())
@@ -150,38 +125,18 @@ def _below_known_gains(directory: Path, cube: Path, settings: Settings, truth: d
 
 def save_picture(file: Path) -> None:
     """Draw a part of two panoramas along the same motion: frames counted alike, and in the light that was found."""
-    with tempfile.TemporaryDirectory() as place:
-        settings = SMALL | ROWS["100 Hz, 100 % deep"]
-        cube, directory = captured(Path(place), "changing", settings, 0), Path(place) / "run"
-        run(parse_spec({"version": 1, "source": source_of(cube, settings)}, output=directory))
-        cv2.imwrite(str(file), alike_and_lit(cube, directory, settings))
-
-
-def alike_and_lit(cube: Path, directory: Path, settings: Settings) -> np.ndarray:
-    """Return a part of the panorama of a run below one that counts all frames alike: uint8."""
-    with np.load(directory / "trajectory.npz") as file:
-        motion = dict(file)
-    plan, trajectory = parse_spec({"version": 1, "source": source_of(cube, settings)}), FrameTrajectory(motion["homographies"])
-    with open_source(plan) as source:
-        shape = image_shape(directory)
-        canvas, tolerance_px = Canvas(*shape, motion["canvas"]), plan.render.tolerance_px
-        parts = [
-            render(each, trajectory, source.info.span, canvas, tolerance_px, Context(2)).flux
-            for each in (source, in_light_of(source, directory))
-        ]
+    with passing() as study:
+        run = run_of(study, captured(study, SMALL | ROWS["100 Hz, 100 % deep"], 0), SMALL)
+        with run.source() as source:
+            sources, tolerance_px = (source, in_light_of(source, run.folder)), run.plan.render.tolerance_px
+            parts = [rendered(each, run.motion, run.canvas, tolerance_px).flux for each in sources]
     width = SMALL["frame_shape"][1]
     white = float(np.nanquantile(parts[1], 0.99))
     rows = [255 * linear_to_srgb(np.clip(np.nan_to_num(part[:, : 2 * width]) / white, 0, 1)) for part in parts]
-    return np.uint8(np.concatenate([rows[0], np.full((6, rows[0].shape[1]), 255.0), rows[1]]))
+    cv2.imwrite(str(file), np.uint8(np.concatenate([rows[0], np.full((6, rows[0].shape[1]), 255.0), rows[1]])))
 
 
-def image_shape(directory: Path) -> tuple[int, int]:
-    """Return the height and width of the panorama of a run."""
-    image = cv2.imread(str(directory / "panorama.png"), cv2.IMREAD_GRAYSCALE)
-    return image.shape[0], image.shape[1]
-
-
-def steady_capture(folder: Path, seed: int) -> tuple[str, Settings]:
+def steady_capture(study: Study, seed: int) -> tuple[str, Settings]:
     """Simulate a small steady capture of a kind that the seed chooses.
 
     Returns:
@@ -199,23 +154,14 @@ def steady_capture(folder: Path, seed: int) -> tuple[str, Settings]:
         path |= {"shake": {"rms_px": float(rng.uniform(0.3, 2))}} if rng.random() < 0.5 else {}
     scene: Settings = {"kind": view, "seed": seed, "width": 800, "height": 600}
     if view == "bordered":
-        scene = {"kind": "photo", "file": str(folder / "scene.png")}
+        scene = {"kind": "photo", "file": str(study.folder / "scene.png")}
         cv2.imwrite(scene["file"], bright_borders(seed))
     n_frames = int(rng.integers(1000, 2001))
     flaw = list(FLAWS)[int(rng.integers(len(FLAWS)))]
     disturbed = {"lens": {"vignette": float(rng.uniform(0.2, 0.8))}} if flaw == "vignette" else FLAWS[flaw]
-    keys = {
-        "scene": scene,
-        "path": path,
-        "seed": seed,
-        "flux": flux,
-        "frame_shape": [64, 96],
-        "n_frames": n_frames,
-        **disturbed,
-    }
-    simulated = {"version": 1, "source": {"use": "simulator", "with": {**keys, "frame_rate_hz": SMALL["frame_rate_hz"]}}}
-    cube = simulate(parse_spec(simulated), folder / "steady.npy").path
-    spec = {"version": 1, "source": source_of(cube, SMALL), "levels": 1, "refine": []}
+    camera = {"frame_shape": [64, 96], "n_frames": n_frames, "frame_rate_hz": SMALL["frame_rate_hz"], **disturbed}
+    cube = study.capture("steady", simulator(scene=scene, path=path, seed=seed, flux=flux, **camera))
+    spec = packed(cube, SMALL["frame_rate_hz"], levels=1, refine=[])
     if flaw == "colour filter":
         spec["corrections"] = [{"colour-filter": {"pattern": "rggb", "keep": "all"}}]
     return f"{view}, {kind}{' with tremor' * ('shake' in path)}, flux {flux:.2f}, {flaw}", spec
@@ -241,8 +187,8 @@ def false_alarm(seed: int) -> tuple[str, bool, bool] | None:
         A description of the capture; whether the light seems to change along the first motion; and whether the run takes it for
         changing. None if the capture cannot be located.
     """
-    with tempfile.TemporaryDirectory() as place:
-        name, spec = steady_capture(Path(place), seed)
+    with passing() as study:
+        name, spec = steady_capture(study, seed)
         plan, context = parse_spec(spec), Context(1)
         with open_source(plan) as source:
             levels, timeline = build_levels(plan, source, []), timeline_of(source, context)
@@ -272,31 +218,23 @@ def print_false_alarms(number: int) -> None:
     print(f"false alarms: {wrong} of {located}; the light of {seeming} seemed to change along the first motion", flush=True)
 
 
-def main() -> None:
-    """Print a row of Markdown for each kind of light."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", nargs="*", default=[""], metavar="WORD", help="words in the names of the rows to measure")
-    parser.add_argument("--seeds", type=int, default=1, help="number of seeds of each row")
-    parser.add_argument("--false-alarms", type=int, default=0, metavar="N", help="number of steady captures to look at")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw a panorama with and without its light")
-    parser.add_argument("--large", action="store_true", help="captures of 254x496 px and 10,000 frames")
-    arguments = parser.parse_args()
-    if arguments.picture:
-        save_picture(arguments.picture)
-        return
-    if arguments.false_alarms:
-        print_false_alarms(arguments.false_alarms)
-        return
-    print("| Light | Seed | Error, px | In steady light | Ratio | Below known gains, dB | Within 3 std_px | Verdict |")
-    print("| --- " * 8 + "|", flush=True)
-    for name, settings in ROWS.items():
-        if not any(word in name for word in arguments.rows):
-            continue
-        for seed in range(arguments.seeds):
-            error, steady, lacks_db, honest, status = measured(name, settings, LARGE if arguments.large else SMALL, seed)
-            numbers = f"{error:.3f} | {steady:.3f} | {error / steady:.2f} | {lacks_db:.2f} | {honest:.0%}"
-            print(f"| {name} | {seed} | {numbers} | {status} |", flush=True)
+HEAD = (
+    "Light", "Seed", "Error, px", "In steady light", "Ratio", "Below known gains, dB", "Within 3 std_px", "Verdict",
+)  # fmt: skip
+
+
+def main(
+    rows: Sequence[str] = ("",), seeds: int = 1, false_alarms: int = 0, picture: Path | None = None, large: bool = False
+) -> None:
+    """Print a row of Markdown for each kind of light; or draw a picture, or look at so many steady captures."""
+    if picture:
+        save_picture(picture)
+    elif false_alarms:
+        print_false_alarms(false_alarms)
+    else:
+        cases = [(name, ROWS[name], LARGE if large else SMALL, seed) for name in chosen(rows, ROWS) for seed in range(seeds)]
+        table(HEAD, (measured(*case) for case in cases))
 
 
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -10,16 +10,14 @@ Times are those of one thread, per pair, to describe the exposures and to regist
 
 from __future__ import annotations
 
-import argparse
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from pages import require_places, write_tables
+from harness import command, simulator, table, took, write_tables
 from pydantic import ValidationError
 
 from photonpano import (
@@ -68,34 +66,18 @@ class Views(NamedTuple):
                 yield moving, fixed, inverse(self.to_plane[fixed]) @ self.to_plane[moving]
 
 
-class Figures(NamedTuple):
-    """Result of a locator on one kind of exposures: median error of located pairs, share of lost pairs, time."""
-
-    error_px: float
-    lost: float
-    ms: float
-
-    def __str__(self) -> str:
-        error = "-" if np.isnan(self.error_px) else f"{self.error_px:.3f} px"
-        return f"{error} | {self.lost:.0%} | {self.ms:.0f} ms"
-
-
 def views(flux: float, seed: int, compensated: bool) -> Views:
     """Simulate a capture, and merge its groups."""
-    simulator: dict[str, Any] = {
-        "scene": {"kind": "street", "seed": seed},
-        "path": {
-            "kind": "random-spline",
-            "seed": seed,
-            "length_px": 25 * GROUPS,
-            "shake": {"rms_px": 1.0, "frequencies_hz": [25.0, 90.0, 180.0]},
-        },
-        "flux": flux,
-        "n_frames": GROUP_SIZE * GROUPS,
-        "frame_shape": SHAPE,
-    }
+    shake = {"rms_px": 1.0, "frequencies_hz": [25.0, 90.0, 180.0]}
+    capture = simulator(
+        scene={"kind": "street", "seed": seed},
+        path={"kind": "random-spline", "seed": seed, "length_px": 25 * GROUPS, "shake": shake},
+        flux=flux,
+        n_frames=GROUP_SIZE * GROUPS,
+        frame_shape=SHAPE,
+    )
     merger = PhotonMleMerger(PhotonMleConfig(compensate=compensated))
-    with open_source(parse_spec({"version": 1, "source": {"use": "simulator", "with": simulator}})) as source:
+    with open_source(parse_spec(capture)) as source:
         assert isinstance(source, KnowsTruth)
         trajectory = FrameTrajectory(source.truth()["homographies"])
         spans = (FrameSpan(start, start + GROUP_SIZE) for start in range(0, source.info.n_frames, GROUP_SIZE))
@@ -126,59 +108,46 @@ def nearly(true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return normalised(cv2.getPerspectiveTransform(corners(SHAPE).astype(np.float32), wrong.astype(np.float32)))
 
 
-def measure(locator: Locator, captures: Sequence[Views], known: bool) -> Figures:
-    """Register all pairs, from a start that is nearly right if `known`, without a start otherwise."""
-    errors, lost, seconds = [], 0, 0.0
+def measured(locator: Locator, captures: Sequence[Views], known: bool) -> Sequence[str]:
+    """Register all pairs, from a start that is nearly right if `known`, without a start otherwise.
+
+    Returns:
+        The median error of the located pairs, the share of the lost ones, and the time of a pair.
+    """
+    errors, pairs, seconds = [], 0, 0.0
     rng = np.random.default_rng(0)
     for capture in captures:
-        began = time.process_time()
-        features = [locator.describe(exposure) for exposure in capture.exposures]
-        seconds += time.process_time() - began
+        features, _, spent, _ = took(lambda exposures: list(map(locator.describe, exposures)), capture.exposures)
+        seconds += spent
         for moving, fixed, true in capture.pairs():
             start = nearly(true, rng) if known else None
-            began = time.process_time()
-            motion = locator.register(features[moving], features[fixed], start)
-            seconds += time.process_time() - began
+            motion, _, spent, _ = took(locator.register, features[moving], features[fixed], start)
+            seconds += spent
+            pairs += 1
             if isinstance(motion, Located):
                 errors.append(corner_displacements(motion.homography, true, SHAPE).mean())
-            else:
-                lost += 1
-    pairs = len(errors) + lost
-    return Figures(float(np.median(errors)) if errors else np.nan, lost / pairs, 1000 * seconds / pairs)
+    error = f"{np.median(errors):.3f} px" if errors else "-"
+    return error, f"{1 - len(errors) / pairs:.0%}", f"{1000 * seconds / pairs:.0f} ms"
 
 
-def table(fluxes: Sequence[float], scenes: int) -> list[str]:
-    """Return the rows in Markdown: one for each locator and flux, for blurred and for compensated exposures."""
-    rows = [
-        "| Flux | Locator | Blurred: error | lost | a pair | Compensated: error | lost | a pair |",
-        "| --- " * 8 + "|",
-    ]
+def rows(fluxes: Sequence[float], scenes: int) -> Iterator[Sequence[str]]:
+    """Yield a row for each locator and flux, with blurred and with compensated exposures."""
     catalog = discover()
     for flux in fluxes:
         kinds = [[views(flux, seed, compensated) for seed in range(scenes)] for compensated in (False, True)]
         for name, locator in available(catalog, kinds[0][0].context):
             # The first pair takes longer: code is compiled and libraries are loaded.
-            measure(locator, [Views(kinds[1][0].exposures[:2], *kinds[1][0][1:])], known=True)
-            blurred, compensated = (
-                measure(locator, captures, known) for captures, known in zip(kinds, (False, True), strict=True)
-            )
-            rows.append(f"| {flux:g} | {name} | {blurred} | {compensated} |")
-            print(rows[-1], file=sys.stderr, flush=True)
-    return rows
+            measured(locator, [Views(kinds[1][0].exposures[:2], *kinds[1][0][1:])], known=True)
+            blurred, compensated = (measured(locator, each, known) for each, known in zip(kinds, (False, True), strict=True))
+            yield f"{flux:g}", name, *blurred, *compensated
 
 
-def main() -> None:
+def main(page: Path | None, scenes: int = 2, fluxes: Sequence[float] = (0.5, 0.1, 0.02)) -> None:
     """Measure everything, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", type=Path, help="the page whose table is replaced")
-    parser.add_argument("--scenes", type=int, default=2, help="how many streets")
-    parser.add_argument("--fluxes", type=float, nargs="+", default=[0.5, 0.1, 0.02], help="photons per pixel per frame")
-    arguments = parser.parse_args()
-    page: Path = arguments.page
-    require_places(page, ["table"])
     cv2.setNumThreads(1)
-    write_tables(page, {"table": table(arguments.fluxes, arguments.scenes)})
+    head = ("Flux", "Locator", "Blurred: error", "lost", "a pair", "Compensated: error", "lost", "a pair")
+    write_tables(page, {"table": table(head, rows(fluxes, scenes))})
 
 
 if __name__ == "__main__":
-    main()
+    command(main, "table")

@@ -11,21 +11,18 @@ folder, and what is there already is not measured again. With captures of 160 MB
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import subprocess
-import sys
-import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from pages import write_tables
+from harness import Study, chosen, command, in_child, packed, simulator, table, write_tables
 
-from photonpano import CameraGuess, evaluate_poses
-from photonpano.evaluation.poses import PoseScore, load_true_poses, pose_errors
+from photonpano import CameraGuess, PhotonpanoError, evaluate_poses, parse_spec, simulate
+from photonpano.captures.writing import truth_path
+from photonpano.evaluation import PoseScore, load_true_poses, pose_errors
 from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.reconstruction import reconstruct
 
@@ -41,10 +38,9 @@ SCENES: dict[str, dict[str, Any]] = {
 FLUXES = ("0.3", "0.1", "0.05")
 SHARP, AVERAGES, STRATIFIED = "sharp frames", "colmap-averages", "stratified-pose"
 METHODS = (SHARP, AVERAGES, STRATIFIED)
-HEADER = [
-    "| Capture, flux | COLMAP on sharp frames | `colmap-averages` | `stratified-pose` | Within 2 std | Located |",
-    "| --- | --- | --- | --- | --- | --- |",
-]
+HEADER = (
+    "Capture, flux", "COLMAP on sharp frames", "`colmap-averages`", "`stratified-pose`", "Within 2 std", "Located",
+)  # fmt: skip
 
 
 def simulated(scene: str, flux: str, work: Path, n_frames: int = N_FRAMES) -> Path:
@@ -52,51 +48,24 @@ def simulated(scene: str, flux: str, work: Path, n_frames: int = N_FRAMES) -> Pa
     cube = work / f"{scene}-{flux}-{n_frames}.npy"
     if not cube.exists():
         keys = SCENES[scene]
-        source = {
-            "use": "travel-simulator",
-            "with": {
-                "scene": keys["scene"],
-                "path": {"kind": "travel", **keys["path"], "tremor": TREMOR},
-                "flux": float(flux),
-                "n_frames": n_frames,
-                "frame_shape": list(SHAPE),
-                "frame_rate_hz": 10_000 * n_frames / N_FRAMES,
-                "focal_px": FOCAL_PX,
-            },
-        }
-        spec = work / f"{cube.stem}.yaml"
-        spec.write_text(json.dumps({"version": 1, "source": source}))
-        command = ["simulate", str(spec), "--output", str(cube)]
-        _program(*command, "--sharp-every", str(SHARP_EVERY))
+        camera = {"n_frames": n_frames, "frame_shape": list(SHAPE), "frame_rate_hz": 10_000 * n_frames / N_FRAMES}
+        path = {"kind": "travel", **keys["path"], "tremor": TREMOR}
+        capture = simulator("travel-simulator", scene=keys["scene"], path=path, flux=float(flux), focal_px=FOCAL_PX, **camera)
+        simulate(parse_spec(capture), cube, sharp_every=SHARP_EVERY)
     return cube
 
 
-def _program(*arguments: str) -> tuple[int, float, float, str]:
-    """Run the program; return its exit status, seconds, memory in MiB, and what it printed."""
-    start = time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "photonpano", *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    assert process.stdout is not None
-    text = process.stdout.read()
-    _, status, used = os.wait4(process.pid, 0)
-    return os.waitstatus_to_exitcode(status), time.perf_counter() - start, used.ru_maxrss / 1024, text
-
-
-def measured(scene: str, flux: str, method: str, work: Path, n_frames: int = N_FRAMES) -> dict[str, Any]:
+def measured(scene: str, flux: str, method: str, study: Study, n_frames: int) -> dict[str, Any]:
     """Return the figures of a method on a capture."""
-    cube = simulated(scene, flux, work, n_frames)
-    truth = cube.with_suffix(".truth.npz")
+    cube = simulated(scene, flux, study.folder, n_frames)
     if method == SHARP:
-        return _figures(_sharp(cube, truth))
-    folder = work / f"{cube.stem}-{method}"
-    spec = work / f"{folder.name}.yaml"
-    source = {"use": "packed-npy", "with": {"path": str(cube), "width": SHAPE[1]}}
-    spec.write_text(json.dumps({"version": 1, "source": source, "pose": {"use": method}, "camera": {"focal_px": FOCAL_PX}}))
-    status, seconds, memory, text = _program("run", str(spec), "--output", str(folder), "--overwrite")
-    if status not in (0, 3):
-        return {"failed": text.strip().splitlines()[-1] if text.strip() else f"exit status {status}"}
-    return _figures(evaluate_poses(folder, truth)) | {"seconds": seconds, "mib": memory}
+        return _figures(_sharp(cube, truth_path(cube)))
+    spec = packed(cube, None, pose={"use": method}, camera={"focal_px": FOCAL_PX})
+    try:
+        folder, seconds, _, mib = in_child(study.run, f"{cube.stem}-{method}", spec)
+    except PhotonpanoError as error:
+        return {"failed": str(error).splitlines()[-1]}
+    return _figures(evaluate_poses(folder, truth_path(cube))) | {"seconds": seconds, "mib": mib}
 
 
 def _sharp(cube: Path, truth: Path) -> PoseScore:
@@ -115,60 +84,51 @@ def _sharp(cube: Path, truth: Path) -> PoseScore:
 def _figures(score: PoseScore) -> dict[str, Any]:
     return {
         "ate": 100 * score.ate_share,
-        "rotation": score.rotation_deg,
         "turned": score.turns_deg,
-        "rpe": score.rpe_deg,
         "located": 100 * score.located_share,
         "within": None if score.honest_shares is None else 100 * score.honest_shares[1],
-        "ratio": score.std_ratio,
     }
 
 
-def row(scene: str, flux: str, of: dict[str, dict[str, Any]]) -> str:
-    """Return a row of the table, of the figures of each method."""
-    cells = [f"`{scene}`, {flux}"]
+def row(scene: str, flux: str, of: dict[str, dict[str, Any]]) -> Iterator[str]:
+    """Yield the cells of a row of the table, of the figures of each method."""
+    yield f"`{scene}`, {flux}"
     for method in METHODS:
-        figures = of.get(method)
-        if figures is None:
-            cells.append("")
-        elif "failed" in figures:
-            cells.append(figures["failed"])
-        else:
-            cells.append(f"{figures['ate']:.3f} %, {figures['turned']:.3f}°")
+        figures = of.get(method, {"failed": ""})
+        yield figures["failed"] if "failed" in figures else f"{figures['ate']:.3f} %, {figures['turned']:.3f}°"
     best = of.get(STRATIFIED, {})
-    cells += ["", ""] if "within" not in best else [f"{best['within']:.0f} %", f"{best['located']:.0f} %"]
-    return f"| {' | '.join(cells)} |"
+    yield from (f"{best[key]:.0f} %" if "within" in best else "" for key in ("within", "located"))
 
 
-def main() -> None:
+def main(
+    page: Path | None,
+    work: Path = Path("runs/poses"),
+    only: Sequence[str] = tuple(SCENES),
+    flux: Sequence[str] = FLUXES,
+    methods: Sequence[str] = METHODS,
+    frames: int = N_FRAMES,
+) -> None:
     """Measure, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", type=Path, nargs="?", help="the page whose table is replaced")
-    parser.add_argument("--work", type=Path, required=True, help="folder for captures and results")
-    parser.add_argument("--only", nargs="*", choices=SCENES, default=list(SCENES))
-    parser.add_argument("--flux", nargs="*", choices=FLUXES, default=list(FLUXES))
-    parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
-    parser.add_argument("--frames", type=int, default=N_FRAMES, help="frames of the captures, of the same paths")
-    parser.add_argument("--again", action="store_true", help="measure also what was measured before")
-    arguments = parser.parse_args()
-    arguments.work.mkdir(parents=True, exist_ok=True)
-    lines = []
-    for scene in arguments.only:
-        for flux in arguments.flux:
-            figures = {}
-            for method in arguments.methods:
-                # Sharp frames are the same whatever the flux.
-                name = f"{scene}-{arguments.frames}" if method == SHARP else f"{scene}-{flux}-{arguments.frames}"
-                file = arguments.work / f"{name}-{method.replace(' ', '-')}.json"
-                if arguments.again or not file.exists():
-                    file.write_text(json.dumps(measured(scene, flux, method, arguments.work, arguments.frames)))
-                figures[method] = json.loads(file.read_text())
-            lines.append(row(scene, flux, figures))
-            costs = [f"{name}: {of['seconds']:.0f} s, {of['mib']:.0f} MiB" for name, of in figures.items() if "seconds" in of]
-            print(lines[-1], *costs, sep="\n  ", flush=True)
-    if arguments.page:
-        write_tables(arguments.page, {"poses": [*HEADER, *lines]})
+    work.mkdir(parents=True, exist_ok=True)
+
+    def figures(scene: str, light: str, method: str) -> dict[str, Any]:
+        # Sharp frames are the same whatever the flux.
+        name = f"{scene}-{frames}" if method == SHARP else f"{scene}-{light}-{frames}"
+        file = work / f"{name}-{method.replace(' ', '-')}.json"
+        if not file.exists():
+            file.write_text(json.dumps(measured(scene, light, method, Study(work), frames)))
+        of: dict[str, Any] = json.loads(file.read_text())
+        if "seconds" in of:
+            print(f"{scene}, {light}, {method}: {of['seconds']:.0f} s, {of['mib']:.0f} MiB", flush=True)
+        return of
+
+    def rows() -> Iterator[Iterator[str]]:
+        for scene in chosen(only, SCENES):
+            for light in flux:
+                yield row(scene, light, {method: figures(scene, light, method) for method in chosen(methods, METHODS)})
+
+    write_tables(page, {"poses": table(HEADER, rows())})
 
 
 if __name__ == "__main__":
-    main()
+    command(main, "poses")

@@ -9,42 +9,39 @@ of the scheduler then works on the tasks of longer captures with many workers.
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
-import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import matplotlib.pyplot as plt
 import numpy as np
 import psutil
 from distributed import Client
-from pages import write_tables
+from harness import IMAGES, command, packed, passing, table, write_tables
 from scheduling import Costs, Kind, Measured, prediction
-from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulate
+from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulated
 
-import photonpano.pipeline.run as run_module
 from photonpano import ExecutorContext, FrameSpan, Source, discover, parse_spec, run
 from photonpano.context import Quiet
 from photonpano.execution import CaptureElsewhere, LocalExecutor
-from photonpano.execution.remote import packed
+from photonpano.execution.packing import packed as packed_for_worker
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging import chunks_of
 from photonpano.pipeline.executors import as_read
 from photonpano_dask.configs import DaskConfig
 
 DASK = discover().find("executor", "dask").contribution
-LONG = 60_000_000
-"""Ten minutes at 100,000 frames per second."""
+LONG = 60_000_000  # ten minutes at 100,000 frames per second
 WORKERS = 1, 8, 64, 512
 EMPTY_TASKS = 2000
 PATH_FRAMES = 400_000
@@ -93,7 +90,7 @@ class Measuring(LocalExecutor):
 
     def _size(self, value: Any) -> int:
         begin = time.thread_time()
-        size = len(packed(value, self._capture))
+        size = len(packed_for_worker(value, self._capture))
         self.packing_seconds += time.thread_time() - begin
         return size
 
@@ -126,19 +123,10 @@ def measured(cube: Path, n_frames: int) -> Measured:
         executors.append(Measuring(as_read(source), lambda: stages.title))
         yield executors[0]
 
-    spec = {
-        "version": 1,
-        "source": {"use": "packed-npy", "with": {"path": str(cube)}},
-        "resample": {"with": {"group_size": GROUP_SIZE}},
-        "run": {"threads": 1},
-    }
-    real = run_module.executor_of
-    run_module.executor_of = executor_of
+    spec = packed(cube, None, resample={"with": {"group_size": GROUP_SIZE}}, run={"threads": 1})
     begin = time.process_time()
-    try:
+    with mock.patch("photonpano.pipeline.run.executor_of", executor_of):
         run(parse_spec(spec, output=cube.with_suffix(".run")), stages)
-    finally:
-        run_module.executor_of = real
     whole = time.process_time() - begin
     executor = executors[0]
     tasks = sum(kind.seconds for kind in executor.kinds.values())
@@ -166,8 +154,8 @@ def measured_costs() -> Costs:
 @contextmanager
 def cluster() -> Iterator[tuple[str, psutil.Process]]:
     """Start a scheduler and two workers in processes of their own."""
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        file = Path(folder) / "scheduler.json"
+    with passing() as study, ExitStack() as stack:
+        file = study.folder / "scheduler.json"
 
         def started(*words: str) -> subprocess.Popen[bytes]:
             process = subprocess.Popen(
@@ -187,29 +175,24 @@ def cluster() -> Iterator[tuple[str, psutil.Process]]:
         yield address, psutil.Process(scheduler.pid)
 
 
-def table_of_tasks(run: Measured) -> list[str]:
-    """Return the rows of the table of tasks."""
-    rows = ["| Stage | Task | Tasks | Time of one | To the worker | Back |", "| --- | --- | --- | --- | --- | --- |"]
+def rows_of_tasks(run: Measured) -> Iterator[Sequence[str]]:
+    """Yield the rows of the table of tasks."""
     for (stage, name), kind in run.kinds.items():
-        if stage.startswith("after") or not kind.tasks:
-            continue
-        time_ms = "" if name.startswith(("shared", "kept")) else f"{1e3 * kind.seconds / kind.tasks:.1f} ms"
-        to, back = (f"{size / kind.tasks / 1e3:,.1f} kB" if size else "" for size in (kind.to_worker, kind.from_worker))
-        rows.append(f"| {stage} | {name} | {kind.tasks:,} | {time_ms} | {to} | {back} |")
-    return rows
+        if not stage.startswith("after") and kind.tasks:
+            time_ms = "" if name.startswith(("shared", "kept")) else f"{1e3 * kind.seconds / kind.tasks:.1f} ms"
+            sizes = (f"{size / kind.tasks / 1e3:,.1f} kB" if size else "" for size in (kind.to_worker, kind.from_worker))
+            yield stage, name, f"{kind.tasks:,}", time_ms, *sizes
 
 
-def table_of_predictions(run: Measured, costs: Costs) -> tuple[list[str], dict[int, dict[str, float]]]:
-    """Return the rows of the table of predictions, and the limits for the plot."""
-    rows = ["| Workers | Predicted | Speed-up | What limits | Its share |", "| --- | --- | --- | --- | --- |"]
-    limits, alone = dict[int, dict[str, float]](), 0.0
+def rows_of_predictions(run: Measured, costs: Costs, limits: dict[int, dict[str, float]]) -> Iterator[Sequence[str]]:
+    """Yield the rows of the table of predictions, and note the limits for the plot."""
+    alone = 0.0
     for workers in WORKERS:
         seconds, limits[workers] = prediction(run, costs, workers)
         alone = alone or seconds
         name, most = max(limits[workers].items(), key=itemgetter(1))
-        rows.append(f"| {workers} | {clock(seconds)} | {alone / seconds:.1f} | {name} | {clock(most)} |")
+        yield f"{workers}", clock(seconds), f"{alone / seconds:.1f}", name, clock(most)
         limits[workers]["all"] = seconds
-    return rows, limits
 
 
 def clock(seconds: float) -> str:
@@ -232,31 +215,28 @@ def plot(limits: dict[int, dict[str, float]], file: Path) -> None:
     figure.savefig(file, dpi=110)
 
 
-def main() -> None:
-    """Measure, predict, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", type=Path, help="the page whose tables are replaced")
-    parser.add_argument(
-        "--frames", type=int, nargs=2, default=[10_000, 40_000], help="lengths of the captures, the shorter first"
-    )
-    arguments = parser.parse_args()
-    page: Path = arguments.page
-    costs = measured_costs()
-    with tempfile.TemporaryDirectory() as folder:
-        cubes = [simulate(Path(folder), number) for number in arguments.frames]
+def main(page: Path | None, frames: Sequence[int] = (10_000, 40_000)) -> None:
+    """Measure two captures, the shorter first, predict, and write the page."""
+    costs, limits = measured_costs(), dict[int, dict[str, float]]()
+    with passing() as study:
+        cubes = [simulated(study, number) for number in frames]
         # What is imported and loaded once does not count.
-        measured(cubes[0], arguments.frames[0])
-        shorter, longer = (measured(cube, number) for cube, number in zip(cubes, arguments.frames, strict=True))
-    rows, limits = table_of_predictions(longer.scaled(shorter, LONG), costs)
+        measured(cubes[0], frames[0])
+        shorter, longer = (measured(cube, number) for cube, number in zip(cubes, frames, strict=True))
     client_s = (longer.client_s - shorter.client_s) / (longer.n_frames - shorter.n_frames)
-    costs_rows = [
+    told = (
         f"A task costs {costs.client_s * 1e3:.1f} ms of processor time in the client, and {costs.scheduler_s * 1e3:.1f} ms in "
         f"the scheduler. Beside the tasks, the client takes {1e6 * client_s:.0f} s for a million frames. A worker divides a "
         f"million frames into chunks in {1e6 * costs.start_s:.1f} s."
-    ]
-    write_tables(page, {"tasks": table_of_tasks(longer), "costs": costs_rows, "predictions": rows})
-    plot(limits, page.parent.parent / "images" / "scale.png")
+    )
+    print(told)
+    tasks = table(("Stage", "Task", "Tasks", "Time of one", "To the worker", "Back"), rows_of_tasks(longer))
+    rows = rows_of_predictions(longer.scaled(shorter, LONG), costs, limits)
+    predictions = table(("Workers", "Predicted", "Speed-up", "What limits", "Its share"), rows)
+    write_tables(page, {"tasks": tasks, "costs": [told], "predictions": predictions})
+    if page:
+        plot(limits, IMAGES / "scale.png")
 
 
 if __name__ == "__main__":
-    main()
+    command(main, "tasks", "costs", "predictions")

@@ -9,16 +9,11 @@ from heapq import heappop, heappush
 from speed import SHAPE
 
 FRAME_BYTES = SHAPE[0] * SHAPE[1] // 8
-STORAGE_BYTES_S = 5e9
-"""What a shared storage reads for all workers together: an assumption."""
-LINK_BYTES_S = 1.25e9
-"""What the client, and each worker, sends and receives: an assumption, ten gigabits per second."""
-WINDOW = 4
-"""Tasks under way for each worker."""
-READING = "panorama", "residuals"
-"""Stages beside the levels that read the whole capture."""
-AT_ONCE = 8
-"""Items of a task, where there are many: as `photonpano.execution.Remote` has it."""
+STORAGE_BYTES_S = 5e9  # what a shared storage reads for all workers together: an assumption
+LINK_BYTES_S = 1.25e9  # what the client, and each worker, sends and receives: an assumption, ten gigabits per second
+WINDOW = 4  # tasks under way for each worker
+READING = "panorama", "residuals"  # stages beside the levels that read the whole capture
+AT_ONCE = 8  # items of a task, where there are many: as `photonpano.execution.Remote` has it
 
 
 @dataclass

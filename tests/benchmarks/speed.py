@@ -9,14 +9,8 @@ so that ratios hold on any machine. Whole runs have three levels of groups of 50
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import subprocess
-import sys
-import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -25,9 +19,24 @@ from typing import Any
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
-from pages import write_tables
+from harness import (
+    IMAGES,
+    Study,
+    command,
+    in_child,
+    least,
+    packed,
+    passing,
+    record_of,
+    scores_of,
+    seen,
+    simulator,
+    table,
+    write_tables,
+)
 
 from photonpano import FrameSpan, SourceContext
+from photonpano.captures.writing import truth_path
 from photonpano.evaluation import load_truth
 from photonpano.geometry import FrameTrajectory, inverse
 from photonpano.protocols import Source
@@ -41,36 +50,20 @@ PX_A_FRAME = 0.02
 GROUP_SIZE = 500
 BLOCK_BYTES = 2**20
 THREADS = 2
-PROGRAM = [sys.executable, "-c", "from photonpano.cli import main; main()"]
 
 
-def simulate(folder: Path, n_frames: int) -> Path:
+def simulated(study: Study, n_frames: int) -> Path:
     """Write a capture that moves by 0.02 px per frame, with its truth beside it."""
-    cube = folder / f"{n_frames}.npy"
     length_px = PX_A_FRAME * n_frames
     width = max(2048, round(length_px))
-    simulator = {
-        "scene": {"kind": "street", "width": width, "height": width * 2 // 3},
-        "path": {"kind": "random-spline", "length_px": length_px},
-        "flux": 0.3,
-        "n_frames": n_frames,
-        "frame_shape": SHAPE,
-    }
-    spec = cube.with_suffix(".yaml")
-    # JSON is YAML.
-    spec.write_text(json.dumps({"version": 1, "source": {"use": "simulator", "with": simulator}}))
-    subprocess.run([*PROGRAM, "simulate", str(spec), "--output", str(cube)], check=True, stdout=subprocess.DEVNULL)
-    return cube
-
-
-def seconds(work: Callable[[], object], repeats: int = 3) -> float:
-    """Return the minimum time of several repetitions."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    capture = simulator(
+        scene={"kind": "street", "width": width, "height": width * 2 // 3},
+        path={"kind": "random-spline", "length_px": length_px},
+        flux=0.3,
+        n_frames=n_frames,
+        frame_shape=SHAPE,
+    )
+    return in_child(study.capture, f"{n_frames}", capture).result
 
 
 def spread(work: Callable[[int], object], items: range, threads: int) -> None:
@@ -80,26 +73,27 @@ def spread(work: Callable[[int], object], items: range, threads: int) -> None:
 
 
 def sums(cube: Path) -> list[str]:
-    """Return the rows of the table of sums: GB of packed frames per second."""
+    """Return the table of sums: GB of packed frames per second."""
     frame_bytes = SHAPE[0] * SHAPE[1] // 8
-    rows = ["| Frames in a sum | unpackbits | one thread | two threads |", "| --- | --- | --- | --- |"]
+    packed_frames = np.load(cube, mmap_mode="r")
+
+    def row(source: Source, length: int) -> Sequence[str]:
+        count = min(6400, source.info.n_frames) // length
+
+        def total(index: int) -> object:
+            return source.counts(FrameSpan(index * length, (index + 1) * length))
+
+        def unpacked() -> object:
+            return np.add.reduce(np.unpackbits(packed_frames[:length], axis=-1), axis=0, dtype=np.uint16)
+
+        naive = length * frame_bytes / 1e9 / least(unpacked).seconds
+        times = [least(spread, total, range(count), threads).seconds for threads in (1, THREADS)]
+        return f"{length}", f"{naive:.2f} GB/s", *(f"{count * length * frame_bytes / 1e9 / each:.1f} GB/s" for each in times)
+
     with PACKED_NPY.build(PackedNpyConfig(path=cube), SourceContext()) as source:
         source.counts(FrameSpan(0, 600))
-        packed = np.load(cube, mmap_mode="r")
-        for length in (8, 16, 32, 64, 250, 500):
-            count = min(6400, source.info.n_frames) // length
-            size = count * length * frame_bytes / 1e9
-
-            def total(index: int, length: int = length) -> object:
-                return source.counts(FrameSpan(index * length, (index + 1) * length))
-
-            def unpacked(length: int = length) -> object:
-                return np.add.reduce(np.unpackbits(packed[:length], axis=-1), axis=0, dtype=np.uint16)
-
-            rates = [size / seconds(partial(spread, total, range(count), threads)) for threads in (1, THREADS)]
-            naive = length * frame_bytes / 1e9 / seconds(unpacked)
-            rows.append(f"| {length} | {naive:.2f} GB/s | {rates[0]:.1f} GB/s | {rates[1]:.1f} GB/s |")
-    return rows
+        rows = (row(source, length) for length in (8, 16, 32, 64, 250, 500))
+        return table(("Frames in a sum", "unpackbits", "one thread", "two threads"), rows)
 
 
 def reading(cube: Path) -> float:
@@ -112,7 +106,7 @@ def reading(cube: Path) -> float:
         with cube.open("rb", buffering=0) as file:
             return os.preadv(file.fileno(), [buffer], index * BLOCK_BYTES)
 
-    return len(blocks) * BLOCK_BYTES / seconds(partial(spread, read, blocks, THREADS))
+    return len(blocks) * BLOCK_BYTES / least(spread, read, blocks, THREADS).seconds
 
 
 def warped_one_by_one(source: Source, span: FrameSpan, to_grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -129,13 +123,9 @@ def warped_one_by_one(source: Source, span: FrameSpan, to_grid: np.ndarray) -> t
 
 
 def merging(cube: Path) -> list[str]:
-    """Return the rows of the table of merging, for groups of the third level, and what chunks cost in accuracy."""
-    truth = load_truth(cube.with_suffix(".truth.npz"))
+    """Return the table of merging, for groups of the third level, and what chunks cost in accuracy."""
+    truth = load_truth(truth_path(cube))
     trajectory = FrameTrajectory(truth.homographies)
-    rows = [
-        "| Moves within a chunk | 100,000 frames, two threads | against frame by frame | PSNR lost |",
-        "| --- | --- | --- | --- |",
-    ]
     with PACKED_NPY.build(PackedNpyConfig(path=cube), SourceContext()) as source:
         groups = MidpointResampler(MidpointConfig(group_size=GROUP_SIZE)).groups(source.info.n_frames, 3)
         scene, response = truth.scene, source.response
@@ -143,49 +133,36 @@ def merging(cube: Path) -> list[str]:
         group = groups[len(groups) // 2]
         reference = trajectory.at([group.reference])[0]
         to_grid = inverse(reference) @ trajectory.at(np.arange(group.span.start, group.span.stop))
-        naive = seconds(lambda: warped_one_by_one(source, group.span, to_grid), 1) / len(group.span)
-        counts, weight = warped_one_by_one(source, group.span, to_grid)
-        view = cv2.warpPerspective(scene, reference, SHAPE[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        (counts, weight), naive, *_ = least(warped_one_by_one, source, group.span, to_grid, times=1)
+        view = seen(scene, reference, SHAPE)
         inside = weight > 0.9 * len(group.span)
 
         def psnr_db(flux: np.ndarray) -> float:
             return float(10 * np.log10(float(view[inside].max()) ** 2 / np.mean((flux[inside] - view[inside]) ** 2)))
 
         exact = psnr_db(response.flux(counts / np.maximum(weight, 1), weight))
-        for tolerance_px in (0.25, 0.5, 1.0):
+
+        def row(tolerance_px: float) -> Sequence[str]:
             merger = PhotonMleMerger(PhotonMleConfig(tolerance_px=tolerance_px))
             lost = exact - psnr_db(merger.merge(source, group, trajectory, 1.0).flux)
-
-            def all_of(merger: PhotonMleMerger = merger) -> None:
-                spread(lambda index: merger.merge(source, groups[index], trajectory, 1.0), range(len(groups)), THREADS)
-
-            level = seconds(all_of) / source.info.n_frames * 100_000
+            work = partial(
+                spread, lambda index: merger.merge(source, groups[index], trajectory, 1.0), range(len(groups)), THREADS
+            )
+            level = least(work).seconds / source.info.n_frames * 100_000
             # Most frames are in four groups.
-            ratio = naive * 100_000 * sum(len(each.span) for each in groups) / source.info.n_frames / THREADS / level
-            rows.append(f"| {tolerance_px:g} px | {level:.1f} s | {ratio:.0f} times | {lost:.3f} dB |")
-    return rows
+            frames = sum(len(each.span) for each in groups) / source.info.n_frames
+            ratio = naive / len(group.span) * 100_000 * frames / THREADS / level
+            return f"{tolerance_px:g} px", f"{level:.1f} s", f"{ratio:.0f} times", f"{lost:.3f} dB"
+
+        head = ("Moves within a chunk", "100,000 frames, two threads", "against frame by frame", "PSNR lost")
+        return table(head, map(row, (0.25, 0.5, 1.0)))
 
 
-def whole(cube: Path) -> dict[str, Any]:
+def whole(study: Study, cube: Path) -> dict[str, Any]:
     """Run the pipeline in a process of its own, and return its record."""
-    spec = cube.with_suffix(".run.yaml")
-    document = {
-        "version": 1,
-        "source": {"use": "packed-npy", "with": {"path": str(cube), "frame_rate_hz": 96_800}},
-        "resample": {"with": {"group_size": GROUP_SIZE}},
-        "run": {"threads": THREADS},
-    }
-    spec.write_text(json.dumps(document))
-    folder = cube.with_suffix(".run")
-    subprocess.run([*PROGRAM, "run", str(spec), "--output", str(folder)], check=True, stdout=subprocess.DEVNULL)
-    scores = subprocess.run(
-        [*PROGRAM, "evaluate", str(folder), "--truth", str(cube.with_suffix(".truth.npz")), "--json"],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    record: dict[str, Any] = json.loads((folder / "run.json").read_text())
-    return record | {"scores": json.loads(scores.stdout)}
+    spec = packed(cube, resample={"with": {"group_size": GROUP_SIZE}}, run={"threads": THREADS})
+    folder = in_child(study.run, "run", spec).result
+    return record_of(folder) | {"mean_px": scores_of(folder, cube).trajectory.mean_px}
 
 
 def stages(record: dict[str, Any]) -> dict[str, float]:
@@ -197,32 +174,30 @@ def stages(record: dict[str, Any]) -> dict[str, float]:
     return found
 
 
-def runs(records: dict[int, dict[str, Any]], rate: float) -> list[str]:
-    """Return the rows of the table of whole runs; `rate` is that of reading, in bytes per second, for comparison."""
-    rows = [
-        "| Frames | Whole | merge | locate | panorama | other | Peak memory | Mean error |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for n_frames, record in records.items():
-        by_stage = stages(record)
-        shares = " | ".join(f"{by_stage[name]:.1f} s" for name in ("merge", "locate", "panorama"))
-        other = by_stage["other"] + by_stage["interpolate"]
-        rows.append(
-            f"| {n_frames:,} | {record['seconds']:.0f} s | {shares} | {other:.1f} s | "
-            f"{record['peak_memory_bytes'] / 2**20:.0f} MiB | {record['scores']['corner_error_px']['mean']:.3f} px |"
-        )
+def row_of_run(record: dict[str, Any], n_frames: int) -> Sequence[str]:
+    """Return a row of the table of whole runs."""
+    by_stage = stages(record)
+    shares = [f"{by_stage[name]:.1f} s" for name in ("merge", "locate", "panorama")]
+    other, memory_mib = by_stage["other"] + by_stage["interpolate"], record["peak_memory_bytes"] / 2**20
+    figures = f"{other:.1f} s", f"{memory_mib:.0f} MiB", f"{record['mean_px']:.3f} px"
+    return f"{n_frames:,}", f"{record['seconds']:.0f} s", *shares, *figures
+
+
+def limits(records: dict[int, dict[str, Any]], rate: float) -> list[str]:
+    """Return what the longest run is compared with, at a rate of reading in bytes per second, and how the time grows."""
     longest = max(records)
     passes = len(records[longest]["levels"]) + 1
     once = longest * SHAPE[0] * SHAPE[1] / 8 / rate
-    rows.append(
+    lines = [
         f"\nTo read the frames once in each of {passes} passes, {passes - 1} levels and the panorama, "
         f"takes {passes * once:.1f} s of {longest:,} frames ({rate / 1e9:.1f} GB/s, two threads, from the page cache): "
         f"the run takes {records[longest]['seconds'] / passes / once:.0f} times that."
-    )
+    ]
     if len(records) > 1:
         exponent = np.polyfit(np.log(list(records)), np.log([record["seconds"] for record in records.values()]), 1)[0]
-        rows.append(f"\nTime grows with the number of frames to the power of {exponent:.2f}.")
-    return rows
+        lines.append(f"\nTime grows with the number of frames to the power of {exponent:.2f}.")
+    print(*lines, sep="\n")
+    return lines
 
 
 def plot(records: dict[int, dict[str, Any]], file: Path) -> None:
@@ -241,30 +216,28 @@ def plot(records: dict[int, dict[str, Any]], file: Path) -> None:
     figure.savefig(file, dpi=110)
 
 
-def main() -> None:
-    """Measure everything, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", type=Path, help="the page whose tables are replaced")
-    parser.add_argument("--frames", type=int, nargs="+", default=[10_000, 30_000, 100_000], help="lengths of the captures")
-    arguments = parser.parse_args()
-    page: Path = arguments.page
+RUNS = ("Frames", "Whole", "merge", "locate", "panorama", "other", "Peak memory", "Mean error")
+
+
+def main(page: Path | None, frames: Sequence[int] = (10_000, 30_000, 100_000)) -> None:
+    """Measure everything on captures of several lengths, and write the page."""
     records: dict[int, dict[str, Any]] = {}
     tables: dict[str, list[str]] = {}
     rate = 0.0
-    with tempfile.TemporaryDirectory() as folder:
-        for n_frames in arguments.frames:
-            cube = simulate(Path(folder), n_frames)
+    with passing() as study:
+        for n_frames in frames:
+            cube = simulated(study, n_frames)
             if not tables:
                 cv2.setNumThreads(1)
                 tables |= {"sums": sums(cube), "merging": merging(cube)}
                 rate = reading(cube)
-            records[n_frames] = whole(cube)
-            print(n_frames, f"{records[n_frames]['seconds']:.0f} s", file=sys.stderr, flush=True)
+            records[n_frames] = whole(study, cube)
             cube.unlink()
-    tables["runs"] = runs(records, rate)
+    tables["runs"] = table(RUNS, (row_of_run(record, n_frames) for n_frames, record in records.items())) + limits(records, rate)
     write_tables(page, tables)
-    plot(records, page.parent.parent / "images" / "speed.png")
+    if page:
+        plot(records, IMAGES / "speed.png")
 
 
 if __name__ == "__main__":
-    main()
+    command(main, "sums", "merging", "runs")

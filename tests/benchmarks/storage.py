@@ -10,20 +10,17 @@ readings counts, and the files are in the memory of the system.
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
+from harness import Cost, command, least, passing, simulator, took
 
 from photonpano import FrameSpan, Source, capture_plan, convert, parse_spec, run, simulate
 from photonpano.pipeline.components import build_source
@@ -61,27 +58,14 @@ def read_short_spans(source: Source) -> None:
         source.counts(span)
 
 
-class Took(NamedTuple):
-    """Seconds that passed, and seconds of processor time of this process, the server's left out."""
-
-    elapsed: float
-    processor: float
-
-
-def took(work: Callable[[], object]) -> Took:
-    """Do some work, and return how long it took."""
-    elapsed, processor = time.perf_counter(), time.process_time()
-    work()
-    return Took(time.perf_counter() - elapsed, time.process_time() - processor)
-
-
-def reading(path: str | Path, read: Callable[[Source], None], times: int = 3) -> Took:
+def reading(path: str | Path, read: Callable[[Source], None]) -> Cost:
     """Return the shortest time of reading a capture, which is opened anew each time."""
-    found = []
-    for _ in range(times):
+
+    def read_anew() -> None:
         with build_source(capture_plan(path, corrections=[])) as source:
-            found.append(took(partial(read, source)))
-    return min(found)
+            read(source)
+
+    return least(read_anew)
 
 
 @contextmanager
@@ -100,43 +84,22 @@ def bytes_in(path: Path) -> int:
     return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]))
 
 
-def compare(places: dict[str, str | Path], measure: Callable[[str | Path], Took]) -> None:
+def compare(places: dict[str, str | Path], measure: Callable[[str | Path], Cost]) -> None:
     """Print the time of each place, its ratio to the first, and the processor time."""
     first = None
     for name, place in places.items():
-        elapsed, processor = measure(place)
+        _, elapsed, processor, _ = measure(place)
         first = elapsed if first is None else first
         print(f"  {name:28} {elapsed:8.2f} s  x {elapsed / first:.2f}  {processor:8.2f} s of the processor", flush=True)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=100_000)
-    parser.add_argument("--runs", action="store_true")
-    parser.add_argument("--folder", type=Path)
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory(dir=arguments.folder) as temporary, served(Path(temporary)) as address:
-        os.environ |= {"AWS_ENDPOINT_URL": address, "FSSPEC_S3_ANON": "true"}
-        folder = Path(temporary, "bucket")
-        folder.mkdir()
-        cube = folder / "cube.npy"
-        write_frames(cube, arguments.frames)
-        places = all_places(cube, address)
-        print(f"{arguments.frames:,} frames in groups of {GROUP}, {THREADS} threads")
-        compare(places, partial(reading, read=read_groups))
-        print(f"{min(SHORT_FRAMES, arguments.frames):,} frames in spans of {SHORT}, one after the other")
-        compare(places, partial(reading, read=read_short_spans))
-        if arguments.runs:
-            whole_runs(folder, address)
 
 
 def all_places(cube: Path, address: str) -> dict[str, str | Path]:
     """Write a capture to zarr arrays, print their sizes, and return where all of them can be read."""
     arrays = {"zarr": cube.with_suffix(".zarr"), "zarr, zstd": cube.with_name(f"{cube.stem}-zstd.zarr")}
     for name, array in arrays.items():
-        written = took(partial(convert, capture_plan(cube, corrections=[]), array, compress="zstd" in name))
+        written = took(partial(convert, compress="zstd" in name), capture_plan(cube, corrections=[]), array)
         share = bytes_in(array) / bytes_in(cube)
-        print(f"{name}: written in {written.elapsed:.2f} s, {share:.3f} of the size of the .npy file", flush=True)
+        print(f"{name}: written in {written.seconds:.2f} s, {share:.3f} of the size of the .npy file", flush=True)
     names = {"npy": cube, **arrays}
     remote = {f"{name} over HTTP": f"{address}/bucket/{path.name}" for name, path in names.items()}
     remote |= {f"{name} in S3": f"s3://bucket/{path.name}" for name, path in names.items()}
@@ -145,19 +108,36 @@ def all_places(cube: Path, address: str) -> dict[str, str | Path]:
 
 def whole_runs(folder: Path, address: str) -> None:
     """Compare whole runs of 10,000 frames of a street."""
-    street = {"n_frames": 10_000, "frame_shape": [254, 496], "flux": FLUX, "path": {"kind": "pan", "length_px": 400}}
+    street = simulator(n_frames=10_000, frame_shape=[254, 496], flux=FLUX, path={"kind": "pan", "length_px": 400})
     capture = folder / "street.npy"
-    simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": street}}), capture)
+    simulate(parse_spec(street), capture)
     print("whole runs of 10,000 frames")
 
-    def whole_run(place: str | Path) -> Took:
-        with tempfile.TemporaryDirectory() as output:
+    def whole_run(place: str | Path) -> Cost:
+        with passing() as study:
             spec = {"version": 1, "source": {"use": "auto", "with": {"path": str(place)}}}
-            return took(partial(run, parse_spec(spec, output=Path(output, "run"))))
+            return took(run, parse_spec(spec, output=study.folder / "run"))
 
     whole_run(capture)  # compiles the loops over pixels
     compare(all_places(capture, address), whole_run)
 
 
+def main(frames: int = 100_000, runs: bool = False, folder: Path | None = None) -> None:
+    """Print the times of each way of reading; and of whole runs."""
+    with passing(folder) as study, served(study.folder) as address:
+        os.environ |= {"AWS_ENDPOINT_URL": address, "FSSPEC_S3_ANON": "true"}
+        bucket = study.folder / "bucket"
+        bucket.mkdir()
+        cube = bucket / "cube.npy"
+        write_frames(cube, frames)
+        places = all_places(cube, address)
+        print(f"{frames:,} frames in groups of {GROUP}, {THREADS} threads")
+        compare(places, partial(reading, read=read_groups))
+        print(f"{min(SHORT_FRAMES, frames):,} frames in spans of {SHORT}, one after the other")
+        compare(places, partial(reading, read=read_short_spans))
+        if runs:
+            whole_runs(bucket, address)
+
+
 if __name__ == "__main__":
-    main()
+    command(main)

@@ -11,19 +11,20 @@ one has a path at five times the speed, and one a raster with loop closures. Bou
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
-import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano.evaluation import corner_errors
+sys.path.append(str(Path(__file__).parent))
+from harness import Compared, Study, groups, in_child, packed, record_of, scores_of, simulator
 
 SCENES: dict[str, dict[str, Any]] = {f"street {seed}": {"kind": "street", "seed": seed} for seed in range(3)}
 for photo in filter(None, os.environ.get("PHOTONPANO_BENCH_PHOTOS", "").split(":")):
@@ -60,8 +61,7 @@ CASES = [
 FAST = Case(0.5, 0.5, below_oracle_db=1.0, path_px=3000, n_frames=4000)
 REVISITS = Case(0.5, 0.08, path_px=3000, n_frames=20_000, kind="scan")
 TREMBLING = Case(0.5, 0.08, shake=True, path_px=750)
-STRETCHES = 10
-"""Parts of a path that are compared with each other."""
+STRETCHES = 10  # parts of a path that are compared with each other
 NEIGHBOURS = {"skips": [], "closure_overlap": None}
 HEADER = (
     "| scene | path px | frames | group | flux | shake | variant "
@@ -69,49 +69,38 @@ HEADER = (
 )
 
 
-def photonpano(*arguments: str) -> str:
-    """Run the command line as users do, and return its output."""
-    command = [sys.executable, "-c", "from photonpano.cli import main; main()", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+Measure = Callable[..., dict[str, float]]
 
 
-def simulate(folder: Path, scene: str, case: Case) -> Path:
-    """Write a capture, with the truth beside it."""
+def simulated(folder: Path, scene: str, case: Case) -> Measure:
+    """Write a capture, with the truth beside it, and return what measures runs of it."""
     path = {"kind": case.kind, "length_px": case.path_px, "shake": SHAKE if case.shake else None}
-    simulator = {"scene": SCENES[scene], "path": path, "flux": case.flux, "n_frames": case.n_frames, "frame_shape": [254, 496]}
-    spec = folder / "capture.yaml"
-    spec.write_text(json.dumps({"version": 1, "source": {"use": "simulator", "with": simulator}}))
-    cube = folder / "cube.npy"
-    photonpano("simulate", str(spec), "--output", str(cube))
-    return cube
+    study = Study(folder)
+    camera = {"scene": SCENES[scene], "path": path, "flux": case.flux, "n_frames": case.n_frames, "frame_shape": [254, 496]}
+    cube = in_child(study.capture, scene, simulator(**camera)).result
+    return partial(measured, study, cube, scene, case)
 
 
-def measure(cube: Path, scene: str, case: Case, variant: str = "full", **sections: Any) -> dict[str, float]:
-    """Run the pipeline on a capture, score it, and print a row of the table."""
-    source = {"use": "packed-npy", "with": {"path": str(cube), "frame_rate_hz": 96800}}
-    document = {"version": 1, "source": source, "resample": {"with": {"group_size": case.group_size}}, "levels": 3}
-    spec = cube.with_name("run.yaml")
-    spec.write_text(json.dumps(document | sections))
-    run = cube.with_name("run")
-    photonpano("run", str(spec), "--output", str(run))
-    scores = json.loads(photonpano("evaluate", str(run), "--truth", str(cube.with_name("cube.truth.npz")), "--json"))
-    record = json.loads((run / "run.json").read_text())
+def measured(study: Study, cube: Path, scene: str, case: Case, variant: str = "full", **sections: Any) -> dict[str, Any]:
+    """Run the pipeline on a capture in a process of its own, score it, and print a row of the table."""
+    spec = packed(cube, **{"resample": groups(case.group_size), "levels": 3} | sections)
+    folder = in_child(study.run, "run", spec).result
+    scores, record = scores_of(folder, cube), record_of(folder)
     row = {
-        "error_px": scores["corner_error_px"]["mean"],
-        "max_px": scores["corner_error_px"]["max"],
-        "within_std": scores["within_three_std_share"],
-        "psnr_db": scores["panorama"]["psnr_db"],
-        "oracle_db": scores["oracle"]["psnr_db"],
-        "ssim": scores["panorama"]["ssim"],
+        "error_px": scores.trajectory.mean_px,
+        "max_px": scores.trajectory.max_px,
+        "within_std": scores.honest_share,
+        "psnr_db": scores.panorama.psnr_db,
+        "oracle_db": scores.oracle.psnr_db,
+        "ssim": scores.panorama.ssim,
         "seconds": record["seconds"],
         "peak_mib": record["peak_memory_bytes"] / 2**20,
     }
     kind = f"{case.path_px} | {case.n_frames} | {case.group_size} | {case.flux} | {'yes' if case.shake else 'no'}"
     figures = "{error_px:.3f} | {max_px:.2f} | {within_std:.3f} | {psnr_db:.2f} | {oracle_db:.2f} | {ssim:.3f}"
     print(f"| {scene} | {kind} | {variant} | {(figures + ' | {seconds:.0f} | {peak_mib:.0f}').format(**row)} |", flush=True)
-    return row
+    errors_px = Compared.of(folder, cube).score.errors_px
+    return row | {"stretches_px": [stretch.mean() for stretch in np.array_split(errors_px, STRETCHES)]}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -123,22 +112,10 @@ def mean(rows: list[dict[str, float]], figure: str) -> float:
     return statistics.mean(row[figure] for row in rows)
 
 
-def errors_px(cube: Path) -> np.ndarray:
-    """Return the error of every frame of the last run."""
-    with np.load(cube.with_name("run") / "trajectory.npz") as found, np.load(cube.with_name("cube.truth.npz")) as truth:
-        return corner_errors(found["homographies"], truth["homographies"], tuple(truth["frame_shape"])).errors_px
-
-
 @pytest.mark.timeout(14_400)
 @pytest.mark.parametrize("case", [*CASES, FAST], ids=str)
 def test_run_reaches_accuracy_bounds(tmp_path, case):
-    rows = []
-    for scene in SCENES:
-        folder = tmp_path / scene
-        folder.mkdir()
-        cube = simulate(folder, scene, case)
-        rows.append(measure(cube, scene, case))
-        cube.unlink()
+    rows = [simulated(tmp_path, scene, case)() for scene in SCENES]
     assert max(row["peak_mib"] for row in rows) < 1024
     assert min(row["within_std"] for row in rows) >= 0.95
     assert mean(rows, "error_px") < case.mean_px
@@ -150,16 +127,11 @@ def test_run_reaches_accuracy_bounds(tmp_path, case):
 
 @pytest.mark.timeout(14_400)
 def test_loop_closures_bound_drift(tmp_path):
-    chains, closed = [], []
-    for scene in SCENES:
-        folder = tmp_path / scene
-        folder.mkdir()
-        cube = simulate(folder, scene, REVISITS)
-        chains.append(measure(cube, scene, REVISITS, "neighbours", graph=NEIGHBOURS))
-        closed.append(measure(cube, scene, REVISITS))
-        stretches = [stretch.mean() for stretch in np.array_split(errors_px(cube), STRETCHES)]
-        assert max(stretches) < 2 * statistics.median(stretches)
-        cube.unlink()
+    measures = [simulated(tmp_path, scene, REVISITS) for scene in SCENES]
+    chains = [measure("neighbours", graph=NEIGHBOURS) for measure in measures]
+    closed = [measure() for measure in measures]
+    for row in closed:
+        assert max(row["stretches_px"]) < 2 * statistics.median(row["stretches_px"])
     assert mean(closed, "error_px") < REVISITS.mean_px
     assert mean(chains, "error_px") > 3 * mean(closed, "error_px")
 
@@ -167,13 +139,11 @@ def test_loop_closures_bound_drift(tmp_path):
 @pytest.mark.timeout(7200)
 def test_each_level_improves_and_ablations_are_worse(tmp_path):
     """The tremor is faster than the distance of two groups, so that level 1 cannot resolve it."""
-    case = TREMBLING
-    cube = simulate(tmp_path, "street 0", case)
-    one, two = (measure(cube, "street 0", case, f"{levels} levels", levels=levels) for levels in (1, 2))
-    full = measure(cube, "street 0", case)
-    naive = measure(cube, "street 0", case, "naive average", merge={"with": {"compensate": False}})
-    groups = {"use": "constant-groups", "with": {"group_size": case.group_size}}
-    constant = measure(cube, "street 0", case, "constant groups", resample=groups)
+    measure = simulated(tmp_path, "street 0", TREMBLING)
+    one, two = (measure(f"{levels} levels", levels=levels) for levels in (1, 2))
+    full = measure()
+    naive = measure("naive average", merge={"with": {"compensate": False}})
+    constant = measure("constant groups", resample={"use": "constant-groups", "with": {"group_size": TREMBLING.group_size}})
     assert full["error_px"] < two["error_px"] < one["error_px"]
     assert naive["error_px"] > 2 * full["error_px"]
     assert constant["error_px"] > 2 * full["error_px"]

@@ -27,6 +27,7 @@ class Size:
 
 
 FULL, SMALL = Size((254, 496), (10_000, 1500.0)), Size((128, 192), (4000, 600.0))
+TINY = Size((96, 144), (1600, 240.0))  # of captures for cuts
 
 
 @dataclass(frozen=True)
@@ -157,3 +158,28 @@ ROWS: dict[str, Row] = {
         PAN, repack=lambda packed, width: np.packbits(np.unpackbits(packed, axis=-1, count=width), axis=1)
     ),
 }
+
+
+SPLINE = "clean, flux 0.5"
+RASTER = {"path": {"kind": "scan", "rows": 3, "row_spacing_px": 24, "length_px": 480}}
+TREMOR = {**shaken(TINY, SPLINE, 1, (223, 590, 1270)), "flux": 0.2}
+
+
+def missing(frames: int, *at: int) -> Settings:
+    """Return gaps of so many frames."""
+    return {"drops": [{"at": each, "frames": frames} for each in at]}
+
+
+CUT_ROWS: dict[str, Row] = {
+    **{f"clean, flux {flux}": Row(f"clean, flux {flux}") for flux in (0.5, 0.1, 0.02)},
+    "clean, fast turns": Row(SPLINE, changed({"path": {"kind": "random-spline", "length_px": 900, "knots": 12}})),
+    "clean raster": Row(SPLINE, changed(RASTER)),
+    "clean, tremor of 1 px": Row(SPLINE, changed(TREMOR)),
+    "clean, vibration of 3 px": Row(SPLINE, changed(shaken(TINY, SPLINE, 3, (1000,)))),
+    "clean, strong shake": Row(SPLINE, changed(shaken(TINY, SPLINE, 10, (25, 90, 210)))),
+    "20 frames missing": Row(SPLINE, changed(missing(20, 700))),
+    "60 frames missing, flux 0.1": Row("clean, flux 0.1", changed(missing(60, 700))),
+    "60 frames missing twice, tremor": Row(SPLINE, changed(TREMOR | missing(60, 500, 1000))),
+    "50 frames doubled": Row(SPLINE, changed({"repeats": [{"at": 700, "frames": 50}]})),
+}
+"""Captures of `TINY`, with and without jumps, on which cuts are counted."""

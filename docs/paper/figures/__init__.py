@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from paper.figures import cameras, costs, levels, light, matches, others, teaser
+from paper.figures.study import FigureOf
 
 FIGURES = {
-    "fig1": teaser.FIGURE,
-    "fig2": matches.FIGURE,
-    "fig3": levels.FIG3,
-    "fig4": cameras.FIGURE,
-    "fig4-light": cameras.LIGHT,
-    "fig5": levels.FIG5,
-    "fig6": levels.FIG6,
-    "fig7": light.FIG7,
-    "fig8": light.FIG8,
-    "fig9": others.HIGH_SPEED,
-    "fig10": light.FIG10,
-    "fig11": others.POSES,
-    "s1": others.BURSTS,
-    "s2": levels.S2,
-    "group-size": costs.SIZES_FIGURE,
-    "run-time": costs.RUN_TIME,
+    "fig1": FigureOf(teaser.make, teaser.claims),
+    "fig2": FigureOf(matches.make, matches.claims),
+    "fig3": FigureOf(levels.loop, levels.loop_claims),
+    "fig4": FigureOf(cameras.make, cameras.claims),
+    "fig4-light": FigureOf(cameras.darker, cameras.darker_claims),
+    "fig5": FigureOf(levels.without_new_groups, levels.groups_claims),
+    "fig6": FigureOf(levels.refinement, levels.refinement_claims),
+    "fig7": FigureOf(light.super_resolution, light.super_resolution_claims),
+    "fig8": FigureOf(light.dynamic_range, light.range_claims),
+    "fig9": FigureOf(others.high_speed, others.high_speed_claims),
+    "fig10": FigureOf(light.flicker, light.flicker_claims),
+    "fig11": FigureOf(others.poses, others.poses_claims),
+    "s1": FigureOf(others.bursts, others.bursts_claims),
+    "s2": FigureOf(levels.ends, levels.ends_claims),
+    "group-size": FigureOf(costs.group_sizes, costs.sizes_claims),
+    "run-time": FigureOf(costs.run_time, costs.run_time_claims),
 }
 """Figures of the paper by name, in its order."""

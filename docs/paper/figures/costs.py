@@ -4,73 +4,58 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from paper.figures.study import Claim, FigureOf, frames_of, motion_of, record_of, rounded
-from picture_parts import drawn
+import picture_parts as draw
+from harness import Compared, Study
+from paper.figures.study import QUICK_STREET, Claim, Numbers, frames_of, levels_of, rounded
 
 from photonpano import PhotonpanoError
 from photonpano_core.configs import MidpointConfig
 from photonpano_core.resamplers import MidpointResampler
 
-if TYPE_CHECKING:
-    from paper.figures.study import Numbers, Study
-    from picture_parts import Picture
-
 SIZES = (125, 250, 500, 750, 1500)
 LENGTHS_PX = (120, 480)
 FLUXES = (0.2, 0.01)
-USUAL = 250, 750
-"""Group sizes that the paper recommends."""
-GOOD_PX = 0.5
-"""Largest mean error of a result of high quality."""
-QUICK = {
-    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
-    "source.with.frame_shape": [96, 144],
-    "source.with.n_frames": 3000,
-}
+USUAL = 250, 750  # group sizes that the paper recommends
+GOOD_PX = 0.5  # largest mean error of a result of high quality
+QUICK = {**QUICK_STREET, "source.with.frame_shape": [96, 144], "source.with.n_frames": 3000}
 QUICK_SIZES, QUICK_LENGTHS_PX, QUICK_FLUXES = (60, 250), (40, 100), (0.3,)
 QUICK_TIME = {**QUICK, "source.with.path.length_px": 100, "source.with.flux": 0.3, "resample.with.group_size": 200}
 QUICK_WINDOWS = {**QUICK_TIME, "resample.with.step_frames": 50}
-LENGTHS = (10_000, 30_000, 100_000)
-"""Frames of the captures whose exposures are counted."""
+LENGTHS = (10_000, 30_000, 100_000)  # frames of the captures whose exposures are counted
 SPEED = Path(__file__).parents[2] / "explanation" / "speed.md"
-LAST = 3
-"""Level whose exposures are as dense as sliding windows with a step of a quarter of a group."""
+LAST = 3  # level whose exposures are as dense as sliding windows with a step of a quarter of a group
 
 
-def group_sizes(study: Study) -> tuple[Picture, Numbers]:
+def group_sizes(study: Study) -> tuple[draw.Picture, Numbers]:
     """Measure the error of each group size over speed and light."""
     sizes, lengths, fluxes = (QUICK_SIZES, QUICK_LENGTHS_PX, QUICK_FLUXES) if study.quick else (SIZES, LENGTHS_PX, FLUXES)
     errors: dict[str, list[float | None]] = {}
-    figure = Figure(figsize=(9.68, 3.4), dpi=100, layout="constrained")
-    panels = figure.subplots(1, len(lengths), sharey=True)
-    for panel, length in zip(panels, lengths, strict=True):
+    figure, axes = draw.panels(9.68, 3.4, 1, len(lengths), sharey=True)
+    for panel, length in zip(axes, lengths, strict=True):
         for flux in fluxes:
-            changes: dict[str, Any] = {"source.with.flux": flux}
-            spec = study.spec("group-size", changes, QUICK)
+            spec = study.spec("paper/group-size", {"source.with.flux": flux}, QUICK)
             spec["source"]["with"]["path"] = spec["source"]["with"]["path"] | {"length_px": length}
             capture = study.capture("group-size", spec)
             found: list[float | None] = []
             for size in sizes:
                 spec["resample"] = {"use": "midpoint", "with": {"group_size": size}}
                 try:
-                    found.append(rounded(motion_of(study.run("group-size", spec, capture), capture)[2].mean_px))
+                    run = study.run("group-size", spec, capture)
+                    found.append(rounded(Compared.of(run, capture).score.mean_px))
                 except PhotonpanoError:
                     found.append(None)
-            speed = length / spec["source"]["with"]["n_frames"]
-            errors[f"{speed:.2g} px a frame, {flux:g} photons"] = found
+            speed = f"{length / spec['source']['with']['n_frames']:.2g} px a frame"
+            errors[f"{speed}, {flux:g} photons"] = found
             panel.loglog(sizes, [np.nan if each is None else each for each in found], ".-", label=f"{flux:g} photons a frame")
         panel.axvspan(*USUAL, color="0.9")
-        panel.set_title(f"{length / spec['source']['with']['n_frames']:.2g} px a frame", fontsize=10)
-        panel.set_xticks(sizes, [str(each) for each in sizes])
-        panel.set_xticks([], minor=True)
-        panel.set_xlabel("group size (frames)", fontsize=9)
-    panels[0].set_ylabel("mean corner error (px)", fontsize=9)
-    panels[0].legend(fontsize=8)
-    return drawn(figure)[..., 2::-1], frames_of(spec) | {"sizes": list(sizes), "error_px": errors}
+        panel.set_title(speed, fontsize=10)
+        draw.ticks(panel, {size: str(size) for size in sizes})
+        draw.name_axes(panel, "group size (frames)")
+    axes[0].set_ylabel("mean corner error (px)", fontsize=9)
+    axes[0].legend(fontsize=8)
+    return draw.in_bgr(figure), frames_of(spec) | {"sizes": list(sizes), "error_px": errors}
 
 
 def sizes_claims(numbers: Numbers) -> list[Claim]:
@@ -101,7 +86,6 @@ def sizes_claims(numbers: Numbers) -> list[Claim]:
             "the same: which of the sizes that work is best",
             f"not decided by one capture each: errors between {USUAL[0]} and {USUAL[1]} frames differ by a factor of at most "
             f"{ratio:.1f}",
-            None,
         ),
     ]
 
@@ -114,16 +98,15 @@ def usual(errors: dict[int, float]) -> dict[int, float]:
 def run_time(study: Study) -> tuple[None, Numbers]:
     """Count the exposures and the frames that they take, and measure the error against that of sliding windows."""
     quick = {"group-size": QUICK_TIME, "sliding-window": QUICK_WINDOWS}
-    specs = {name: study.spec(name, {}, changes) for name, changes in quick.items()}
+    specs = {name: study.spec(f"paper/{name}", {}, changes) for name, changes in quick.items()}
     capture = study.capture("group-size", specs["group-size"])
     numbers: Numbers = frames_of(specs["group-size"])
     for name, spec in specs.items():
         folder = study.run(name, spec, capture)
-        levels = record_of(folder)["levels"]
         numbers[name] = {
-            "exposures": sum(level["groups"] for level in levels),
-            "pairs": sum(level["pairs"] for level in levels),
-            "error_px": rounded(motion_of(folder, capture)[2].mean_px),
+            "exposures": sum(levels_of(folder, "groups")),
+            "pairs": sum(levels_of(folder, "pairs")),
+            "error_px": rounded(Compared.of(folder, capture).score.mean_px),
         }
     counted = {size: [exposures(n_frames, size) for n_frames in LENGTHS] for size in (250, 500, 1000)}
     numbers["exposures"] = {str(size): found for size, found in counted.items()}
@@ -174,7 +157,3 @@ def run_time_claims(numbers: Numbers) -> list[Claim]:
             numbers["seconds"] < 600,
         ),
     ]
-
-
-SIZES_FIGURE = FigureOf(group_sizes, sizes_claims)
-RUN_TIME = FigureOf(run_time, run_time_claims)

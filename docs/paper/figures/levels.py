@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
+import picture_parts as draw
+from harness import Compared, Study
+from numpy.typing import NDArray
 from paper.figures.study import (
     Claim,
-    FigureOf,
+    Numbers,
     averaged_in_place,
-    fitted,
     frames_of,
-    in_rows,
-    motion_of,
-    place,
-    record_of,
+    group_size,
+    levels_of,
     rounded,
     scores_of,
 )
-from picture_parts import beside, drawn, labelled, picture
-
-from photonpano import load_panorama
-from photonpano.geometry import apply
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import Any
-
-    from numpy.typing import NDArray
-    from paper.figures.study import Numbers, Study
-    from picture_parts import Picture
-
-    from photonpano import Panorama
 
 QUICK = {
     "source.with.path": {"kind": "random-spline", "length_px": 60, "shake": {"rms_px": 1.5, "frequencies_hz": [450, 800]}},
@@ -42,67 +28,53 @@ QUICK = {
     "source.with.flux": 0.5,
     "resample.with.group_size": 100,
 }
-LEVELS = 3
-"""Levels of Fig. 3, Fig. 5 and S2."""
-COLOURS = ("#c8a26b", "#1f5a94", "#7a1f5a")
-"""Of the levels."""
-ENDS = 0.5
-"""Length of an end of the capture, in groups."""
+LEVELS = 3  # of Fig. 3, Fig. 5 and S2
+COLOURS = ("#c8a26b", "#1f5a94", "#7a1f5a")  # of the levels
+ENDS = 0.5  # length of an end of the capture, in groups
 
 
-def runs(study: Study) -> tuple[dict[str, Any], Path, list[Path]]:
-    """Return the spec, the capture, and the runs of one level, of two, and of three."""
-    spec = study.spec("fig6", {}, QUICK)
+def runs(study: Study) -> tuple[Numbers, Path, list[Path]]:
+    """Return how large the capture and its groups are, the capture, and the runs of one level, of two, and of three."""
+    spec = study.spec("paper/fig6", {}, QUICK)
     capture = study.capture("fig6", spec)
-    return spec, capture, [study.run("fig6", spec | {"levels": [{"scale": 1}] * n}, capture) for n in range(1, LEVELS + 1)]
+    folders = [study.run("fig6", spec | {"levels": [{"scale": 1}] * n}, capture) for n in range(1, LEVELS + 1)]
+    return {**frames_of(spec, "flux"), "group_size": group_size(spec)}, capture, folders
 
 
 def constant(study: Study, capture: Path) -> Path:
     """Return the run with a constant number of groups, which locates no end by itself."""
-    return study.run("fig5", study.spec("fig5", {}, QUICK), capture)
+    return study.run("fig5", study.spec("paper/fig5", {}, QUICK), capture)
 
 
-def settings(spec: dict[str, Any]) -> Numbers:
-    """Return how large the capture and its groups are."""
-    return {
-        **frames_of(spec),
-        "flux": spec["source"]["with"]["flux"],
-        "group_size": spec["resample"]["with"]["group_size"],
-    }
-
-
-def loop(study: Study) -> tuple[Picture, Numbers]:
+def loop(study: Study) -> tuple[draw.Picture, Numbers]:
     """Fig. 3: the estimated path, with expected errors, after each level."""
-    spec, capture, folders = runs(study)
-    rate = spec["source"]["with"]["frame_rate_hz"] / 1000
-    figure = Figure(figsize=(10, 5.6), dpi=100, layout="constrained")
-    panels = figure.subplots(2, LEVELS, sharex=True)
+    settings, capture, folders = runs(study)
+    rate = settings["frame_rate_hz"] / 1000
+    figure, axes = draw.panels(10, 5.6, 2, LEVELS, sharex=True)
     levels: Numbers = {"error_px": [], "expected_px": [], "exposures": []}
-    for column, (folder, colour) in enumerate(zip(folders, COLOURS, strict=True)):
-        found, truth, score = motion_of(folder, capture)
+    for column, (folder, colour, path, errors) in enumerate(zip(folders, COLOURS, axes, axes[LEVELS:], strict=False)):
+        run = Compared.of(folder, capture)
         with np.load(folder / "exposures" / f"level-{column + 1}.npz") as level:
             spans, instants = level["frames"], level["instants"].round().astype(int)
-        middle = (np.array(found.frame_shape[::-1]) - 1) / 2
-        true = apply(truth.homographies, middle[None])[:, 0]
-        estimated = apply(score.alignment @ found.homographies, middle[None])[:, 0]
+        true, estimated = run.middles(true=True), run.aligned_middles()
         for start, stop in spans[:: 2 ** (column + 1)]:
-            panels[0, column].axvspan(start / rate, stop / rate, color=colour, alpha=0.2, linewidth=0)
+            path.axvspan(start / rate, stop / rate, color=colour, alpha=0.2, linewidth=0)
         milliseconds = np.arange(len(true)) / rate
-        panels[0, column].plot(milliseconds, true[:, 0], color="0.6", linewidth=3, label="true path")
-        panels[0, column].plot(milliseconds, estimated[:, 0], color=colour, linewidth=1, label="estimated")
-        panels[0, column].set_title(f"level {column + 1}: {len(spans)} exposures", fontsize=10)
-        error = estimated - true
-        panels[1, column].plot(milliseconds, error[:, 0], color=colour, linewidth=0.8)
+        path.plot(milliseconds, true[:, 0], color="0.6", linewidth=3, label="true path")
+        path.plot(milliseconds, estimated[:, 0], color=colour, linewidth=1, label="estimated")
+        path.set_title(f"level {column + 1}: {len(spans)} exposures", fontsize=10)
+        error = (estimated - true)[:, 0]
+        errors.plot(milliseconds, error, color=colour, linewidth=0.8)
         bars = {"fmt": ".", "color": "black", "markersize": 4, "linewidth": 0.8}
-        panels[1, column].errorbar(instants / rate, error[instants, 0], found.std_px[instants], **bars)
-        panels[1, column].set_xlabel("ms", fontsize=9)
-        levels["error_px"].append(rounded(score.mean_px))
-        levels["expected_px"].append(rounded(float(found.std_px[found.located].mean())))
+        errors.errorbar(instants / rate, error[instants], run.found.std_px[instants], **bars)
+        draw.name_axes(errors, "ms")
+        levels["error_px"].append(rounded(run.score.mean_px))
+        levels["expected_px"].append(rounded(float(run.found.std_px[run.found.located].mean())))
         levels["exposures"].append(len(spans))
-    panels[0, 0].legend(fontsize=8)
-    panels[0, 0].set_ylabel("x (px)", fontsize=9)
-    panels[1, 0].set_ylabel("error of x, with expected errors (px)", fontsize=9)
-    return drawn(figure)[..., 2::-1], settings(spec) | levels
+    axes[0].legend(fontsize=8)
+    axes[0].set_ylabel("x (px)", fontsize=9)
+    axes[LEVELS].set_ylabel("error of x, with expected errors (px)", fontsize=9)
+    return draw.in_bgr(figure), settings | levels
 
 
 def loop_claims(numbers: Numbers) -> list[Claim]:
@@ -127,32 +99,28 @@ def loop_claims(numbers: Numbers) -> list[Claim]:
     ]
 
 
-def without_new_groups(study: Study) -> tuple[Picture, Numbers]:
+def without_new_groups(study: Study) -> tuple[draw.Picture, Numbers]:
     """Fig. 5: the panorama with a constant number of groups, and with new groups at each level."""
-    spec, capture, folders = runs(study)
+    numbers, capture, folders = runs(study)
     ways = {"constant number of groups": constant(study, capture), "new groups at each level": folders[-1]}
-    worst = int(np.argmax(np.where(inside(spec), motion_of(ways["constant number of groups"], capture)[2].errors_px, 0)))
-    figure = Figure(figsize=(9.68, 2.6), dpi=100, layout="constrained")
-    panel = figure.subplots()
-    shown, numbers = [], settings(spec)
-    for (name, folder), colour in zip(ways.items(), COLOURS, strict=False):
-        found, _, score = motion_of(folder, capture)
-        panorama = load_panorama(folder)
-        middle = (np.array(found.frame_shape[::-1]) - 1) / 2
-        point = apply(found.homographies[worst], middle[None])[0]
-        radius = min(120, panorama.flux.shape[1] // 2), min(90, panorama.flux.shape[0] // 2)
-        shown.append(labelled(place(panorama, (point[0], point[1]), radius, float(np.nanquantile(panorama.flux, 0.995))), name))
-        panel.plot(score.errors_px, color=colour, linewidth=1, label=name)
-        numbers[name.split()[0]] = scores_of(folder, capture) | {"exposures": record_of(folder)["levels"][-1]["groups"]}
-    panel.set_xlabel("frame", fontsize=9)
-    panel.set_ylabel("corner error (px)", fontsize=9)
+    compared = {name: Compared.of(folder, capture) for name, folder in ways.items()}
+    few = compared["constant number of groups"]
+    worst = int(np.argmax(np.where(inside(numbers), few.score.errors_px, 0)))
+    figure, (panel,) = draw.panels(9.68, 2.6)
+    shown = {}
+    for (name, run), colour in zip(compared.items(), COLOURS, strict=False):
+        panorama = run.panorama
+        shown[name] = draw.place(panorama, run.middles()[worst], (120, 90), draw.white_of(panorama.flux))
+        panel.plot(run.score.errors_px, color=colour, linewidth=1, label=name)
+        numbers[name.split()[0]] = scores_of(run.folder, capture) | {"exposures": levels_of(run.folder, "groups")[-1]}
+    draw.name_axes(panel, "frame", "corner error (px)")
     panel.legend(fontsize=8)
-    return in_rows([beside(shown), drawn(figure)[..., 0]]), numbers
+    return draw.in_rows([draw.beside(draw.all_labelled(shown)), draw.drawn(figure)[..., 0]]), numbers
 
 
-def inside(spec: dict[str, Any]) -> NDArray[np.bool_]:
+def inside(settings: Numbers) -> NDArray[np.bool_]:
     """Return the frames that are more than a group from both ends: (T,)."""
-    n_frames, group = spec["source"]["with"]["n_frames"], spec["resample"]["with"]["group_size"]
+    n_frames, group = settings["n_frames"], settings["group_size"]
     frames = np.arange(n_frames)
     return (frames >= group) & (frames < n_frames - group)
 
@@ -176,28 +144,23 @@ def groups_claims(numbers: Numbers) -> list[Claim]:
     ]
 
 
-def refinement(study: Study) -> tuple[Picture, Numbers]:
+def refinement(study: Study) -> tuple[draw.Picture, Numbers]:
     """Fig. 6: averages of groups, and panoramas of one level and of two."""
-    spec, capture, folders = runs(study)
+    numbers, capture, folders = runs(study)
     naive, naive_db = averaged_in_place(folders[0], capture)
-    panoramas: dict[str, Panorama] = {
-        f"averages of {spec['resample']['with']['group_size']:,} frames": naive,
-        "one level": load_panorama(folders[0]),
-        "two levels": load_panorama(folders[1]),
-    }
-    found = motion_of(folders[1], capture)[0]
-    middle = (np.array(found.frame_shape[::-1]) - 1) / 2
-    white = float(np.nanquantile(panoramas["two levels"].flux, 0.995))
-    rows = []
+    first, second = (Compared.of(folder, capture) for folder in folders[:2])
+    named = {f"averages of {numbers['group_size']:,} frames": naive, "one level": first.panorama}
+    panoramas = {**named, "two levels": second.panorama}
+    white = draw.white_of(second.panorama.flux)
+    middles = second.middles()
+    rows = {}
     for name, panorama in panoramas.items():
-        places = [apply(found.homographies[frame], middle[None])[0] for frame in (0, len(found.homographies) // 2)]
-        radius = min(60, panorama.flux.shape[1] // 2), min(60, panorama.flux.shape[0] // 2)
-        insets = [place(panorama, (x, y), radius, white) for x, y in places]
-        whole = picture(panorama.flux, white)
+        insets = [draw.place(panorama, middles[frame], (60, 60), white) for frame in (0, len(middles) // 2)]
+        whole = draw.picture(panorama.flux, white)
         scale = insets[0].shape[0] / whole.shape[0]
-        rows.append(labelled(beside([fitted(whole, round(whole.shape[1] * scale)), *insets]), name))
-    numbers = settings(spec) | {"averages_psnr_db": round(naive_db, 1)}
-    return in_rows(rows), numbers | {"levels": [scores_of(folder, capture) for folder in folders]}
+        rows[name] = draw.beside([draw.fitted(whole, round(whole.shape[1] * scale)), *insets])
+    numbers["averages_psnr_db"] = round(naive_db, 1)
+    return draw.in_rows(draw.all_labelled(rows)), numbers | {"levels": [scores_of(folder, capture) for folder in folders]}
 
 
 def refinement_claims(numbers: Numbers) -> list[Claim]:
@@ -224,26 +187,22 @@ def refinement_claims(numbers: Numbers) -> list[Claim]:
     ]
 
 
-def ends(study: Study) -> tuple[Picture, Numbers]:
+def ends(study: Study) -> tuple[draw.Picture, Numbers]:
     """S2: errors at the ends of the capture, where they are located and where they are extrapolated."""
-    spec, capture, folders = runs(study)
-    group = spec["resample"]["with"]["group_size"]
-    length = int(ENDS * group)
-    figure = Figure(figsize=(9.68, 3), dpi=100, layout="constrained")
-    panel = figure.subplots()
-    numbers = settings(spec) | {"ends_px": {}, "between_px": {}}
-    ways = {"constant": constant(study, capture), **{f"level {n + 1}": folder for n, folder in enumerate(folders)}}
+    numbers, capture, folders = runs(study)
+    length = int(ENDS * numbers["group_size"])
+    figure, (panel,) = draw.panels(9.68, 3)
+    numbers |= {"ends_px": {}, "between_px": {}}
+    ways: dict[str, Any] = {"constant": constant(study, capture), **{f"level {n + 1}": each for n, each in enumerate(folders)}}
     for (name, folder), colour in zip(ways.items(), ("0.5", *COLOURS), strict=True):
-        errors = motion_of(folder, capture)[2].errors_px
-        panel.semilogy(
-            errors, color=colour, linewidth=1, label="ends extrapolated" if name == "constant" else f"{name}, ends located"
-        )
+        errors = Compared.of(folder, capture).score.errors_px
+        label = "ends extrapolated" if name == "constant" else f"{name}, ends located"
+        panel.semilogy(errors, color=colour, linewidth=1, label=label)
         numbers["ends_px"][name] = rounded(float(np.mean([errors[:length], errors[-length:]])))
         numbers["between_px"][name] = rounded(float(errors[length:-length].mean()))
-    panel.set_xlabel("frame", fontsize=9)
-    panel.set_ylabel("corner error (px)", fontsize=9)
+    draw.name_axes(panel, "frame", "corner error (px)")
     figure.legend(loc="outside upper center", fontsize=8, ncols=4)
-    return drawn(figure)[..., 2::-1], numbers
+    return draw.in_bgr(figure), numbers
 
 
 def ends_claims(numbers: Numbers) -> list[Claim]:
@@ -261,9 +220,3 @@ def ends_claims(numbers: Numbers) -> list[Claim]:
             at_ends["level 3"] < at_ends["constant"],
         ),
     ]
-
-
-FIG3 = FigureOf(loop, loop_claims)
-FIG5 = FigureOf(without_new_groups, groups_claims)
-FIG6 = FigureOf(refinement, refinement_claims)
-S2 = FigureOf(ends, ends_claims)

@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
+import picture_parts as draw
+from harness import Compared, Study, record_of
+from numpy.typing import NDArray
 from paper.figures.study import (
+    QUICK_STREET,
     Claim,
-    FigureOf,
+    Numbers,
     fails,
     frames_of,
-    in_rows,
-    motion_of,
-    record_of,
+    group_size,
     rounded,
     scores_of,
     scores_or_reason,
     told,
 )
-from picture_parts import beside, drawn, labelled, picture
 
-from photonpano import load_panorama, open_source, parse_spec
-from photonpano.context import Context
-from photonpano.evaluation import covered, image_score, true_panorama, white_flux
-from photonpano.geometry import Canvas, FrameTrajectory
-from photonpano.merging.panorama import plan_canvas, render
-
-if TYPE_CHECKING:
-    from pathlib import Path
-    from typing import Any
-
-    from paper.figures.study import Numbers, Study
-    from picture_parts import Picture
+from photonpano import load_panorama
+from photonpano.evaluation import covered
 
 QUICK_FINE = {"source.with.n_frames": 2000, "source.with.frame_shape": [96, 128]}
 QUICK_NIGHT = {
@@ -45,49 +36,43 @@ QUICK_NIGHT = {
     "resample.with.group_size": 250,
 }
 QUICK_FLICKER = {
+    **QUICK_STREET,
     "source.with.n_frames": 1200,
     "source.with.frame_rate_hz": 20000,
     "source.with.frame_shape": [96, 144],
-    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
     "source.with.path": {"kind": "pan", "length_px": 60},
     "source.with.flux": 0.5,
     "resample.with.group_size": 100,
 }
-DEPTHS = (0.0, 0.5, 0.8, 0.9, 1.0)
-"""Amplitudes of the flicker, relative to the mean light."""
+DEPTHS = (0.0, 0.5, 0.8, 0.9, 1.0)  # amplitudes of the flicker, relative to the mean light
 
 
-def super_resolution(study: Study) -> tuple[Picture, Numbers]:
+def fine_images(run: Compared) -> dict[str, NDArray[np.float32]]:
+    """Return what a run of `super-resolution` is compared with on its canvas: interpolated, merged, and the true scene."""
+    merged, bicubic = run.finer()
+    return {"interpolated": bicubic, "merged": merged.flux, "fine": run.panorama.flux, "true": run.scene(run.canvas)}
+
+
+def fine_pictures(images: dict[str, NDArray[np.float32]], radius: tuple[int, int]) -> draw.Picture:
+    """Return the middle of images, magnified twice; the last one has the white."""
+    parts = {name: draw.around(image, (image.shape[1] // 2, image.shape[0] // 2), radius) for name, image in images.items()}
+    white = draw.white_of(list(parts.values())[-1])
+    return draw.beside([draw.labelled(draw.magnified(draw.picture(part, white), 2), name) for name, part in parts.items()])
+
+
+def super_resolution(study: Study) -> tuple[draw.Picture, Numbers]:
     """Fig. 7: a part of the panorama, interpolated from the resolution of the sensor, super-resolved, and the truth."""
-    spec = study.spec("fig7", {}, QUICK_FINE)
+    spec = study.spec("paper/fig7", {}, QUICK_FINE)
     capture = study.capture("fig7", spec)
-    folder = study.run("fig7", spec, capture)
-    fine = load_panorama(folder)
-    canvas = Canvas(*fine.flux.shape[:2], fine.canvas)
-    found, truth, score = motion_of(folder, capture)
-    assert truth.scene is not None
-    scene = true_panorama(truth.scene, canvas, score.alignment)
-    with open_source(parse_spec(record_of(folder)["spec"])) as source:
-        trajectory, span = FrameTrajectory(found.homographies), source.info.span
-        small = plan_canvas(trajectory, span, source.info.frame_shape, 1.0, 2**31)
-        coarse = render(source, trajectory, span, small, 0.125, Context(2)).flux
-    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    to_small = small.transform @ np.linalg.inv(canvas.transform)
-    bicubic = cv2.warpPerspective(np.nan_to_num(coarse), to_small, fine.flux.shape[::-1], flags=flags)
-    compared = cv2.erode((covered(fine.weight) & np.isfinite(scene)).astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
-    white = white_flux(truth.scene)
-    middle = fine.flux.shape[0] // 2, fine.flux.shape[1] // 2
-    part = np.s_[middle[0] - 75 : middle[0] + 75, middle[1] - 80 : middle[1] + 80]
-    bright = float(np.nanquantile(scene[part], 0.995))
-    images = {"sensor's resolution, interpolated": bicubic, "super-resolution, 2x": fine.flux, "true scene": scene}
-    shown = [labelled(np.kron(picture(image[part], bright), np.ones((2, 2), np.uint8)), name) for name, image in images.items()]
-    numbers = {
-        **frames_of(spec),
-        "scale": spec["render"]["scale"],
-        "interpolated_psnr_db": round(image_score(bicubic, scene, compared, white).psnr_db, 1),
-        "psnr_db": round(image_score(fine.flux, scene, compared, white).psnr_db, 1),
-    }
-    return beside(shown), numbers
+    run = Compared.of(study.run("fig7", spec, capture), capture)
+    of = fine_images(run)
+    seen = covered(run.panorama.weight) & np.isfinite(of["true"])
+    compared = cv2.erode(seen.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+    numbers = {**frames_of(spec), "scale": spec["render"]["scale"]}
+    for name, image in {"interpolated_psnr_db": of["interpolated"], "psnr_db": of["fine"]}.items():
+        numbers[name] = round(run.psnr_db(image, of["true"], compared), 1)
+    named = {"sensor's resolution, interpolated": of["interpolated"], "super-resolution, 2x": of["fine"]}
+    return fine_pictures({**named, "true scene": of["true"]}, (80, 75)), numbers
 
 
 def super_resolution_claims(numbers: Numbers) -> list[Claim]:
@@ -102,30 +87,32 @@ def super_resolution_claims(numbers: Numbers) -> list[Claim]:
     ]
 
 
-def dynamic_range(study: Study) -> tuple[Picture, Numbers]:
+def dynamic_range(study: Study) -> tuple[draw.Picture, Numbers]:
     """Fig. 8: the average of all frames, and the stabilised image."""
-    spec = study.spec("fig8", {}, QUICK_NIGHT)
+    spec = study.spec("paper/fig8", {}, QUICK_NIGHT)
     capture = study.capture("fig8", spec)
-    folder = study.run("fig8", spec, capture)
-    with open_source(parse_spec(record_of(folder)["spec"])) as source:
+    run = Compared.of(study.run("fig8", spec, capture), capture)
+    with run.source() as source:
         n_frames = source.info.n_frames
         average = source.response.flux(source.counts(source.info.span).astype(np.float32) / n_frames, n_frames)
-    flux = load_panorama(folder).flux
+    flux = run.panorama.flux
     white = float(np.nanquantile(flux, 0.98))
-    shown = {f"the {n_frames:,} frames, averaged": picture(average, white), "aligned and merged": picture(flux, white)}
-    local = cv2.imread(str(folder / "panorama.png"), cv2.IMREAD_GRAYSCALE)
+    shown = {
+        f"the {n_frames:,} frames, averaged": draw.picture(average, white),
+        "aligned and merged": draw.picture(flux, white),
+    }
+    local = cv2.imread(str(run.folder / "panorama.png"), cv2.IMREAD_GRAYSCALE)
     shown["the same, all of its range (tone: local)"] = np.asarray(local, np.uint8)
-    panorama = record_of(folder)["panorama"]
+    panorama = record_of(run.folder)["panorama"]
     numbers = {
-        **frames_of(spec),
-        "flux": spec["source"]["with"]["flux"],
+        **frames_of(spec, "flux"),
         "median_flux": rounded(float(np.nanmedian(flux)), 2),
         "shake_px": spec["source"]["with"]["path"]["shake"]["rms_px"],
         "range_db": round(panorama["dynamic_range_db"]),
         "measurable_db": round(panorama["measurable_range_db"]),
-        **scores_of(folder, capture),
+        **scores_of(run.folder, capture),
     }
-    return beside([labelled(image, label) for label, image in shown.items()]), numbers
+    return draw.beside(draw.all_labelled(shown)), numbers
 
 
 def range_claims(numbers: Numbers) -> list[Claim]:
@@ -145,41 +132,32 @@ def range_claims(numbers: Numbers) -> list[Claim]:
     ]
 
 
-def flicker(study: Study) -> tuple[Picture, Numbers]:
+def flicker(study: Study) -> tuple[draw.Picture, Numbers]:
     """Fig. 10: errors over the depth of the flicker with the light taken for steady, and panoramas where the lamps go out."""
-    spec = study.spec("fig10", {}, QUICK_FLICKER)
+    spec = study.spec("paper/fig10", {}, QUICK_FLICKER)
     (lamp,) = spec["source"]["with"]["lamps"]
-    group = spec["resample"]["with"]["group_size"]
-    numbers: Numbers = frames_of(spec) | {
-        "frequency_hz": lamp["frequency_hz"],
-        "group_periods": rounded(group * lamp["frequency_hz"] / spec["source"]["with"]["frame_rate_hz"], 2),
-        "depths": list(DEPTHS[::4] if study.quick else DEPTHS),
-    }
+    numbers: Numbers = frames_of(spec) | {"frequency_hz": lamp["frequency_hz"]}
+    numbers["group_periods"] = rounded(group_size(spec) * lamp["frequency_hz"] / numbers["frame_rate_hz"], 2)
+    numbers["depths"] = list(DEPTHS[::4] if study.quick else DEPTHS)
     steady = spec | {"light": "steady"}
     found = [under(study, steady, [lamp | {"depth": depth}]) for depth in numbers["depths"]]
     measured = under(study, spec, [lamp])
     phases = [
         lamp | {"phase_deg": degrees, "at": [x, 0.5], "radius": 0.25} for degrees, x in ((0, 0.35), (120, 0.5), (-120, 0.65))
     ]
-    numbers |= {
-        "steady": [scores for _, scores in found],
-        "auto": measured[1],
-        "phases": under(study, steady, phases)[1],
-    }
-    shown = []
-    for (folder, _), name in ((found[-1], "the lamps go out; light taken for steady"), (measured, "the same, light measured")):
-        if folder is not None:
-            flux = load_panorama(folder).flux
-            shown.append(labelled(picture(flux, float(np.nanquantile(flux, 0.995))), name))
-    figure = Figure(figsize=(8, 2.6), dpi=100, layout="constrained")
-    panel = figure.subplots()
+    numbers["steady"] = [scores for _, scores in found]
+    numbers |= {"auto": measured[1], "phases": under(study, steady, phases)[1]}
+    runs = {"the lamps go out; light taken for steady": found[-1][0], "the same, light measured": measured[0]}
+    shown = draw.all_labelled(
+        {name: draw.picture(load_panorama(folder).flux) for name, folder in runs.items() if folder is not None}
+    )
+    figure, (panel,) = draw.panels(8, 2.6)
     errors = [scores.get("mean_px", np.nan) for scores in numbers["steady"]]
     panel.semilogy(numbers["depths"], errors, ".-", color="0.6", label="light taken for steady")
     panel.semilogy([lamp["depth"]], [numbers["auto"].get("mean_px", np.nan)], "o", color="black", label="light measured")
-    panel.set_xlabel("depth of the flicker (1: the lamps go out)")
-    panel.set_ylabel("mean corner error (px)")
+    draw.name_axes(panel, "depth of the flicker (1: the lamps go out)", "mean corner error (px)", None)
     panel.legend()
-    return in_rows([*shown, drawn(figure)[..., 0]]), numbers
+    return draw.in_rows([*shown, draw.drawn(figure)[..., 0]]), numbers
 
 
 def under(study: Study, spec: dict[str, Any], lamps: list[dict[str, Any]]) -> tuple[Path | None, Numbers]:
@@ -202,12 +180,10 @@ def flicker_claims(numbers: Numbers) -> list[Claim]:
         Claim(
             "(not in the paper) how deep the flicker is when it fails",
             "; ".join(f"depth {depth:g}: {told(scores)}" for depth, scores in shallow),
-            None,
         ),
         Claim(
             "(not in the paper) lamps that go out on three phases, so that it is never dark everywhere",
             told(numbers["phases"]),
-            None,
         ),
         Claim(
             "may be mitigated (by longer exposures where brightness is not constant)",
@@ -215,8 +191,3 @@ def flicker_claims(numbers: Numbers) -> list[Claim]:
             fails(out[1]) and not fails(numbers["auto"]),
         ),
     ]
-
-
-FIG7 = FigureOf(super_resolution, super_resolution_claims)
-FIG8 = FigureOf(dynamic_range, range_claims)
-FIG10 = FigureOf(flicker, flicker_claims)

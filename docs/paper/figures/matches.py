@@ -2,42 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
-from paper.figures.study import Claim, FigureOf, fitted, in_colour, in_rows, rounded
-from picture_parts import beside, drawn, labelled, picture
+import picture_parts as draw
+from harness import Study
+from numpy.typing import NDArray
+from paper.figures.study import QUICK_STREET, Claim, Numbers, rounded
 
 from photonpano import FrameSpan, Group, Located, StageContext, discover, open_source, parse_spec
 from photonpano.geometry import FrameTrajectory, apply, corner_displacements, inverse
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from paper.figures.study import Numbers, Study
-    from picture_parts import Picture
-
-BLUR_PX = (0, 3, 6, 12, 20, 30)
-"""Blur of the frames, which are 30 px apart."""
-PHOTONS = (3000, 300, 100, 30, 10, 3)
-"""Photons per pixel per frame, from little noise to much."""
+BLUR_PX = (0, 3, 6, 12, 20, 30)  # blur of the frames, which are 30 px apart
+PHOTONS = (3000, 300, 100, 30, 10, 3)  # per pixel per frame, from little noise to much
 LOCATORS = ("opencv-sift", "direct")
-CORRECT_PX, LOST_PX = 3.0, 10.0
-"""Largest error of a match that counts; the error with which a lost pair is drawn and averaged."""
-QUICK = {"source.with.frame_shape": [128, 192], "source.with.scene": {"kind": "street", "width": 1024, "height": 682}}
+CORRECT_PX, LOST_PX = 3.0, 10.0  # largest error of a match that counts; the error with which a lost pair is drawn and averaged
 
 
-def make(study: Study) -> tuple[Picture, Numbers]:
+def make(study: Study) -> tuple[draw.Picture, Numbers]:
     """Register the pairs of each blur and each noise."""
     every = slice(None, None, 3) if study.quick else slice(None)
     blurs, photons = BLUR_PX[every], PHOTONS[every]
     maps = {name: np.zeros((len(photons), len(blurs))) for name in ("matches", *LOCATORS)}
     for row, flux in enumerate(photons):
         for column, blur in enumerate(blurs):
-            spec = study.spec("fig2", {"source.with.flux": flux}, QUICK)
-            spec["source"]["with"]["sensor"] |= {"exposure": blur / 30, "full_well": 4 * flux + 100}
-            for name, value in registered(spec)[0].items():
+            for name, value in registered(pairs_of(study, flux, blur))[0].items():
                 maps[name][row, column] = value
     numbers: Numbers = {
         "blur_px": list(blurs),
@@ -45,22 +35,22 @@ def make(study: Study) -> tuple[Picture, Numbers]:
         "matches": maps["matches"].round().astype(int).tolist(),
         **{name: [[rounded(value, 2) for value in line] for line in maps[name]] for name in LOCATORS},
     }
-    width = 2 * 484 + 8
-    frames = [labelled(fitted(frame, 238), label) for label, frame in corners_of(study).items()]
-    return in_rows([in_colour(beside(frames)), heat_maps(numbers, width)]), numbers
+    corners = {  # with little and much noise and blur
+        f"{flux:,} photons, {blur} px of blur": draw.fitted(registered(pairs_of(study, flux, blur), pairs=0)[1], 238)
+        for flux in (1000, 10)
+        for blur in (0, 20)
+    }
+    return draw.in_rows([draw.in_colour(draw.beside(draw.all_labelled(corners))), heat_maps(numbers, 2 * 484 + 8)]), numbers
 
 
-def corners_of(study: Study) -> dict[str, Picture]:
-    """Return frames with little and much noise and blur."""
-    frames = {}
-    for flux, blur in ((1000, 0), (1000, 20), (10, 0), (10, 20)):
-        spec = study.spec("fig2", {"source.with.flux": flux}, QUICK)
-        spec["source"]["with"]["sensor"] |= {"exposure": blur / 30, "full_well": 4 * flux + 100}
-        frames[f"{flux:,} photons, {blur} px of blur"] = registered(spec, pairs=0)[1]
-    return frames
+def pairs_of(study: Study, flux: float, blur: float) -> dict[str, Any]:
+    """Return the spec of frames with so many photons per pixel and so many px of blur."""
+    spec = study.spec("paper/fig2", {"source.with.flux": flux}, QUICK_STREET)
+    spec["source"]["with"]["sensor"] |= {"exposure": blur / 30, "full_well": 4 * flux + 100}
+    return spec
 
 
-def registered(spec: dict[str, Any], pairs: int | None = None) -> tuple[dict[str, float], Picture]:
+def registered(spec: dict[str, Any], pairs: int | None = None) -> tuple[dict[str, float], draw.Picture]:
     """Return the mean number of correct matches and the mean error of each locator, over neighbouring frames; and a frame."""
     plan = parse_spec(spec)
     found: dict[str, list[float]] = {name: [] for name in ("matches", *LOCATORS)}
@@ -72,8 +62,8 @@ def registered(spec: dict[str, Any], pairs: int | None = None) -> tuple[dict[str
         n_frames = source.info.n_frames if pairs is None else pairs + 1
         groups = [Group(FrameSpan(index, index + 1), float(index)) for index in range(n_frames)]
         exposures = [merger.merge(source, group, FrameTrajectory(true), 1.0) for group in groups]
-        white = float(np.quantile(exposures[0].flux, 0.995))
-        pictures = [picture(each.flux, white) for each in exposures]
+        white = draw.white_of(exposures[0].flux)
+        pictures = [draw.picture(each.flux, white) for each in exposures]
         locators = {name: discover().find("locator", name).contribution for name in LOCATORS}
         built = {name: each.build(each.config(), context) for name, each in locators.items()}
         features = {name: [locator.describe(each) for each in exposures] for name, locator in built.items()}
@@ -89,7 +79,7 @@ def registered(spec: dict[str, Any], pairs: int | None = None) -> tuple[dict[str
     return {name: float(np.mean(values)) for name, values in found.items() if values}, pictures[0]
 
 
-def correct_matches(moving: Picture, fixed: Picture, motion: NDArray[np.float64]) -> int:
+def correct_matches(moving: draw.Picture, fixed: draw.Picture, motion: NDArray[np.float64]) -> int:
     """Return how many matches of SIFT, by Lowe's ratio, agree with the true motion."""
     sift = cv2.SIFT.create()
     (first, first_words), (second, second_words) = (sift.detectAndCompute(image, None) for image in (moving, fixed))
@@ -104,12 +94,11 @@ def correct_matches(moving: Picture, fixed: Picture, motion: NDArray[np.float64]
     return int((np.linalg.norm(apply(motion, at) - to, axis=-1) < CORRECT_PX).sum())
 
 
-def heat_maps(numbers: Numbers, width: int) -> Picture:
+def heat_maps(numbers: Numbers, width: int) -> draw.Picture:
     """Draw the matches and the errors over noise and blur."""
-    figure = Figure(figsize=(width / 100, 3.4), dpi=100, layout="constrained")
-    panels = figure.subplots(1, 3)
+    figure, axes = draw.panels(width / 100, 3.4, 1, 3)
     titles = {"matches": "correct matches of SIFT", **{name: f"error of {name} (px)" for name in LOCATORS}}
-    for panel, (name, title) in zip(panels, titles.items(), strict=True):
+    for panel, (name, title) in zip(axes, titles.items(), strict=True):
         values = np.array(numbers[name])
         scaled = np.log10(values + 1) if name == "matches" else -np.log10(values)
         panel.imshow(scaled, cmap="viridis")
@@ -119,13 +108,12 @@ def heat_maps(numbers: Numbers, width: int) -> Picture:
         panel.set_xticks(range(len(numbers["blur_px"])), [str(each) for each in numbers["blur_px"]], fontsize=8)
         panel.set_yticks(range(len(numbers["photons"])), [f"{each:,}" for each in numbers["photons"]], fontsize=8)
         panel.set_title(title, fontsize=9)
-        panel.set_xlabel("blur (px)", fontsize=8)
-    panels[0].set_ylabel("photons per pixel: less is noisier", fontsize=8)
-    return drawn(figure)[..., 2::-1]
+        draw.name_axes(panel, "blur (px)", fontsize=8)
+    axes[0].set_ylabel("photons per pixel: less is noisier", fontsize=8)
+    return draw.in_bgr(figure)
 
 
-BOX = {"facecolor": "black", "alpha": 0.35, "linewidth": 0, "pad": 1.0}
-"""Behind the numbers of the heat maps."""
+BOX = {"facecolor": "black", "alpha": 0.35, "linewidth": 0, "pad": 1.0}  # behind the numbers of the heat maps
 
 
 def claims(numbers: Numbers) -> list[Claim]:
@@ -150,9 +138,5 @@ def claims(numbers: Numbers) -> list[Claim]:
             "; ".join(
                 f"{name} is off by {CORRECT_PX:g} px or more in {share:.0%} of the fields" for name, share in lost.items()
             ),
-            None,
         ),
     ]
-
-
-FIGURE = FigureOf(make, claims)

@@ -1,47 +1,28 @@
-"""What the figures share: captures and runs that are kept, results, and claims of the paper beside what was measured."""
+"""What the figures share: claims of the paper beside what was measured, and scores that do not depend on the machine."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
-import cv2
 import numpy as np
-from picture_parts import GAP, picture
-from ruamel.yaml import YAML
+from harness import Compared, Study, record_of, rendered
+from harness import scores_of as evaluation_of
+from picture_parts import Picture
 
-from photonpano import PhotonpanoError, evaluate, open_source, parse_spec, run
-from photonpano.captures.writing import truth_path, write_packed
-from photonpano.context import Context
-from photonpano.evaluation import (
-    corner_errors,
-    covered,
-    image_score,
-    load_run_trajectory,
-    load_truth,
-    true_panorama,
-    white_flux,
-)
-from photonpano.geometry import FrameTrajectory, apply
-from photonpano.merging.panorama import plan_canvas, render
+from photonpano import Panorama, PhotonpanoError
+from photonpano.evaluation import corner_errors, covered
+from photonpano.geometry import Canvas, FrameTrajectory
 
-if TYPE_CHECKING:
-    from picture_parts import Picture
-
-    from photonpano import Panorama
-    from photonpano.evaluation import RunTrajectory, TrajectoryScore, Truth
-
-SPECS = Path(__file__).parents[3] / "examples" / "paper"
-FAILED_DB = 3.0
-"""A panorama that is further below the one along the true motion, in dB, has failed."""
+FAILED_DB = 3.0  # a panorama that is further below the one along the true motion has failed
+QUICK_STREET = {
+    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
+    "source.with.frame_shape": [128, 192],
+}
+"""What makes most captures of a quick study small."""
 Numbers: TypeAlias = dict[str, Any]
 """Figures by name: numbers, words, and lists and mappings of them, which do not depend on the machine."""
-Changes: TypeAlias = Mapping[str, Any]
-"""Keys of a spec, with dots, and their values."""
 
 
 class Claim(NamedTuple):
@@ -55,7 +36,7 @@ class Claim(NamedTuple):
 
     paper: str
     measured: str
-    agrees: bool | None
+    agrees: bool | None = None
 
     def row(self) -> str:
         """Return a row of a table in Markdown."""
@@ -74,52 +55,14 @@ class FigureOf(NamedTuple):
     claims: Callable[[Numbers], list[Claim]]
 
 
-@dataclass(frozen=True)
-class Study:
-    """A folder of captures and runs, which are used again, and the size of both.
-
-    Attributes:
-        folder: for captures and runs.
-        quick: whether captures are small: some hundreds of frames.
-    """
-
-    folder: Path
-    quick: bool
-
-    def spec(self, name: str, changes: Changes, quick: Changes) -> dict[str, Any]:
-        """Return a spec of examples/paper with changes, and with those of the quick study if this is one."""
-        spec: dict[str, Any] = YAML(typ="safe").load((SPECS / f"{name}.yaml").read_text(encoding="utf-8"))
-        for key, value in {**changes, **(quick if self.quick else {})}.items():
-            *parents, last = key.split(".")
-            section = spec
-            for parent in parents:
-                section = section.setdefault(parent, {})
-            section[last] = value
-        return spec
-
-    def capture(self, name: str, spec: Mapping[str, Any]) -> Path:
-        """Return the capture that the source of a spec simulates, with its truth beside it."""
-        path = self.folder / f"{name}-{digest(spec['source'])}.npy"
-        if not truth_path(path).exists():
-            with open_source(parse_spec({"version": 1, "source": spec["source"]})) as source:
-                write_packed(source, path)
-        return path
-
-    def run(self, name: str, spec: Mapping[str, Any], capture: Path | None = None) -> Path:
-        """Run a spec, on a capture that its source has simulated, and return the run folder."""
-        spec = dict(spec)
-        if capture is not None:
-            rate = spec["source"]["with"].get("frame_rate_hz", 96_800)
-            spec["source"] = {"use": "packed-npy", "with": {"path": str(capture.absolute()), "frame_rate_hz": rate}}
-        folder = self.folder / f"{name}-{digest(spec)}"
-        if not (folder / "run.json").exists():
-            run(parse_spec(spec, output=folder))
-        return folder
+def frames_of(spec: Mapping[str, Any], *keys: str) -> Numbers:
+    """Return how many frames the capture of a spec has, at which rate, and other settings of its source."""
+    return {key: spec["source"]["with"][key] for key in ("n_frames", "frame_rate_hz", *keys)}
 
 
-def frames_of(spec: Mapping[str, Any]) -> Numbers:
-    """Return how many frames the capture of a spec has, and at which rate."""
-    return {key: spec["source"]["with"][key] for key in ("n_frames", "frame_rate_hz")}
+def group_size(spec: Mapping[str, Any]) -> int:
+    """Return how many frames are merged into an exposure."""
+    return int(spec["resample"]["with"]["group_size"])
 
 
 def chained(spec: Mapping[str, Any]) -> dict[str, Any]:
@@ -128,14 +71,9 @@ def chained(spec: Mapping[str, Any]) -> dict[str, Any]:
     return {**spec, "locate": {"use": "opencv-sift"}, "graph": graph, "light": "steady"}
 
 
-def digest(content: object) -> str:
-    """Return eight characters that differ for other contents."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
-
-
 def scores_of(folder: Path, capture: Path) -> Numbers:
     """Return the errors of the path of a run, in px, and of its panorama, in dB below the one along the true path."""
-    scores = evaluate(folder, truth_path(capture))
+    scores = evaluation_of(folder, capture)
     assert scores.panorama is not None
     assert scores.below_oracle_db is not None
     return {
@@ -159,25 +97,23 @@ def told(scores: Mapping[str, Any]) -> str:
     )
 
 
+def reason_of(error: PhotonpanoError) -> str:
+    """Return the first line of an error."""
+    return str(error).splitlines()[0]
+
+
 def scores_or_reason(run_folder: Callable[[], Path], capture: Path) -> tuple[Path | None, Numbers]:
     """Run, and return the run folder and the scores, or no folder and the reason why there is no motion."""
     try:
         folder = run_folder()
     except PhotonpanoError as error:
-        return None, {"reason": str(error).splitlines()[0]}
+        return None, {"reason": reason_of(error)}
     return folder, scores_of(folder, capture)
 
 
-def motion_of(folder: Path, capture: Path) -> tuple[RunTrajectory, Truth, TrajectoryScore]:
-    """Return the motion of a run, the truth, and the errors."""
-    found, truth = load_run_trajectory(folder), load_truth(truth_path(capture))
-    return found, truth, corner_errors(found.homographies, truth.homographies, found.frame_shape, found.located)
-
-
-def record_of(folder: Path) -> dict[str, Any]:
-    """Return the record of a run."""
-    record: dict[str, Any] = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    return record
+def levels_of(folder: Path, key: str) -> list[int]:
+    """Return a number of each level of a run, such as that of its groups."""
+    return [level[key] for level in record_of(folder)["levels"]]
 
 
 def rounded(value: float, digits: int = 3) -> float:
@@ -185,22 +121,12 @@ def rounded(value: float, digits: int = 3) -> float:
     return float(f"{value:.{digits}g}")
 
 
-def widened(image: Picture, width: int) -> Picture:
-    """Fill up with white, on the right."""
-    missing = [(0, 0), (0, width - image.shape[1]), *[(0, 0)] * (image.ndim - 2)]
-    return np.pad(image, missing, constant_values=255)
-
-
-def in_rows(rows: list[Picture]) -> Picture:
-    """Put pictures below each other, with gaps."""
-    width = max(row.shape[1] for row in rows)
-    gap = np.full((GAP, width, *rows[0].shape[2:]), 255, np.uint8)
-    return np.vstack([part for row in rows for part in (widened(row, width), gap)][:-1])
-
-
-def in_colour(image: Picture) -> Picture:
-    """Return a grey picture with three equal channels."""
-    return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+def first_exposures(run: Compared) -> tuple[Any, Any, Any]:
+    """Return the homographies and instants of the exposures of level 1, and how they are aligned with the true plane."""
+    with np.load(run.folder / "exposures" / "level-1.npz") as level:
+        homographies, instants = level["homographies"], level["instants"]
+    true = run.truth.homographies[instants.round().astype(int)]
+    return homographies, instants, corner_errors(homographies, true, run.found.frame_shape).alignment
 
 
 def averaged_in_place(folder: Path, capture: Path) -> tuple[Panorama, float]:
@@ -209,33 +135,11 @@ def averaged_in_place(folder: Path, capture: Path) -> tuple[Panorama, float]:
     Returns:
         The panorama, and its PSNR in dB.
     """
-    found, truth = load_run_trajectory(folder), load_truth(truth_path(capture))
-    with np.load(folder / "exposures" / "level-1.npz") as level:
-        homographies, instants = level["homographies"], level["instants"]
-    nearest = np.abs(np.arange(len(found.homographies))[:, None] - instants).argmin(axis=1)
-    placed = FrameTrajectory(homographies[nearest])
-    with open_source(parse_spec(record_of(folder)["spec"])) as source:
-        span, shape = source.info.span, source.info.frame_shape
-        canvas = plan_canvas(placed, span, shape, 1.0, 2**31)
-        panorama = render(source, placed, span, canvas, 0.25, Context(2))
-    alignment = corner_errors(homographies, truth.homographies[instants.round().astype(int)], shape).alignment
-    assert truth.scene is not None
-    scene = true_panorama(truth.scene, canvas, alignment)
+    run = Compared.of(folder, capture)
+    homographies, instants, alignment = first_exposures(run)
+    nearest = np.abs(np.arange(len(run.found.homographies))[:, None] - instants).argmin(axis=1)
+    with run.source() as source:
+        panorama = rendered(source, FrameTrajectory(homographies[nearest]), tolerance_px=0.25)
+    scene = run.scene(Canvas(*panorama.flux.shape[:2], panorama.canvas), alignment)
     compared = covered(panorama.weight) & np.isfinite(scene) & np.isfinite(panorama.flux)
-    return panorama, image_score(panorama.flux, scene, compared, white_flux(truth.scene)).psnr_db
-
-
-def place(panorama: Panorama, point: tuple[float, float], radius: tuple[int, int], white: float) -> Picture:
-    """Return the surroundings of a point of the reference plane, magnified twice."""
-    x, y = apply(panorama.canvas, np.array([point]))[0].round().astype(int)
-    x = int(np.clip(x, radius[0], panorama.flux.shape[1] - radius[0]))
-    y = int(np.clip(y, radius[1], panorama.flux.shape[0] - radius[1]))
-    part = panorama.flux[y - radius[1] : y + radius[1], x - radius[0] : x + radius[0]]
-    return np.repeat(np.repeat(picture(part, white), 2, 0), 2, 1)
-
-
-def fitted(image: Picture, width: int) -> Picture:
-    """Scale a picture to a width."""
-    return cv2.resize(image, (width, round(image.shape[0] * width / image.shape[1])), interpolation=cv2.INTER_AREA).astype(
-        np.uint8
-    )
+    return panorama, run.psnr_db(panorama.flux, scene, compared)

@@ -2,75 +2,58 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import cv2
 import numpy as np
-import tifffile
-from paper.figures.study import Claim, FigureOf, frames_of, in_rows, record_of, rounded, scores_of
-from picture_parts import beside, labelled, picture
+import picture_parts as draw
+from harness import Compared, Study, seen
+from numpy.typing import NDArray
+from paper.figures.study import QUICK_STREET, Claim, Numbers, frames_of, group_size, rounded, scores_of
 
-from photonpano import FrameSpan, open_source, parse_spec
-from photonpano.captures.writing import truth_path
-from photonpano.evaluation import load_truth
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-    from paper.figures.study import Numbers, Study
-    from picture_parts import Picture
+from photonpano import FrameSpan
 
 QUICK = {
+    **QUICK_STREET,
     "source.with.path.length_px": 300,
     "source.with.path.row_spacing_px": 50,
     "source.with.path.centre": None,
     "source.with.flux": 0.3,
     "source.with.n_frames": 3000,
-    "source.with.frame_shape": [128, 192],
-    "source.with.scene": {"kind": "street", "width": 1024, "height": 682},
     "resample.with.group_size": 150,
 }
-PANORAMA_PX = 1000
-"""Width of the panorama in the picture."""
 
 
-def make(study: Study) -> tuple[Picture, Numbers]:
+def make(study: Study) -> tuple[draw.Picture, Numbers]:
     """Sweep over the street in a fraction of a second."""
-    spec = study.spec("fig1", {}, QUICK)
+    spec = study.spec("paper/fig1", {}, QUICK)
     capture = study.capture("fig1", spec)
-    run_folder = study.run("fig1", spec, capture)
-    group = np.load(run_folder / "exposures" / "level-1.npz")["frames"]
-    index = int(0.8 * len(group))
-    span = FrameSpan(*(int(each) for each in group[index]))
-    with open_source(parse_spec(record_of(run_folder)["spec"])) as source:
+    run = Compared.of(study.run("fig1", spec, capture), capture)
+    groups = np.load(run.folder / "exposures" / "level-1.npz")["frames"]
+    span = FrameSpan(*(int(each) for each in groups[int(0.8 * len(groups))]))
+    with run.source() as source:
         frame = source.frames(FrameSpan(span.start, span.start + 1))[0] * np.uint8(255)
-    first, second = (exposure_at(run_folder, level, span.centre) for level in (1, 2))
-    flux = tifffile.imread(run_folder / "panorama.tiff")
-    white = float(np.nanquantile(flux, 0.995))
+    exposures = [exposure_at(run.folder, level, span.centre) for level in (1, 2)]
+    flux = run.panorama.flux
+    white = draw.white_of(flux)
     numbers: Numbers = {
-        **frames_of(spec),
-        "flux": spec["source"]["with"]["flux"],
-        "group_size": spec["resample"]["with"]["group_size"],
-        "exposure_psnr_db": [round(psnr_db(each, capture, at), 1) for at, each in (first, second)],
-        **scores_of(run_folder, capture),
+        **frames_of(spec, "flux"),
+        "group_size": group_size(spec),
+        "exposure_psnr_db": [round(psnr_db(run, each, at), 1) for at, each in exposures],
+        **scores_of(run.folder, capture),
         "pixels": list(flux.shape[:2]),
     }
     numbers["milliseconds"] = rounded(1000 * numbers["n_frames"] / numbers["frame_rate_hz"])
-    labels = (
-        f"one frame of {numbers['n_frames']:,}",
-        f"{len(span)} frames, averaged (level 1)",
-        "about the same, merged along the motion (level 2)",
-    )
-    above = beside(
-        [
-            labelled(each, label)
-            for each, label in zip((frame, picture(first[-1], white), picture(second[-1], white)), labels, strict=True)
-        ]
-    )
-    scale = above.shape[1] / flux.shape[1]
-    small = cv2.resize(picture(flux, white), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
-    return in_rows([above, labelled(small, "panorama")]), numbers
+    averaged, merged = (draw.picture(each, white) for _, each in exposures)
+    above = {
+        f"one frame of {numbers['n_frames']:,}": frame,
+        f"{len(span)} frames, averaged (level 1)": averaged,
+        "about the same, merged along the motion (level 2)": merged,
+    }
+    row = draw.beside(draw.all_labelled(above))
+    scale = row.shape[1] / flux.shape[1]
+    small = cv2.resize(draw.picture(flux, white), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return draw.in_rows([row, draw.labelled(small, "panorama")]), numbers
 
 
 def exposure_at(run_folder: Path, level: int, instant: float) -> tuple[float, NDArray[np.float32]]:
@@ -80,13 +63,11 @@ def exposure_at(run_folder: Path, level: int, instant: float) -> tuple[float, ND
         return file["instants"][nearest], np.load(run_folder / "exposures" / f"level-{level}.npy")[nearest]
 
 
-def psnr_db(flux: NDArray[np.float32], capture: Path, instant: float) -> float:
+def psnr_db(run: Compared, flux: NDArray[np.float32], instant: float) -> float:
     """Return the PSNR of an exposure against the view of the true scene at its instant, where the brightest 0.5 % are white."""
-    truth = load_truth(truth_path(capture))
-    assert truth.scene is not None
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    view = cv2.warpPerspective(truth.scene, truth.homographies[round(instant)], flux.shape[::-1], flags=flags)
-    white = float(np.quantile(view, 0.995))
+    assert run.truth.scene is not None
+    view = seen(run.truth.scene, run.truth.homographies[round(instant)], flux.shape)
+    white = draw.white_of(view)
     known = np.isfinite(flux)
     squared = np.square(np.clip(flux[known] / white, 0, 1) - np.clip(view[known] / white, 0, 1)).mean()
     return float(-10 * np.log10(squared))
@@ -100,7 +81,6 @@ def claims(numbers: Numbers) -> list[Claim]:
             "the prototype captures binary frames at about 100,000 frames per second",
             f"simulated: {numbers['n_frames']:,} frames at {numbers['frame_rate_hz']:,} Hz, {numbers['flux']:g} photons per "
             f"pixel per frame",
-            None,
         ),
         Claim(
             "re-aggregating the photons along the refined motion recovers the scene",
@@ -114,6 +94,3 @@ def claims(numbers: Numbers) -> list[Claim]:
             numbers["below_oracle_db"] < 1,
         ),
     ]
-
-
-FIGURE = FigureOf(make, claims)
