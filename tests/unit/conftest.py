@@ -1,7 +1,5 @@
 """A level whose components know the true motion, to test the loop without plugins."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 

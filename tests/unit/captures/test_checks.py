@@ -1,7 +1,5 @@
 """What is found before a run: the pixel order, repeats, obstacles, parts of a capture, its fingerprint and checks."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

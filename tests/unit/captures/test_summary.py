@@ -1,7 +1,5 @@
 """Summaries and pictures of captures."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

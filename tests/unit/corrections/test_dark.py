@@ -1,7 +1,5 @@
 """Dark counts and vignettes: measured, and taken out of sums without bias."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Hot pixels, and what stands still while the frame moves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

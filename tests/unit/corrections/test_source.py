@@ -1,7 +1,5 @@
 """Corrected sources: one map, and corrections that move pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Scores of runs and images, and bounds of errors."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Odd truths and run folders: each gets a finite score, or is refused with one sentence that names the file."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from collections.abc import Callable, Mapping

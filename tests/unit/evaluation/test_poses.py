@@ -1,7 +1,5 @@
 """Scores of poses, and of a camera that turns all the way round against a scene all around it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Values that travel to other processes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial

@@ -1,7 +1,5 @@
 """Levels of the motion, trajectories with the names of their plugins, and captures with cuts and repeated frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The motion graph: its solution with outliers and in several parts, its normal equations, and the expected errors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Which exposures are registered: neighbours, and places that are seen again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Motion without exposures: the speed from short spans, and a constant velocity from all frames together."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Photon noise, and the similarity of exposures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter

@@ -1,7 +1,5 @@
 """Responses, contrast, tone, white balance and pictures."""
 
-from __future__ import annotations
-
 from typing import get_args
 
 import numpy as np

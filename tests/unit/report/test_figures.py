@@ -1,7 +1,5 @@
 """The figures of a page, and their pictures."""
 
-from __future__ import annotations
-
 import base64
 import re
 from dataclasses import replace

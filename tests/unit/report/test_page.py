@@ -1,7 +1,5 @@
 """Pages of finished and failed runs: what they say, and that they need nothing from outside."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

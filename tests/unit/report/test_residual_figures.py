@@ -1,7 +1,5 @@
 """Views of poses in perspective, and the figures of the residuals."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

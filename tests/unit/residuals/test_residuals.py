@@ -1,7 +1,5 @@
 """Residuals of spans, full turns, and lenses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise

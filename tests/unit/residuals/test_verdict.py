@@ -1,7 +1,5 @@
 """The verdict: each test finds the residuals that were made for it, and nothing else; photon noise is trusted."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace

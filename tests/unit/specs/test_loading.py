@@ -1,7 +1,5 @@
 """What becomes of a spec: defaults, corrections and outcomes."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Odd specs, extreme values and any value at all: a plan, or problems that name every place, in a second."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Iterator, Mapping

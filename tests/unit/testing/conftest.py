@@ -1,7 +1,5 @@
 """Run single checks of the kit on components, most of them broken on purpose, and a small capture with them."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping

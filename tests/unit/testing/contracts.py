@@ -1,7 +1,5 @@
 """Components that break a contract: how they differ from a good component. What is said of them stands in contracts.txt."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import count

@@ -1,7 +1,5 @@
 """Mergers and renderers that keep their contract and break another promise: the check of the kit that finds each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, TypeAlias

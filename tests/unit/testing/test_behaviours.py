@@ -3,8 +3,6 @@
 What the check says of each is a regular expression in behaviours.txt.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Checks of every contribution, run on resamplers."""
 
-from __future__ import annotations
-
 import pytest
 from pydantic import BaseModel, Field, field_serializer, model_validator
 

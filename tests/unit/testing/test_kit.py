@@ -1,7 +1,5 @@
 """The kit itself: scenes, executors, and the plugin of pytest."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """A level of twelve exposures with a known motion, of which some pairs may fail."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Locators that fail or break their contract, and fallbacks."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from collections.abc import Callable

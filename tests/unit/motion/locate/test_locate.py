@@ -1,7 +1,5 @@
 """Exposures are located: pairs, hypotheses, bridges, and their information."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import repeat

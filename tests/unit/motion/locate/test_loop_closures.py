@@ -1,7 +1,5 @@
 """Loop closures of a level: which pairs are registered, accepted, refused or dropped."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from collections.abc import Callable, Iterable
