@@ -12,12 +12,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from photonpano import FrameSpan, Group, VirtualExposure, interrupts
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run import RunResult
 from photonpano.testing import KnownMotion, MemorySource
+
+settings.register_profile("suite", max_examples=50, deadline=None)  # the machine may be busy
+settings.load_profile("suite")
 
 
 def sibling(name: str) -> Any:

@@ -1,7 +1,5 @@
 """A level whose components know the true motion, to test the loop without plugins."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -9,13 +7,14 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, Located, NotLocated, Source, Trajectory, VirtualExposure
-from photonpano.geometry import inverse, normalised, rescaled
+from photonpano.geometry import inverse, normalised, rescaled, translation
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.photometry import BinaryResponse
+from photonpano.testing import KnownMotion
 from photonpano.threads import one_thread_inside
 
-FRAMES = 10
-"""Frames of a group."""
+FRAMES = 10  # of a group
+STEADY = KnownMotion(lambda frame: translation(0.3 * frame, 0))
 
 
 class SideBySide:
@@ -73,6 +72,17 @@ def _truth(moving: Group, fixed: Group, found: Located) -> Located:
 
 
 @pytest.fixture
+def with_report() -> None:
+    """Draw the report of a run, which takes longer than a small run itself."""
+
+
+@pytest.fixture(autouse=True)
+def report_if_asked(request: pytest.FixtureRequest) -> None:
+    if "with_report" not in request.fixturenames:
+        request.getfixturevalue("without_report")
+
+
+@pytest.fixture
 def one_thread() -> Iterator[None]:
     """Keep libraries from starting threads, as in a run."""
     with one_thread_inside():
@@ -83,11 +93,12 @@ def one_thread() -> Iterator[None]:
 def make_level() -> Callable[..., Level]:
     """Build a level: `make_level(motion, answer, number, scale)`, other components by their kinds, fallbacks by their names.
 
+    The motion is a pan of 0.3 px a frame unless another is given.
     `answer(moving, fixed, found)` gets the groups of a pair and its true motion, and returns what the locator returns.
     """
 
     def make(
-        motion: Trajectory,
+        motion: Trajectory = STEADY,
         answer: Callable[..., Any] = _truth,
         number: int = 1,
         scale: float = 1.0,

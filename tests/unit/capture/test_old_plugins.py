@@ -103,7 +103,7 @@ class TestOldMerger(MergerConformance):
 
 
 @pytest.mark.parametrize("light", ["auto", "changing"])
-def test_old_plugins_run_unchanged(light: str, tmp_path: Path, without_report: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_plugins_run_unchanged(light: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: set[tuple[bool, ...]] = set()
     merge: Callable[..., VirtualExposure] = OldMerger.merge
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -14,9 +12,10 @@ import pytest
 from photonpano import FrameSpan, InputError, OutputError, PluginError, StreamInfo
 from photonpano.captures.writing import truth_path, write_packed
 from photonpano.photometry import BinaryResponse
+from photonpano.protocols import Closing
 
 
-class RandomSource:
+class RandomSource(Closing):
     """Frames that differ, each made from its index alone."""
 
     def __init__(self, n_frames: int, height: int, width: int, fails_at: int | None = None, kind: Any = "binary") -> None:
@@ -35,15 +34,6 @@ class RandomSource:
 
     def counts(self, span: FrameSpan) -> np.ndarray:
         return self.frames(span).sum(axis=0, dtype=np.uint32)
-
-    def close(self) -> None:
-        pass
-
-    def __enter__(self) -> RandomSource:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class TruthfulSource(RandomSource):
@@ -135,24 +125,19 @@ def test_small_disk_is_reported_before_the_work(tmp_path: Path, monkeypatch: pyt
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_folder_is_reported_before_the_work(tmp_path: Path) -> None:
-    path = tmp_path / "nowhere" / "cube.npy"
-    with pytest.raises(OutputError, match=r"there is no folder .*nowhere; create it or choose another"):
-        write_packed(TruthfulSource(5, 6, 19, fails_at=0), path)
-
-
-def test_another_suffix_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(OutputError) as caught:
-        write_packed(RandomSource(5, 6, 19), tmp_path / "cube")
-    assert str(caught.value) == f"cannot write {tmp_path / 'cube'}: a packed capture is a .npy file; name it cube.npy"
-
-
-def test_intensities_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError) as caught:
-        write_packed(RandomSource(5, 6, 19, kind="intensity"), tmp_path / "cube.npy")
-    assert str(caught.value) == (
-        f"cannot write {tmp_path / 'cube.npy'}: packed captures hold binary frames, and this source gives intensities"
-    )
+@pytest.mark.parametrize(
+    ("name", "kind", "message"),
+    [
+        ("nowhere/cube.npy", "binary", "there is no folder {folder}/nowhere; create it or choose another"),
+        ("cube", "binary", "a packed capture is a .npy file; name it cube.npy"),
+        ("cube.npy", "intensity", "packed captures hold binary frames, and this source gives intensities"),
+    ],
+    ids=["folder", "suffix", "intensities"],
+)
+def test_what_cannot_be_written_is_refused_before_the_work(tmp_path: Path, name: str, kind: str, message: str) -> None:
+    with pytest.raises((InputError, OutputError)) as caught:
+        write_packed(RandomSource(5, 6, 19, fails_at=0, kind=kind), tmp_path / name)
+    assert str(caught.value) == f"cannot write {tmp_path / name}: {message.format(folder=tmp_path)}"
 
 
 @pytest.mark.usefixtures("small_blocks")

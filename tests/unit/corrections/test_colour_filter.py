@@ -1,7 +1,5 @@
 """Captures behind a colour filter array, with all colours kept: one grey source, and a source for each colour."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pixels that somebody knows to be bad, and pixels behind a colour filter."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,6 +1,4 @@
-"""A corrected source is a source: whole numbers, one map, and what belongs to sums where there is something to take out."""
-
-from __future__ import annotations
+"""Corrected sources: one map, and corrections that move pixels."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -87,3 +85,123 @@ def test_corrected_source_closes_the_source(frames: np.ndarray, monkeypatch: pyt
     with corrected_source(MemorySource(frames), ()):
         pass
     assert len(closed) == 1
+
+
+def bits(shape: tuple[int, int], n: int = 3) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 2, (n, *shape), dtype=np.uint8)
+
+
+def moved(frames: np.ndarray, corrections: Any) -> np.ndarray:
+    with corrected_source(MemorySource(frames), corrections) as source:
+        return source.frames(source.info.span)
+
+
+def by_photoncube(frames: np.ndarray, folder: Path, transforms: tuple[str, ...] = (), **fixes: bool) -> np.ndarray:
+    """Return packed frames as photoncube corrects them."""
+    photoncube = pytest.importorskip("photoncube")
+    np.save(folder / "cube.npy", np.packbits(frames, axis=-1))
+    cube = photoncube.PhotonCube.open(str(folder / "cube.npy"))
+    cube.set_transforms([getattr(photoncube.Transform, name) for name in transforms])
+    cube.process_cube(str(folder / "corrected.npy"), **fixes)
+    return np.load(folder / "corrected.npy")
+
+
+@pytest.mark.parametrize(
+    ("written", "transforms"),
+    [
+        (["rot90"], ("Rot90",)),
+        (["rot180"], ("Rot180",)),
+        (["rot270"], ("Rot270",)),
+        (["flip-ud"], ("FlipUD",)),
+        (["flip-lr"], ("FlipLR",)),
+        (["rot90", "flip-ud"], ("Rot90", "FlipUD")),
+    ],
+)
+def test_turns_equal_those_of_photoncube(written: list[str], transforms: Any, corrections: Callable, tmp_path: Path) -> None:
+    frames = bits((16, 24))
+    expected = by_photoncube(frames, tmp_path, transforms)
+    np.testing.assert_array_equal(np.packbits(moved(frames, corrections(*written)), axis=-1), expected)
+
+
+@pytest.mark.parametrize(
+    ("preset", "shape", "fix", "result"),
+    [
+        ("colour-swissspad2", (256, 512), "colorspad_fix", (254, 496)),
+        ("grey-swissspad2-half", (256, 512), "grayspad_fix", (254, 496)),
+        ("grey-swissspad2-full", (512, 512), "grayspad_fix", (509, 496)),
+    ],
+)
+def test_presets_equal_those_of_photoncube(
+    preset: str, shape: Any, fix: str, result: Any, corrections: Callable, tmp_path: Path
+) -> None:
+    frames = bits(shape)
+    expected = by_photoncube(frames, tmp_path, **{fix: True})
+    corrected = moved(frames, corrections(preset))
+    assert corrected.shape[1:] == result
+    np.testing.assert_array_equal(np.packbits(corrected, axis=-1), expected)
+
+
+def test_rot90_turns_clockwise(corrections: Callable) -> None:
+    frames = np.uint8([[[1, 0, 0], [0, 0, 0]]])  # the corner at the top left
+    assert moved(frames, corrections("rot90"))[0].tolist() == [[0, 1], [0, 0], [0, 0]]
+    assert moved(frames, corrections("rot270"))[0].tolist() == [[0, 0], [0, 0], [1, 0]]
+
+
+def test_corrections_are_applied_in_order(corrections: Callable) -> None:
+    frames = bits((6, 10))
+    crop = {"crop": {"rows": [1, 4]}}
+    np.testing.assert_array_equal(moved(frames, corrections(crop, "rot90"))[0], np.rot90(frames[0, 1:4], -1))
+    np.testing.assert_array_equal(moved(frames, corrections("rot90", crop))[0], np.rot90(frames[0], -1)[1:4])
+
+
+def test_crop_counts_from_either_end(corrections: Callable) -> None:
+    frames = bits((6, 10))
+    cropped = moved(frames, corrections({"crop": {"rows": [2, None], "columns": [-7, -1]}}))
+    np.testing.assert_array_equal(cropped, frames[:, 2:, -7:-1])
+
+
+def test_swap_columns_swaps_both_blocks(corrections: Callable) -> None:
+    frames = bits((4, 12))
+    swapped = moved(frames, corrections({"swap-columns": {"first": [8, 10], "second": [2, 4]}}))
+    np.testing.assert_array_equal(swapped, frames[:, :, [0, 1, 8, 9, 4, 5, 6, 7, 2, 3, 10, 11]])
+
+
+@pytest.mark.parametrize(("settings", "row"), [({}, 3), ({"before": 1}, 1), ({"before": 6}, 6)])
+def test_missing_row_is_dark_and_masked(settings: dict[str, int], row: int, corrections: Callable) -> None:
+    frames = bits((6, 5))
+    with corrected_source(MemorySource(frames), corrections({"missing-row": settings})) as source:
+        np.testing.assert_array_equal(source.frames(source.info.span), np.insert(frames, row, 0, axis=1))
+        np.testing.assert_array_equal(source.valid, np.arange(7)[:, None] != np.full((1, 5), row))
+        assert not source.counts(FrameSpan(0, 3))[row].any()
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        (
+            {"crop": {"rows": [2, 300]}},
+            "there are no rows [2, 300]: frames have 6 rows at this place of the list",
+        ),
+        (
+            {"crop": {"columns": [-12, None]}},
+            "there are no columns [-12, null]: frames have 10 columns at this place of the list",
+        ),
+        (
+            {"crop": {"rows": [4, 4]}},
+            "there are no rows [4, 4]: frames have 6 rows at this place of the list",
+        ),
+        (
+            {"swap-columns": {"first": [0, 2], "second": [9, 11]}},
+            "there is no column 10: frames have 10 columns at this place of the list",
+        ),
+        ({"missing-row": {"before": 7}}, "there is no row 7: frames have 6 rows at this place of the list"),
+        (
+            "colour-swissspad2",
+            "colour-swissspad2 is for frames of 256x512 px, and frames have 6x10 px at this place of the list",
+        ),
+    ],
+)
+def test_rearrangement_outside_the_frame_is_refused(written: Any, message: str, corrections: Callable) -> None:
+    with pytest.raises(InputError) as caught:
+        corrected_source(MemorySource(bits((6, 10))), corrections(written))
+    assert str(caught.value) == message

@@ -1,8 +1,7 @@
 """Odd truths and run folders: each gets a finite score, or is refused with one sentence that names the file."""
 
-from __future__ import annotations
-
 import math
+import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -14,9 +13,10 @@ import pytest
 import tifffile
 
 from photonpano import PhotonpanoError, evaluate
+from photonpano.evaluation import load_truth
+from photonpano.geometry import apply, corners, normalised
 
-OUTCOMES = Path(__file__).with_suffix(".txt")
-"""What becomes of each: `NAME: SENTENCE`, or `NAME: a score`."""
+OUTCOMES = Path(__file__).with_suffix(".txt")  # what becomes of each: `NAME -> SENTENCE`, or `NAME -> a score`
 N_FRAMES = 120
 
 Change = Callable[[SimpleNamespace], Any]
@@ -37,10 +37,29 @@ def image(name: str, change: Callable[[np.ndarray], Any]) -> Change:
     return lambda capture: setattr(capture, name, change(getattr(capture, name)))
 
 
+def late(change: Change) -> Change:
+    """Return what changes files after they are written."""
+    return lambda capture: setattr(capture, "late", lambda: change(capture))
+
+
 def written(name: str, content: str | bytes) -> Change:
     """Return what writes a file of the run folder, after the others."""
     data = content.encode() if isinstance(content, str) else content
-    return lambda capture: setattr(capture, "late", lambda: (capture.folder / name).write_bytes(data))
+    return late(lambda capture: (capture.folder / name).write_bytes(data))
+
+
+def truth_file(change: Callable[[bytes], bytes]) -> Change:
+    return late(lambda capture: capture.truth.write_bytes(change(capture.truth.read_bytes())))
+
+
+def of_depth(capture: SimpleNamespace) -> None:
+    capture.true["camera_from_world"] = np.zeros((N_FRAMES, 3, 4))
+    del capture.true["homographies"]
+
+
+def single_array(capture: SimpleNamespace) -> None:
+    with capture.truth.open("wb") as file:
+        np.save(file, capture.true["homographies"])
 
 
 def holed(value: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -138,14 +157,28 @@ CASES: Mapping[str, Change] = {
     "trajectory.npz: text": written("trajectory.npz", "frames"),
     "panorama.tiff: empty": written("panorama.tiff", b""),
     "panorama.tiff: endless": written("panorama.tiff", b"II*\0\x08\0\0\0" + bytes(2) + b"\x08\0\0\0"),
-    "coverage.tiff: cut": lambda capture: setattr(
-        capture,
-        "late",
-        lambda: (capture.folder / "coverage.tiff").write_bytes((capture.folder / "panorama.tiff").read_bytes()[:500]),
+    "coverage.tiff: cut": late(
+        lambda capture: (capture.folder / "coverage.tiff").write_bytes((capture.folder / "panorama.tiff").read_bytes()[:500])
     ),
-    "panorama.tiff: two pages": lambda capture: setattr(
-        capture, "late", lambda: tifffile.imwrite(capture.folder / "panorama.tiff", np.stack([capture.flux] * 2))
+    "panorama.tiff: two pages": late(
+        lambda capture: tifffile.imwrite(capture.folder / "panorama.tiff", np.stack([capture.flux] * 2))
     ),
+    "run: missing": late(lambda capture: setattr(capture, "folder", capture.folder / "nowhere")),
+    "trajectory.npz: missing": late(lambda capture: (capture.folder / "trajectory.npz").unlink()),
+    "coverage.tiff: missing": late(lambda capture: (capture.folder / "coverage.tiff").unlink()),
+    "run, canvas: four numbers": found("canvas", lambda _: np.eye(2)),
+    "run, located: none": found("located", lambda values: values & False),
+    "truth: missing": late(lambda capture: capture.truth.unlink()),
+    "truth: without homographies": lambda capture: capture.true.pop("homographies"),
+    "truth: of a scene with depth": of_depth,
+    "truth: a pickle": truth_file(lambda _: pickle.dumps({"homographies": 1})),
+    "truth: cut": truth_file(lambda content: content[:-200]),
+    "truth: a wrong byte": truth_file(lambda content: content[:1000] + bytes([content[1000] ^ 0xFF]) + content[1001:]),
+    "truth: a single array": late(single_array),
+    "truth, frame_shape: three numbers": true("frame_shape", lambda _: np.array([60, 90, 1])),
+    "truth, frame_shape: no width": true("frame_shape", lambda _: np.array([60, 0])),
+    "truth, scene: two colours": true("scene", lambda _: np.zeros((4, 4, 2))),
+    "truth, undistorted_corners: three": lambda capture: capture.true.update(undistorted_corners=np.zeros((3, 2))),
 }
 
 
@@ -177,3 +210,26 @@ def test_odd_file_gets_a_score_or_one_sentence(name: str, capture: SimpleNamespa
     except PhotonpanoError as error:
         ended = str(error).replace(str(capture.truth.parent), "DIR")
     assert ended == expected()[name]
+
+
+def test_load_truth_returns_written_arrays(capture: SimpleNamespace) -> None:
+    truth = load_truth(capture.truth)
+    np.testing.assert_array_equal(truth.homographies, capture.true["homographies"])
+    np.testing.assert_array_equal(truth.scene, capture.true["scene"])
+    assert truth.frame_shape == (60, 90)
+
+
+def test_run_on_distorted_frames_is_right_where_it_moves_the_corners_as_they_appear(
+    capture: SimpleNamespace,
+) -> None:
+    """A corner of a barrel of 3 % shows what an ideal lens images 1 / 0.97 times as far from the middle."""
+    middle, corner = np.array([44.5, 29.5]), np.array([89.0, 59.0])
+    capture.true["undistorted_corners"] = middle + (corners((60, 90)) - middle) / 0.97
+    capture.write()
+    assert evaluate(capture.folder, capture.truth, oracle=False).trajectory.mean_px > 0.1
+    truth = load_truth(capture.truth)
+    expected = apply(capture.true["homographies"], [middle, middle + (corner - middle) / 0.97])
+    np.testing.assert_allclose(apply(truth.homographies, [middle, corner]), expected)
+    capture.trajectory["homographies"] = normalised(capture.gauge @ truth.homographies)
+    capture.write()
+    assert evaluate(capture.folder, capture.truth, oracle=False).trajectory.max_px < 1e-6

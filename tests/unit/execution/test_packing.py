@@ -1,7 +1,5 @@
 """Values that travel to other processes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -102,8 +100,8 @@ def test_run_on_copies_has_the_same_bytes(tmp_path: Path, monkeypatch: pytest.Mo
             "scene": {"kind": "street", "width": 400, "height": 300},
             "path": {"kind": "pan", "length_px": 30},
             "flux": 1,
-            "n_frames": 400,
-            "frame_shape": [96, 128],
+            "n_frames": 250,
+            "frame_shape": [64, 96],
         },
     }
     spec = {"version": 1, "source": source, "resample": {"with": {"group_size": 50}}, "levels": 2}

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2
@@ -12,34 +10,32 @@ from photonpano.lighting import in_light
 from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of, divided
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource
+from photonpano.testing.scenes import detected
 
 SHAPE = (30, 40)
 FLUX = 0.7
 
 
-def frames_of(flux: np.ndarray | float, n: int, seed: int = 0) -> np.ndarray:
-    """Bernoulli frames of a still scene."""
-    return np.random.default_rng(seed).random((n, *SHAPE)) < -np.expm1(-np.asarray(flux))
+def frames_of(flux: np.ndarray | float, n: int) -> np.ndarray:
+    """Binary frames of a still scene."""
+    return detected(np.broadcast_to(flux, (n, *SHAPE)))
 
 
 def still(n: int, homography: np.ndarray | None = None) -> list[Chunk]:
     return [Chunk(FrameSpan(0, n), np.eye(3) if homography is None else homography)]
 
 
-def test_accumulate_returns_source_counts_of_still_capture(memory_source: type) -> None:
+HALVES = [Chunk(FrameSpan(0, 20), np.eye(3)), Chunk(FrameSpan(20, 50), np.eye(3))]
+
+
+@pytest.mark.parametrize(("chunks", "told"), [(still(50), [50]), (HALVES, [20, 30])], ids=["whole", "halves"])
+def test_accumulate_returns_source_counts_of_still_capture(memory_source: type, chunks: list[Chunk], told: list[int]) -> None:
     source = memory_source(frames_of(FLUX, 50))
-    photons = accumulate(source, still(50), np.eye(3), SHAPE)
+    advances: list[int] = []
+    photons = accumulate(source, chunks, np.eye(3), SHAPE, advances.append)
     np.testing.assert_array_equal(photons.counts, source.counts(FrameSpan(0, 50)))
     np.testing.assert_array_equal(photons.weight, np.full(SHAPE, 50))
-
-
-def test_accumulate_adds_chunks_of_still_capture(memory_source: type) -> None:
-    source = memory_source(frames_of(FLUX, 50))
-    halves = [Chunk(FrameSpan(0, 20), np.eye(3)), Chunk(FrameSpan(20, 50), np.eye(3))]
-    advances: list[int] = []
-    photons = accumulate(source, halves, np.eye(3), SHAPE, advances.append)
-    np.testing.assert_array_equal(photons.counts, source.counts(FrameSpan(0, 50)))
-    assert advances == [20, 30]
+    assert advances == told
 
 
 def test_accumulate_moves_counts_and_weight_by_whole_pixels_without_loss(memory_source: type) -> None:
@@ -51,17 +47,13 @@ def test_accumulate_moves_counts_and_weight_by_whole_pixels_without_loss(memory_
     assert np.count_nonzero(photons.weight) == 30 * 40
 
 
-def test_accumulate_ignores_frame_off_the_grid(memory_source: type) -> None:
-    photons = accumulate(memory_source(frames_of(FLUX, 5)), still(5, translation(500, 0)), np.eye(3), SHAPE)
-    assert not photons.counts.any()
-    assert not photons.weight.any()
-
-
-def test_accumulate_keeps_visible_half_of_frame(memory_source: type) -> None:
+def test_accumulate_keeps_visible_half_of_frame_and_ignores_frame_off_the_grid(memory_source: type) -> None:
     source = memory_source(frames_of(FLUX, 5))
-    photons = accumulate(source, still(5, translation(-15, 0)), np.eye(3), SHAPE)
-    np.testing.assert_allclose(photons.counts[:, :25], source.counts(FrameSpan(0, 5))[:, 15:], rtol=1e-6)
-    assert not photons.weight[:, 25:].any()
+    half, off = (accumulate(source, still(5, translation(x, 0)), np.eye(3), SHAPE) for x in (-15, 500))
+    np.testing.assert_allclose(half.counts[:, :25], source.counts(FrameSpan(0, 5))[:, 15:], rtol=1e-6)
+    assert not half.weight[:, 25:].any()
+    assert not off.counts.any()
+    assert not off.weight.any()
 
 
 def test_accumulate_interpolates_counts_and_weight_alike(memory_source: type) -> None:
@@ -101,7 +93,7 @@ def test_accumulate_misplaces_chunks_by_less_than_tolerance(memory_source: type,
     assert abs(quick.weight.sum() / weight.sum() - 1) < 0.01
 
 
-def test_estimate_of_panned_bernoulli_frames_is_unbiased(memory_source: type, pan: Callable) -> None:
+def test_estimate_of_panned_frames_is_unbiased_and_of_still_ones_has_photon_noise(memory_source: type, pan: Callable) -> None:
     """The standard error of the mean over P pixels of n frames is sqrt((exp(f) - 1) / (n P))."""
     n = 200
     source = memory_source(frames_of(FLUX, n))
@@ -112,11 +104,6 @@ def test_estimate_of_panned_bernoulli_frames_is_unbiased(memory_source: type, pa
     std = np.sqrt(np.expm1(FLUX) / (n * known.size))
     assert abs(known.mean() - FLUX - bias) < 4 * std
     assert abs(known.mean() - FLUX) < 0.01
-
-
-def test_estimate_of_still_capture_has_photon_noise(memory_source: type) -> None:
-    n = 200
-    source = memory_source(frames_of(FLUX, n))
     flux, _ = accumulate(source, still(n), np.eye(3), SHAPE).estimate(source.response)
     # With 1,200 pixels the standard deviation has an error of 2 %.
     assert flux.std() == pytest.approx(np.sqrt(np.expm1(FLUX) / n), rel=0.08)
@@ -132,14 +119,11 @@ def masked(memory_source: type) -> object:
     return memory_source(frames, valid)
 
 
-def test_estimate_is_nan_at_masked_pixel_of_still_camera(masked) -> None:
+def test_masked_pixel_is_nan_for_a_still_camera_and_filled_from_moved_frames(masked, pan: Callable) -> None:
     flux, weight = accumulate(masked, still(200), np.eye(3), SHAPE).estimate(masked.response)
     assert weight[10, 20] == 0
     assert np.isnan(flux[10, 20])
     assert np.isnan(flux).sum() == 1
-
-
-def test_accumulate_fills_masked_pixel_from_moved_frames(masked, pan: Callable) -> None:
     chunks = chunks_of(FrameSpan(0, 200), pan(0.02), SHAPE, 0.25)
     flux, weight = accumulate(masked, chunks, np.eye(3), SHAPE).estimate(masked.response)
     seen = weight[10, 20:25]
@@ -175,11 +159,13 @@ def test_accumulate_weight_is_number_of_frames(memory_source: type, pan: Callabl
     np.testing.assert_allclose(photons.weight, np.tile(np.minimum(np.arange(60), 39) + 1, (30, 1)), rtol=1e-5)
 
 
-def test_estimate_is_nan_below_one_frame() -> None:
+def test_estimate_is_nan_below_one_frame_and_zero_where_corrected_counts_are_negative() -> None:
     counts, weight = np.float32([[0.5, 0.5, 3]]), np.float32([[0.99, 1, 4]])
     flux, known = PhotonSum(counts, weight).estimate(BinaryResponse())
     np.testing.assert_array_equal(known, [[0, 1, 4]])
     np.testing.assert_allclose(flux, [[np.nan, np.log(2), np.log(4)]], rtol=1e-6)
+    flux, _ = PhotonSum(np.float32([[-3, 5]]), np.float32([[10, 10]])).estimate(BinaryResponse())
+    assert flux.tolist() == [[0, pytest.approx(np.log(2))]]
 
 
 @pytest.mark.parametrize("shift_px", [0.01, 0.1, 1 / 64])
@@ -205,20 +191,13 @@ def test_accumulate_corrects_each_chunk_once(scale: float) -> None:
     """Sums are corrected before pixels are masked and averaged, also if they come from a cache."""
     frames = frames_of(FLUX, 50)
     valid = np.random.default_rng(0).random(SHAPE) > 0.1
-    halves = [Chunk(FrameSpan(0, 20), np.eye(3)), Chunk(FrameSpan(20, 50), np.eye(3))]
     shape = round(scale * SHAPE[0]), round(scale * SHAPE[1])
     plain, halved = (
-        accumulate(source, halves, rescaling(scale), shape, counts_of=counts_of)
+        accumulate(source, HALVES, rescaling(scale), shape, counts_of=counts_of)
         for source, counts_of in ((MemorySource(frames, valid), None), (Halved(frames, valid), MemorySource(frames).counts))
     )
     np.testing.assert_array_equal(halved.weight, plain.weight)
     np.testing.assert_allclose(halved.counts, plain.counts / 2 - plain.weight, atol=1e-3)
-
-
-def test_estimate_is_zero_where_corrected_counts_are_negative() -> None:
-    photons = PhotonSum(np.float32([[-3, 5]]), np.float32([[10, 10]]))
-    flux, _ = photons.estimate(BinaryResponse())
-    assert flux.tolist() == [[0, pytest.approx(np.log(2))]]
 
 
 def test_divided_returns_about_equal_parts_of_1_or_more() -> None:

@@ -46,42 +46,35 @@ def test_box_in_degrees_is_that_part_of_the_panorama() -> None:
 
 
 @pytest.mark.parametrize(
-    ("degrees", "projection", "extent", "message"),
+    ("degrees", "projection", "extent", "pitch", "message"),
     [
         (
-            200,
-            "planar",
-            "panorama",
+            *(200, "planar", "panorama", 0),
             "the frames cover 261 degrees, and a plane holds up to 100; write render.projection: cylindrical",
         ),
         (
-            200,
-            "spherical",
-            (140, 0, 150, 10),
+            *(200, "spherical", (140, 0, 150, 10), 0),
             "[140, 0, 150, 10] lies outside the panorama, which holds a from -131 to 131 and b from -21 to 21, in degrees",
         ),
         (
-            200,
-            "spherical",
-            (0, -100, 500, 10),
+            *(200, "spherical", (0, -100, 500, 10), 0),
             "[0, -100, 500, 10] is in degrees on a spherical panorama: expected a0, b0, a1, b1 with a1 - a0 up to 360 and b0 "
             "and b1 from -90 (up) to 90 (down)",
         ),
+        # The camera looks up, so that its frames pass over what is above the reference camera.
+        (
+            *(360, "cylindrical", "panorama", 40),
+            "the frames reach 90 degrees up or down, and a cylinder holds up to 80; write render.projection: spherical",
+        ),
     ],
+    ids=["plane", "outside", "no box", "pole"],
 )
-def test_view_that_cannot_be_shown_is_refused(degrees: float, projection: str, extent: Extent, message: str) -> None:
+def test_view_that_cannot_be_shown_is_refused(
+    degrees: float, projection: str, extent: Extent, pitch: float, message: str
+) -> None:
     with pytest.raises(InputError) as caught:
-        planned(degrees, projection, extent)
+        planned(degrees, projection, extent, pitch=pitch)
     assert str(caught.value) == message
-
-
-def test_cylinder_over_a_pole_is_refused() -> None:
-    """The camera looks up by 40 degrees, so that its frames pass over what is above the reference camera."""
-    with pytest.raises(InputError) as caught:
-        planned(360, "cylindrical", pitch=40)
-    assert str(caught.value) == (
-        "the frames reach 90 degrees up or down, and a cylinder holds up to 80; write render.projection: spherical"
-    )
 
 
 def test_sphere_of_any_homographies_is_refused() -> None:

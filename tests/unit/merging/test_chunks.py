@@ -1,23 +1,21 @@
-from __future__ import annotations
+"""Sums of frames: their chunks, cache, footprints and warps."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photonpano import FrameSpan
-from photonpano.geometry import corner_displacements, from_parameters, inverse, translation
-from photonpano.merging import chunks_of, clipped
+from photonpano import FrameSpan, InputError
+from photonpano.geometry import Canvas, corner_displacements, from_parameters, inverse, rescaling, transform_points, translation
+from photonpano.merging import CountsCache, chunks_of, clipped
+from photonpano.merging.footprints import Footprint, footprints_of
+from photonpano.merging.warping import add_footprint, add_warped
 
 SHAPE = (30, 40)
-
-
-def test_chunks_of_still_camera_is_one_chunk(pan: Callable) -> None:
-    (chunk,) = chunks_of(FrameSpan(5, 105), pan(0), SHAPE, 0.25)
-    assert chunk.span == FrameSpan(5, 105)
-    np.testing.assert_array_equal(chunk.homography, np.eye(3))
 
 
 def test_chunks_of_splits_pan_where_it_moved_by_tolerance(pan: Callable) -> None:
@@ -25,9 +23,9 @@ def test_chunks_of_splits_pan_where_it_moved_by_tolerance(pan: Callable) -> None
     assert [chunk.span for chunk in chunks] == [FrameSpan(10, 14), FrameSpan(14, 18), FrameSpan(18, 20)]
     # Each is warped as the camera stood at its centre.
     np.testing.assert_allclose(chunks[0].homography, translation(0.125 * 11.5, 0))
-
-
-def test_chunks_of_fast_camera_has_one_frame_each(pan: Callable) -> None:
+    (still,) = chunks_of(FrameSpan(5, 105), pan(0), SHAPE, 0.25)
+    assert still.span == FrameSpan(5, 105)
+    np.testing.assert_array_equal(still.homography, np.eye(3))
     assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 7), pan(3), SHAPE, 0.25)] == [1] * 7
 
 
@@ -82,3 +80,147 @@ def test_clipped_returns_part_of_chunk_around_span(pan: Callable) -> None:
     (part,) = clipped(chunks, FrameSpan(33, 39), pan(0.125))
     assert part.span == FrameSpan(33, 39)
     assert clipped(chunks, FrameSpan(0, 40), pan(0.125)) == chunks
+
+
+@pytest.fixture
+def counted(memory_source: type) -> tuple[object, list[FrameSpan]]:
+    """A source of 20 frames, and the spans that it summed."""
+    source = memory_source(np.random.default_rng(0).random((20, 4, 6)) < 0.5)
+    summed: list[FrameSpan] = []
+    sums = source.counts
+
+    def counts(span: FrameSpan) -> np.ndarray:
+        summed.append(span)
+        if span.start == 7:
+            raise InputError("a damaged block")
+        return sums(span)
+
+    source.counts = counts
+    return source, summed
+
+
+def test_counts_cache_computes_each_sum_once(counted: tuple) -> None:
+    source, summed = counted
+    shared = CountsCache(source, 1000)
+    first = shared(FrameSpan(0, 5))
+    assert shared(FrameSpan(0, 5)) is first
+    assert summed == [FrameSpan(0, 5)]
+    np.testing.assert_array_equal(first, source.frames(FrameSpan(0, 5)).sum(axis=0))
+    assert not first.flags.writeable
+
+
+def test_counts_cache_drops_least_recently_used_sum(counted: tuple) -> None:
+    source, summed = counted
+    shared = CountsCache(source, 2 * 4 * 6 * 4)
+    for start in (0, 1, 0, 2, 0, 1):
+        shared(FrameSpan(start, start + 3))
+    assert [span.start for span in summed] == [0, 1, 2, 1]
+
+
+def test_counts_cache_computes_sum_once_for_concurrent_threads(counted: tuple) -> None:
+    source, summed = counted
+    shared, together = CountsCache(source, 1000), Barrier(4)
+
+    def ask(_: int) -> np.ndarray:
+        together.wait()
+        return shared(FrameSpan(0, 20))
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(ask, range(4)))
+    assert len(summed) == 1
+    assert all(each is found[0] for each in found)
+
+
+def test_counts_cache_raises_source_error_on_each_call(counted: tuple) -> None:
+    shared = CountsCache(counted[0], 1000)
+    for _ in range(2):
+        with pytest.raises(InputError, match="a damaged block"):
+            shared(FrameSpan(7, 9))
+
+
+FRAME, GRID = (254, 496), Canvas(300, 700, np.eye(3))
+
+
+def footprints(to_grid: np.ndarray) -> list[Footprint]:
+    return footprints_of(GRID, None, to_grid, FRAME)
+
+
+def test_footprint_of_shift_is_straight_and_covers_shifted_frame() -> None:
+    (footprint,) = footprints(translation(10.5, 20.25)[None])
+    assert (footprint.shrink, footprint.straight) == (1, True)
+    assert (footprint.rows, footprint.columns) == (range(19, 276), (range(9, 508),))
+    assert footprint.to_image == pytest.approx(translation(-10.5, -20.25))
+
+
+def test_footprint_is_empty_outside_of_grid() -> None:
+    for shift in (translation(800, 0), translation(-600, 0), translation(0, 400)):
+        (footprint,) = footprints(shift[None])
+        assert not (footprint.rows and footprint.columns)
+
+
+def test_footprint_is_not_straight_beyond_small_rotation() -> None:
+    turned = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in (0.005, 0.02)]
+    assert [footprint.straight for footprint in footprints(np.array(turned))] == [True, False]
+
+
+def test_footprint_shrinks_frame_on_coarse_grid() -> None:
+    found = footprints(np.array([rescaling(1), rescaling(0.5), rescaling(0.26)]))
+    assert [footprint.shrink for footprint in found] == [1, 2, 3]
+    assert found[1].to_image == pytest.approx(np.eye(3))
+    assert found[2].to_image == pytest.approx(inverse(rescaling(0.26) @ rescaling(3)))
+
+
+IMAGE = np.random.default_rng(0).random((23, 37)).astype(np.float32)
+
+
+def interpolated(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Interpolate an image, with zeros around it, at each pixel of a grid."""
+    padded = np.pad(image.astype(np.float64), 2)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    seen = transform_points(to_image, np.stack([x.ravel(), y.ravel()], axis=-1).astype(float)) + 2
+    u, v = (np.clip(seen[:, axis], 0, padded.shape[1 - axis] - 2) for axis in (0, 1))
+    left, top = np.floor(u).astype(int), np.floor(v).astype(int)
+    a, b = u - left, v - top
+    upper = (1 - a) * padded[top, left] + a * padded[top, left + 1]
+    lower = (1 - a) * padded[top + 1, left] + a * padded[top + 1, left + 1]
+    return ((1 - b) * upper + b * lower).reshape(shape)
+
+
+@settings(max_examples=60)
+@given(
+    x=st.floats(-45, 45),
+    y=st.floats(-30, 30),
+    linear=st.lists(st.floats(-0.15, 0.15), min_size=4, max_size=4),
+    perspective=st.lists(st.floats(-1e-3, 1e-3), min_size=2, max_size=2),
+)
+def test_add_warped_equals_bilinear_interpolation(x: float, y: float, linear: list[float], perspective: list[float]) -> None:
+    to_image = np.array([[1 + linear[0], linear[1], x], [linear[2], 1 + linear[3], y], [*perspective, 1]])
+    shape = (31, 53)
+    total = np.full(shape, 7, np.float32)
+    add_warped(IMAGE, to_image, total)
+    np.testing.assert_allclose(total, 7 + interpolated(IMAGE, to_image, shape), atol=1e-4)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (3, -5), (2.25, 1.5), (-0.5, 0.5), (36.5, 0), (37, 0), (0, -22.5), (200, 0)])
+def test_add_warped_is_exact_up_to_the_border(shift: tuple[float, float]) -> None:
+    total = np.zeros((40, 60), np.float32)
+    add_warped(IMAGE, translation(*shift), total)
+    np.testing.assert_allclose(total, interpolated(IMAGE, translation(*shift), total.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "to_image",
+    [
+        translation(0, 0),
+        translation(-2.25, 1.5),
+        np.array([[0.9, 0.2, -4], [-0.1, 1.1, 3], [1e-3, -5e-4, 1]]),
+        translation(500, 0),
+    ],
+    ids=["identity", "shift", "perspective", "outside"],
+)
+def test_add_footprint_equals_warp_of_uniform_image(to_image: np.ndarray) -> None:
+    shape = (40, 60)
+    expected, total, steps = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros((40, 61), np.float32)
+    add_warped(np.full(IMAGE.shape, 3, np.float32), to_image, expected)
+    add_footprint(IMAGE.shape, to_image, 3.0, steps, total)
+    np.testing.assert_allclose(total + np.cumsum(steps, axis=1)[:, :-1], expected, atol=1e-4)

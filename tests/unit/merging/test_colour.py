@@ -1,11 +1,9 @@
 """Images in colour, made of the images of single colours."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from photonpano.merging.colour import filled, with_clear
+from photonpano.merging.colour import filled, noise_of_a_frame, with_clear, with_shared_detail
 from photonpano.photometry import BinaryResponse
 from photonpano.reading import bayer_array
 
@@ -96,3 +94,37 @@ def test_clear_pixels_lower_the_noise_without_bias() -> None:
     variance, clear = (np.expm1(each) / n for each, n in ((truth[0, 0], 500), (with_sum[0, 0, 3], 4500)))
     assert after == pytest.approx(np.sqrt(variance - variance**2 / (clear + variance.sum())), rel=0.05)
     assert result.sum(axis=-1).std() < 0.5 * flux[..., :3].sum(axis=-1).std()
+
+
+def large(tint: np.ndarray | tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a larger texture in one tint, and the frames that a turn of the camera gives each colour."""
+    y, x = np.mgrid[:96, :128]
+    truth = ((0.3 + 0.2 * np.sin(x / 1.5) * np.cos(y / 2))[..., None] * np.float32(tint)).astype(np.float32)
+    return truth, np.broadcast_to(np.float32([400, 800, 400]), truth.shape)
+
+
+def rms_of_colours(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean((image - truth) ** 2, axis=(0, 1)))
+
+
+def test_noise_of_tinted_texture_is_lower_without_bias() -> None:
+    truth, weight = large((0.5, 0.8, 0.3))
+    flux = seen_by(truth, weight)
+    found = with_shared_detail(flux, weight, BinaryResponse())
+    assert (rms_of_colours(found, truth) < [0.6, 0.9, 0.5] * rms_of_colours(flux, truth)).all()
+    assert found.mean(axis=(0, 1)) == pytest.approx(flux.mean(axis=(0, 1)), rel=0.003)
+
+
+def test_detail_of_single_colours_stays_with_many_photons() -> None:
+    """Red and green checks of equal brightness: the sum of the colours shows nothing of them."""
+    checks = (np.add.outer(np.arange(96) // 4, np.arange(128) // 4) % 2)[..., None]
+    truth = np.where(checks, np.float32([0.4, 0.1, 0.2]), np.float32([0.1, 0.4, 0.2])).astype(np.float32)
+    weight = 100 * large((1, 1, 1))[1]
+    flux = seen_by(truth, weight)
+    found = with_shared_detail(flux, weight, BinaryResponse())
+    assert (rms_of_colours(found, truth) < 1.05 * rms_of_colours(flux, truth)).all()
+
+
+def test_noise_of_a_frame_is_the_binomial_one() -> None:
+    flux = np.float32([0.01, 0.1, 1, 3])
+    assert noise_of_a_frame(flux, BinaryResponse()) == pytest.approx(np.expm1(flux), rel=0.01)

@@ -1,11 +1,9 @@
 """Sums of frames in changing light are divided by the sum of their gains."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Light
+from photonpano import FrameSpan, Light, Response
 from photonpano.geometry import translation
 from photonpano.lighting import in_light
 from photonpano.merging import Chunk, accumulate
@@ -33,17 +31,19 @@ def test_flux_in_deep_flicker_is_unbiased_up_to_bright_pixels(flux: float) -> No
     np.testing.assert_allclose(weight, FLICKER.sum(), rtol=1e-4)
 
 
-def test_frames_of_one_gain_have_the_exact_flux() -> None:
-    frames, gains = np.full((1, 2, 2), 100, np.float32), np.full((1, 2, 2), 50, np.float32)
-    flux = LitFrames(frames, gains).flux(np.full((2, 2), 30, np.float32), BinaryResponse())
-    np.testing.assert_allclose(flux, -np.log1p(-0.3) / 0.5, rtol=1e-6)
-
-
-def test_flux_of_linear_response_needs_only_the_sum_of_gains() -> None:
-    frames, gains = np.float32([[[60]], [[40]]]), np.float32([[[30]], [[80]]])
-    response = IntensityResponse(photons_per_level=2.0, black_level=0.0, saturation_level=255, read_noise=0.0)
-    flux = LitFrames(frames, gains).flux(np.float32([[550]]), response)
-    np.testing.assert_allclose(flux, 2 * 550 / 110, rtol=1e-5)
+@pytest.mark.parametrize(
+    ("frames", "gains", "counts", "response", "flux"),
+    [
+        ([100], [50], 30, BinaryResponse(), -np.log1p(-0.3) / 0.5),
+        ([60, 40], [30, 80], 550, IntensityResponse(2.0, 0.0, 255, 0.0), 2 * 550 / 110),
+    ],
+    ids=["one gain", "a linear response needs only the sum of gains"],
+)
+def test_flux_of_known_gains_is_exact(
+    frames: list[float], gains: list[float], counts: float, response: Response, flux: float
+) -> None:
+    lit = LitFrames(*(np.float32(each).reshape(-1, 1, 1) for each in (frames, gains)))
+    np.testing.assert_allclose(lit.flux(np.float32([[counts]]), response), flux, rtol=1e-5)
 
 
 def test_pixel_lit_in_every_frame_has_finite_flux() -> None:

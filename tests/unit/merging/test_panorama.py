@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable
 from typing import Any
@@ -21,11 +19,13 @@ ALL = FrameSpan(0, N)
 GIB = 1024**3
 
 
-def test_plan_canvas_holds_frames_of_span_only(pan: Callable) -> None:
+def test_plan_canvas_holds_frames_of_span_only_in_one_tile_if_it_fits(pan: Callable) -> None:
     """At 2 px per frame, frames 10 to 19 span 18 px and a frame."""
     canvas = plan_canvas(pan(2), FrameSpan(10, 20), SHAPE, 1.0, GIB)
     assert canvas.shape == (30, 40 + 18)
     np.testing.assert_array_equal(canvas.transform, translation(-20, 0))
+    (tile,), reduction = tiles_of(canvas, canvas.height * canvas.width * BYTES_PER_PIXEL)
+    assert (tile.left, tile.top, tile.canvas, reduction) == (0, 0, canvas, 1)
 
 
 def test_plan_canvas_refuses_canvas_far_beyond_memory(pan: Callable) -> None:
@@ -192,12 +192,6 @@ def test_thumbnail_averages_seen_pixels() -> None:
     np.testing.assert_array_equal(shown.panorama.weight, [[6, 0], [4, 2]])
     # The centre of the first square lies between the pixels 0 and 1.
     np.testing.assert_allclose(transform_points(shown.panorama.canvas, [[-1.5, -0.5]]), [[0, 0]], atol=1e-12)
-
-
-def test_tiles_of_canvas_that_fits_is_one_tile(pan: Callable) -> None:
-    canvas = plan_canvas(pan(1), ALL, SHAPE, 1.0, GIB)
-    (tile,), reduction = tiles_of(canvas, canvas.height * canvas.width * BYTES_PER_PIXEL)
-    assert (tile.left, tile.top, tile.canvas, reduction) == (0, 0, canvas, 1)
 
 
 @pytest.mark.parametrize("size", [(3000, 40_000), (50_000, 3000), (3001, 3003)])

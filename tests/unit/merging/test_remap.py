@@ -70,12 +70,20 @@ def mean_on(canvas: Canvas, source: MemorySource, turns: FloatArray) -> tuple[Fl
         return photons.counts / photons.weight, photons.weight
 
 
+def around(turns: FloatArray, camera: Camera, projection: str = "spherical", scale: float = 1.0) -> Canvas:
+    return canvas_around(covered_by(turns, camera, SHAPE), CAMERA, scale, projection)
+
+
+def alike(turns: FloatArray, valid: np.ndarray | None = None) -> MemorySource:
+    """Return frames of the same value everywhere."""
+    return MemorySource(np.full((len(turns), *SHAPE), 7, np.uint8), valid)
+
+
 @pytest.mark.parametrize("projection", ["cylindrical", "spherical"])
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 def test_full_turn_shows_the_scene_without_a_seam(projection: str, camera: Camera) -> None:
     turns = rotations()
-    covered = covered_by(turns, camera, SHAPE)
-    canvas = canvas_around(covered, CAMERA, 1.0, projection)
+    canvas = around(turns, camera, projection)
     mean, weight = mean_on(canvas, seen_through(capture(turns, camera), camera), turns)
     seen = weight > 0.5
     assert seen[len(seen) // 2].all(), "no hole at the seam"
@@ -85,8 +93,7 @@ def test_full_turn_shows_the_scene_without_a_seam(projection: str, camera: Camer
 
 def test_pole_is_filled() -> None:
     turns = rotations(YAWS, 75)
-    covered = covered_by(rotations(YAWS, 75), CAMERA, SHAPE)
-    canvas = canvas_around(covered, CAMERA, 1.0, "spherical")
+    canvas = around(turns, CAMERA)
     mean, weight = mean_on(canvas, capture(turns, CAMERA), turns)
     seen = weight > 0.5
     assert_shows_the_scene(mean, canvas, seen)
@@ -108,21 +115,16 @@ def test_lens_on_a_plane_straightens_frames() -> None:
 def test_counts_and_weight_are_interpolated_alike_at_masks_and_borders() -> None:
     turns = rotations()
     valid = np.random.default_rng(0).random(SHAPE) > 0.2
-    canvas = canvas_around(covered_by(turns, CAMERA, SHAPE), CAMERA, 1.3, "spherical")
-    source = MemorySource(np.full((len(turns), *SHAPE), 7, np.uint8), valid)
-    mean, weight = mean_on(canvas, source, turns)
+    canvas = around(turns, CAMERA, scale=1.3)
+    mean, weight = mean_on(canvas, alike(turns, valid), turns)
+    _, whole = mean_on(canvas, alike(turns), turns)
     assert np.allclose(mean[weight > 1e-3], 7, rtol=1e-3)
-    assert weight.sum() == pytest.approx(valid.mean() * mean_weight(canvas, turns), rel=0.02)
-
-
-def mean_weight(canvas: Canvas, turns: FloatArray) -> float:
-    source = MemorySource(np.full((len(turns), *SHAPE), 7, np.uint8))
-    return float(mean_on(canvas, source, turns)[1].sum())
+    assert weight.sum() == pytest.approx(valid.mean() * whole.sum(), rel=0.02)
 
 
 def test_small_scale_averages_pixels_before_the_warp() -> None:
     turns = rotations(np.zeros(1))
-    canvas = canvas_around(covered_by(turns, CAMERA, SHAPE), CAMERA, 0.25, "cylindrical")
+    canvas = around(turns, CAMERA, "cylindrical", 0.25)
     frame = (7 * np.indices(SHAPE).sum(axis=0) % 2).astype(np.uint8) * 40
     photons = accumulate(MemorySource(frame[None]), chunks(turns, CAMERA), canvas, canvas.shape)
     middle = photons.weight > 0.99
@@ -131,7 +133,7 @@ def test_small_scale_averages_pixels_before_the_warp() -> None:
 
 def test_part_of_a_canvas_is_the_same_as_that_part_of_the_whole() -> None:
     turns = rotations()
-    canvas = canvas_around(covered_by(turns, LENS, SHAPE), CAMERA, 1.0, "spherical")
+    canvas = around(turns, LENS)
     source = seen_through(capture(turns, LENS), LENS)
     whole = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape)
     part = canvas.part(canvas.width - 40, 10, 20, 40)
@@ -146,7 +148,7 @@ def test_part_of_a_canvas_is_the_same_as_that_part_of_the_whole() -> None:
 def test_runs_of_chunks_add_up_also_across_the_seam(camera: Camera, run: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(accumulate.__globals__, "_RUN", run)
     turns = rotations()
-    canvas = canvas_around(covered_by(turns, camera, SHAPE), CAMERA, 1.0, "spherical")
+    canvas = around(turns, camera)
     source = seen_through(capture(turns, camera), camera)
     at_once = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape)
     in_runs = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape, in_order=map)
@@ -170,7 +172,7 @@ def test_frames_behind_a_plane_leave_no_ghost() -> None:
     """A part of the plane is rendered of a camera that turns all around."""
     turns = rotations()
     canvas = Canvas(*SHAPE, np.eye(3))
-    source = MemorySource(np.full((len(turns), *SHAPE), 7, np.uint8))
+    source = alike(turns)
     photons = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape)
     ahead = np.degrees(np.arccos(np.clip(turns[:, 2, 2], -1, 1))) < 80
     few = accumulate(source, [chunk for chunk, near in zip(chunks(turns, CAMERA), ahead, strict=True) if near], canvas, SHAPE)
@@ -182,7 +184,7 @@ def test_frames_behind_a_plane_leave_no_ghost() -> None:
 def test_noise_on_a_sphere_is_lowered_by_interpolation(camera: Camera) -> None:
     """The variance of pixels between others is 4 / 9 on average."""
     turns = rotations(np.arange(0.0, 100, 0.5))
-    canvas = canvas_around(covered_by(turns, camera, SHAPE), CAMERA, 1.0, "spherical")
+    canvas = around(turns, camera)
     span = FrameSpan(0, len(turns))
     averaging = Averaging.of(FrameTrajectory(CAMERA.homographies(turns)), span, SHAPE, canvas, camera)
     factor = averaging.std_factor(canvas.shape)
@@ -193,7 +195,7 @@ def test_noise_on_a_sphere_is_lowered_by_interpolation(camera: Camera) -> None:
 
 def test_corrections_are_laid_on_a_sphere_as_counts_are() -> None:
     turns = rotations()
-    canvas = canvas_around(covered_by(turns, LENS, SHAPE), CAMERA, 1.0, "spherical")
+    canvas = around(turns, LENS)
     image = np.random.default_rng(0).integers(0, 255, SHAPE)
     source = seen_through(MemorySource(np.repeat(image[None], len(turns), axis=0)), LENS)
     photons = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape)

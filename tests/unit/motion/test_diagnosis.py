@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from textwrap import dedent
 from typing import Any, Literal
 
@@ -12,46 +10,36 @@ from photonpano import FrameSpan, Group, Located, LocationError, NotLocated, Vir
 from photonpano.motion.diagnosis import Contrast, contrast_of, require_in_front, require_tied, solving
 from photonpano.motion.graph import GraphSolution
 from photonpano.photometry import BinaryResponse
+from photonpano.testing import photographed
 from photonpano.values import Edge
 
-RESPONSE = BinaryResponse()
-
-
-def exposed(counts: np.ndarray, frames: int) -> VirtualExposure:
-    weight = np.full(counts.shape, frames, np.float32)
-    flux = RESPONSE.flux((counts / frames).astype(np.float32), weight)
-    return VirtualExposure(flux, weight, Group(FrameSpan(0, frames), 0), 1.0, RESPONSE)
-
 
 @given(st.integers(1, 100_000))
-def test_contrast_is_blank_if_all_pixels_are_saturated(frames: int) -> None:
-    assert contrast_of(exposed(np.full((4, 6), frames), frames)).blank == (
-        "every pixel is saturated, so that its flux is unknown; use a smaller aperture"
-    )
-
-
-@given(st.integers(1, 100_000))
-def test_contrast_is_not_blank_if_one_pixel_has_one_dark_frame(frames: int) -> None:
+def test_contrast_is_blank_if_all_pixels_are_saturated_and_not_if_one_has_one_dark_frame(frames: int) -> None:
+    response, weight = BinaryResponse(), np.full((4, 6), frames, np.float32)
     counts = np.full((4, 6), frames)
-    counts[1, 2] -= 1
-    assert contrast_of(exposed(counts, frames)).blank is None
+    for saturated in (True, False):
+        counts[1, 2] -= not saturated
+        flux = response.flux((counts / frames).astype(np.float32), weight)
+        blank = contrast_of(VirtualExposure(flux, weight, GROUPS[0], 1.0, response)).blank
+        sentence = "every pixel is saturated, so that its flux is unknown; use a smaller aperture"
+        assert blank == (sentence if saturated else None)
 
 
 @pytest.mark.parametrize(
-    ("seen", "blank"),
-    [(True, "no pixel detected a photon; is the shutter closed, or is it the wrong file?"), (False, "no pixel was seen")],
+    ("unseen", "blank"),
+    [
+        (None, "no pixel detected a photon; is the shutter closed, or is it the wrong file?"),
+        (np.ones((4, 6), bool), "no pixel was seen"),
+    ],
 )
-def test_contrast_is_blank_without_photons_or_pixels(seen: bool, blank: str) -> None:
-    exposure = exposed(np.zeros((4, 6)), 100)
-    if not seen:
-        exposure.flux[:], exposure.weight[:] = np.nan, 0
-    assert contrast_of(exposure).blank == blank
+def test_contrast_is_blank_without_photons_or_pixels(unseen: np.ndarray | None, blank: str) -> None:
+    assert contrast_of(photographed(np.zeros((4, 6)), 100, unseen=unseen)).blank == blank
 
 
 N = 10
 GROUPS = tuple(Group(FrameSpan(100 * index, 100 * index + 100), 100 * index + 49.5) for index in range(N))
-CLEAR, DARK = Contrast(12.34), Contrast(0.17)
-BLANK = Contrast(0.0, "no pixel detected a photon")
+CLEAR = Contrast(12.34)
 
 
 def require(
@@ -79,9 +67,6 @@ def test_require_tied_accepts_two_lost_exposures_in_a_row_or_the_largest_part(
     lost: tuple[int, ...], disconnected: Literal["error", "largest"]
 ) -> None:
     require(lost, disconnected=disconnected)
-
-
-def test_require_tied_accepts_a_single_group() -> None:
     require_tied(1, GROUPS[:1], [], np.array([0]), {0: CLEAR}, "error")
 
 
@@ -91,13 +76,11 @@ def refusal(*args: Any, **kwargs: Any) -> str:
     return str(caught.value)
 
 
-def golden(text: str) -> str:
-    return dedent(text).strip()
-
-
 def test_refusal_names_lost_frames_and_failed_pairs() -> None:
-    assert refusal((4, 5, 6)) == golden(
-        """
+    assert (
+        refusal((4, 5, 6))
+        == dedent(
+            """
         level 2: 4 of 9 pairs of exposures could not be located, so that frames 400 to 699 cannot be tied to the rest
         Parts that are tied together: frames 0 to 399 with frames 700 to 999.
           frames 400 to 499 onto frames 300 to 399: 3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)
@@ -109,6 +92,7 @@ not the cause: either motion blurs them (try smaller groups, such as resample.wi
 texture there.
         To go on with the largest part alone, set graph.disconnected to largest.
         """
+        ).strip()
     )
 
 
@@ -116,7 +100,7 @@ texture there.
     ("contrast", "advice"),
     [
         (
-            DARK,
+            Contrast(0.17),
             "varies 0.17 times as much as a pixel's photon noise: either they are too dark (try larger groups, such as "
             "resample.with.group_size=200), or the scene has no texture there.",
         ),
@@ -145,14 +129,6 @@ def test_refusal_advises_by_the_signal_to_noise_ratio(contrast: Contrast, advice
     ]
 
 
-def parts_refusal(parts: list[int]) -> str:
-    groups = tuple(Group(FrameSpan(100 * index, 100 * index + 100), 100 * index + 49.5) for index in range(len(parts)))
-    contrasts = dict.fromkeys(range(len(parts)), CLEAR)
-    with pytest.raises(LocationError) as caught:
-        require_tied(1, groups, [Edge(1, 0, NotLocated("lost"))], np.array(parts), contrasts, "error")
-    return str(caught.value).splitlines()[1]
-
-
 SIX = "; ".join(f"frames {200 * part} to {200 * part + 199}" for part in range(6))
 
 
@@ -171,16 +147,18 @@ SIX = "; ".join(f"frames {200 * part} to {200 * part + 199}" for part in range(6
     ids=["largest first", "one", "six", "seven"],
 )
 def test_refusal_lists_six_parts_at_most(parts: list[int], named: str) -> None:
-    assert parts_refusal(parts) == f"Parts that are tied together: {named}"
+    groups = tuple(Group(FrameSpan(100 * index, 100 * index + 100), 100 * index + 49.5) for index in range(len(parts)))
+    contrasts = dict.fromkeys(range(len(parts)), CLEAR)
+    with pytest.raises(LocationError) as caught:
+        require_tied(1, groups, [Edge(1, 0, NotLocated("lost"))], np.array(parts), contrasts, "error")
+    assert str(caught.value).splitlines()[1] == f"Parts that are tied together: {named}"
 
 
-def test_refusal_lists_six_pairs_at_most() -> None:
+def test_refusal_lists_six_pairs_at_most_and_gives_no_advice_for_blank_exposures() -> None:
     lines = refusal((2, 3, 4, 5, 6, 7, 8, 9)).splitlines()
     assert [line for line in lines if line.startswith("  ")][6:] == ["  ... and 2 more"]
-
-
-def test_refusal_gives_no_advice_for_blank_exposures() -> None:
-    assert refusal((4, 5, 6), BLANK, reason="frames 400 to 499: no pixel detected a photon").splitlines()[-2:] == [
+    blank = Contrast(0.0, "no pixel detected a photon")
+    assert refusal((4, 5, 6), blank, reason="frames 400 to 499: no pixel detected a photon").splitlines()[-2:] == [
         "  frames 700 to 799 onto frames 600 to 699: frames 400 to 499: no pixel detected a photon",
         "To go on with the largest part alone, set graph.disconnected to largest.",
     ]

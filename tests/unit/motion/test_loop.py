@@ -1,6 +1,6 @@
-from __future__ import annotations
+"""Levels of the motion, trajectories with the names of their plugins, and captures with cuts and repeated frames."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -8,12 +8,36 @@ import pytest
 
 from photonpano import FrameSpan, Group, InputError, PluginError
 from photonpano.context import Context, Quiet
+from photonpano.contracts.attribution import AttributedTrajectory
 from photonpano.geometry import from_parameters, inverse, normalised, translation
 from photonpano.motion.level import Level
-from photonpano.motion.loop import ReferencedTrajectory, estimate_motion
+from photonpano.motion.loop import LevelResult, ReferencedTrajectory, estimate_motion
+from photonpano.motion.timeline import Cut, Timeline
 from photonpano.specs.settings import GraphSettings
 
 N_FRAMES = 120
+
+
+def groups(*spans: tuple[int, int]) -> tuple[Group, ...]:
+    return tuple(Group(span, span.centre) for span in (FrameSpan(*each) for each in spans))
+
+
+class Grouping:
+    """A resampler that returns these groups, whatever the capture."""
+
+    def __init__(self, *spans: tuple[int, int]) -> None:
+        self.answer = groups(*spans)
+
+    def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
+        return self.answer
+
+
+class Notes(Quiet):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, message: str) -> None:
+        self.lines.append(message)
 
 
 @pytest.fixture(scope="module")
@@ -23,17 +47,16 @@ def source(memory_source: type) -> Any:
 
 @pytest.fixture
 def run(source: Any) -> Callable[..., list]:
-    def run(*levels: Level, reference: int = 60) -> list:
-        return estimate_motion(source, levels, GraphSettings(), reference, Context(2))
+    def run(*levels: Level, reference: int = 60, notes: Any = None, **options: Any) -> list:
+        context = Context(2) if notes is None else Context(2, notes)
+        return estimate_motion(source, levels, GraphSettings(), reference, context, **options)
 
     return run
 
 
 @pytest.mark.parametrize("reference", [0, 60, 119])
-def test_reference_frame_is_the_identity_at_every_level(
-    run: Callable, make_level: Callable, pan: Callable, reference: int
-) -> None:
-    results = run(make_level(pan(0.3)), make_level(pan(0.3), number=2), reference=reference)
+def test_reference_frame_is_the_identity_at_every_level(run: Callable, make_level: Callable, reference: int) -> None:
+    results = run(make_level(), make_level(number=2), reference=reference)
     for result in results:
         np.testing.assert_allclose(result.trajectory.at([reference]), [np.eye(3)], atol=1e-12)
         inside = np.arange(5, 115)
@@ -41,71 +64,47 @@ def test_reference_frame_is_the_identity_at_every_level(
             np.testing.assert_allclose(result.trajectory.at(inside)[:, 0, 2], 0.3 * (inside - reference), atol=1e-9)
 
 
-def test_level_is_merged_along_the_motion_of_the_previous_one(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_level_is_merged_along_the_motion_of_the_previous_one(run: Callable, make_level: Callable) -> None:
     merged_along: list[Any] = []
-    level = make_level(pan(0.3))
-    merge = level.merger.merge
+    merge = make_level().merger.merge
 
     class Watched:
         def merge(self, source: Any, group: Group, trajectory: Any, scale: float) -> Any:
             merged_along.append(trajectory)
             return merge(source, group, trajectory, scale)
 
-    levels = [make_level(pan(0.3), number=number, merger=Watched()) for number in (1, 2)]
-    results = run(*levels)
+    results = run(*(make_level(number=number, merger=Watched()) for number in (1, 2)))
     assert [len(result.groups) for result in results] == [12, 23]
     assert merged_along == [None] * 12 + [results[0].trajectory] * 23
 
 
+@pytest.mark.parametrize(
+    ("sway_px", "change_px"), [(2.0, pytest.approx(2 * 2 / np.pi, rel=0.15)), (0.0, pytest.approx(0, abs=1e-6))]
+)
 def test_change_is_the_mean_displacement_of_corners_between_levels(
-    run: Callable, make_level: Callable, known_motion: type
+    run: Callable, make_level: Callable, known_motion: type, sway_px: float, change_px: Any
 ) -> None:
-    """The second level adds a sway of 2 px with four periods, which no change of the reference plane explains."""
-
-    def swaying(by_px: float) -> Any:
-        return known_motion(lambda frame: translation(0.3 * frame, by_px * np.sin(2 * np.pi * frame / 30)))
-
-    first, second = run(make_level(swaying(0.0)), make_level(swaying(2.0), number=2))
+    """The second level adds a sway with four periods, which no change of the reference plane explains."""
+    swaying = known_motion(lambda frame: translation(0.3 * frame, sway_px * np.sin(2 * np.pi * frame / 30)))
+    first, second = run(make_level(), make_level(swaying, number=2), reference=100)
     assert first.change_px is None
-    assert second.change_px == pytest.approx(2 * 2 / np.pi, rel=0.15)
+    assert second.change_px == change_px
     assert set(second.seconds) == {"resample", "merge", "locate", "interpolate"}
 
 
-def test_change_is_0_if_a_level_finds_the_same_motion(run: Callable, make_level: Callable, pan: Callable) -> None:
-    _, second = run(make_level(pan(0.3)), make_level(pan(0.3), number=2), reference=100)
-    assert second.change_px == pytest.approx(0, abs=1e-6)
-
-
 @pytest.mark.parametrize(("wanted", "levels"), [(True, 2), (False, 4)])
-def test_estimate_motion_stops_on_convergence_only_if_asked(
-    source: Any, make_level: Callable, pan: Callable, wanted: bool, levels: int
+def test_estimate_motion_stops_on_convergence_only_if_asked_and_notes_a_line_for_each_level(
+    run: Callable, make_level: Callable, wanted: bool, levels: int
 ) -> None:
     """Without information, the expected error is about a pixel; the second level changes nothing."""
-    chosen = [make_level(pan(0.3), number=number) for number in (1, 2, 3, 4)]
-    results = estimate_motion(source, chosen, GraphSettings(), 60, Context(2), until_converged=wanted)
-    assert len(results) == levels
-    assert [result.converged for result in results] == [False, *[True] * (levels - 1)]
-
-
-def test_estimate_motion_notes_a_line_for_each_level(source: Any, make_level: Callable, pan: Callable) -> None:
-    class Notes(Quiet):
-        def __init__(self) -> None:
-            self.lines: list[str] = []
-
-        def note(self, message: str) -> None:
-            self.lines.append(message)
-
     notes = Notes()
-    levels = [make_level(pan(0.3)), make_level(pan(0.3), number=2)]
-    estimate_motion(source, levels, GraphSettings(), 60, Context(2, notes))
-    assert notes.lines == [
+    results = run(*(make_level(number=number) for number in (1, 2, 3, 4)), notes=notes, until_converged=wanted)
+    assert [result.converged for result in results] == [False, *[True] * (levels - 1)]
+    assert len(notes.lines) == levels
+    assert notes.lines[:2] == [
         "level 1: 12 of 12 exposures located",
         "level 2: 23 of 23 exposures located, the motion changed by 0.00 px",
     ]
-
-
-def component(level: Level, kind: str) -> Any:
-    return level.locators[0].component if kind == "locator" else getattr(level, kind)
 
 
 def raising(error: BaseException) -> Callable[..., Any]:
@@ -115,90 +114,40 @@ def raising(error: BaseException) -> Callable[..., Any]:
     return fail
 
 
-CALLS = [
-    ("resampler", "groups"),
-    ("merger", "merge"),
-    ("locator", "describe"),
-    ("locator", "register"),
-    ("interpolator", "fit"),
-]
-
-
-@pytest.mark.parametrize(("kind", "method"), CALLS)
-def test_component_that_raises_is_named(run: Callable, make_level: Callable, pan: Callable, kind: str, method: str) -> None:
-    second = make_level(pan(0.3), number=2)
-    setattr(component(second, kind), method, raising(ZeroDivisionError("by nothing")))
+@pytest.mark.parametrize(
+    ("kind", "method"),
+    [("resampler", "groups"), ("merger", "merge"), ("locator", "describe"), ("locator", "register"), ("interpolator", "fit")],
+)
+def test_component_that_raises_is_named_and_errors_for_users_pass_unchanged(
+    run: Callable, make_level: Callable, kind: str, method: str
+) -> None:
+    second = make_level(number=2)
+    component = second.locators[0].component if kind == "locator" else getattr(second, kind)
+    setattr(component, method, raising(ZeroDivisionError("by nothing")))
     with pytest.raises(PluginError) as caught:
-        run(make_level(pan(0.3)), second)
+        run(make_level(), second)
     assert str(caught.value) == f"{kind} 'toy' of toys 1.0 failed at level 2: ZeroDivisionError: by nothing"
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
-
-
-@pytest.mark.parametrize(("kind", "method"), CALLS)
-def test_errors_written_for_users_pass_unchanged(
-    run: Callable, make_level: Callable, pan: Callable, kind: str, method: str
-) -> None:
     error = InputError("said for users")
-    level = make_level(pan(0.3))
-    setattr(component(level, kind), method, raising(error))
-    with pytest.raises(type(error)) as caught:
-        run(level)
-    assert caught.value is error
+    setattr(component, method, raising(error))
+    with pytest.raises(InputError) as unchanged:
+        run(make_level(), second)
+    assert unchanged.value is error
 
 
-def spans(*starts: int) -> Iterator[Group]:
-    for start in starts:
-        yield Group(FrameSpan(start, start + 10), start)
-
-
-@pytest.mark.parametrize(
-    ("groups", "instants"), [((), "[]"), (tuple(spans(0, 50, 20)), "[0, 50, 20]"), (tuple(spans(0, 0)), "[0, 0]")]
-)
-def test_resample_refuses_groups_out_of_order(
-    run: Callable, make_level: Callable, pan: Callable, groups: tuple[Group, ...], instants: str
-) -> None:
-    class Chaos:
-        def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-            return groups
-
-    with pytest.raises(PluginError) as caught:
-        run(make_level(pan(0.3), resampler=Chaos()))
-    assert str(caught.value) == (
-        "resampler 'toy' of toys 1.0 broke its contract at level 1: "
-        f"expected at least one group, in order, each instant once; got the instants {instants}"
-    )
-
-
-def test_resample_refuses_groups_beyond_the_capture(run: Callable, make_level: Callable, pan: Callable) -> None:
-    class Greedy:
-        def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-            return tuple(spans(0, n_frames - 5))
-
-    with pytest.raises(PluginError) as caught:
-        run(make_level(pan(0.3), resampler=Greedy()))
-    assert str(caught.value) == (
-        "resampler 'toy' of toys 1.0 broke its contract at level 1: "
-        "the capture has 120 frames (0 to 119), got a group of frames 115 to 124"
-    )
-
-
-def test_single_group_is_one_located_instant(run: Callable, make_level: Callable, pan: Callable) -> None:
-    class Whole:
-        def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-            return (Group(FrameSpan(0, n_frames), 59.5),)
-
-    (result,) = run(make_level(pan(0.3), resampler=Whole()))
-    assert (result.located.n_located, result.located.edges) == (1, ())
+def test_single_group_is_one_located_instant_without_information(run: Callable, make_level: Callable) -> None:
+    (result,) = run(make_level(resampler=Grouping((0, N_FRAMES))))
+    assert (result.located.n_located, result.located.edges, result.located.information) == (1, (), None)
+    np.testing.assert_array_equal(result.located.homographies, [np.eye(3)])
     np.testing.assert_array_equal(result.trajectory.at([0, 119]), [np.eye(3)] * 2)
 
 
-def test_referenced_trajectory_is_the_identity_at_the_reference(pan: Callable) -> None:
+def test_referenced_trajectory_is_the_identity_at_the_reference_and_keeps_pairwise_motions(
+    pan: Callable, known_motion: type
+) -> None:
+    """A camera that zooms while it pans: these maps do not commute."""
     trajectory = ReferencedTrajectory(pan(0.5), 40)
     np.testing.assert_allclose(trajectory.at([40, 50, 20.5]), [np.eye(3), translation(5, 0), translation(-9.75, 0)])
-
-
-def test_referenced_trajectory_keeps_pairwise_motions(known_motion: type) -> None:
-    """A camera that zooms while it pans: these maps do not commute."""
     zoom, speed = np.array([1e-3, -2e-4, 3e-4, 1e-3, 0, 0, 1e-6, 2e-6]), np.array([0.3, -0.1])
     free = known_motion(lambda frame: translation(*speed * frame) @ from_parameters(zoom * frame))
     pairs = []
@@ -207,3 +156,131 @@ def test_referenced_trajectory_keeps_pairwise_motions(known_motion: type) -> Non
         pairs.append(normalised(inverse(first) @ second))
         np.testing.assert_allclose(ReferencedTrajectory(free, reference).at([reference]), [np.eye(3)], atol=1e-12)
     np.testing.assert_allclose(pairs[1:], [pairs[0]] * 2, atol=1e-9)
+
+
+def test_attributed_trajectory_returns_what_the_trajectory_returns(pan: Callable) -> None:
+    motion = pan(0.3)
+    named = AttributedTrajectory(motion, "interpolator 'toy' of toys 1.0", 2)
+    for frames in ([3], [0, 2.5, 7], np.arange(4), 3):
+        np.testing.assert_array_equal(named.at(frames), motion.at(frames))
+
+
+@pytest.mark.parametrize(
+    ("answer", "problem"),
+    [
+        (raising(KeyError("knot")), "failed at level 2: KeyError: 'knot'"),
+        (lambda _: np.eye(3), "broke its contract at level 2: expected homographies of the shape (2, 3, 3), got (3, 3)"),
+        (
+            lambda _: [np.eye(3), np.diag([1.0, 1.0, 0.0])],
+            "broke its contract at level 2: a homography is finite with h33 = 1, that of frame 7.5 is "
+            "[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]",
+        ),
+    ],
+    ids=["raises", "shape", "h33"],
+)
+def test_attributed_trajectory_names_interpolator_on_exception_or_broken_contract(
+    answer: Callable[..., Any], problem: str
+) -> None:
+    class Odd:
+        at = staticmethod(answer)
+
+    with pytest.raises(PluginError) as caught:
+        AttributedTrajectory(Odd(), "interpolator 'toy' of toys 1.0", 2).at([3, 7.5])
+    assert str(caught.value) == f"interpolator 'toy' of toys 1.0 {problem}"
+
+
+REGULAR = Timeline.regular(N_FRAMES)
+
+
+def cut_at(frame: int, dark: FrameSpan | None = None) -> Cut:
+    return Cut(frame, np.array([7.0, 0.0]), 20.0, dark)
+
+
+def repeating(*frames: int) -> Timeline:
+    return Timeline.with_repeats(np.isin(np.arange(N_FRAMES), frames))
+
+
+def jumping(frame: float) -> float:
+    return 0.3 * frame + 7 * (frame >= 49.5)
+
+
+@pytest.fixture
+def estimated(run: Callable, make_level: Callable, known_motion: type) -> Callable[..., LevelResult]:
+    """Run two levels on a motion along x, in px by frame; return the last."""
+
+    def estimated(x_px: Callable[[float], float], timeline: Timeline) -> LevelResult:
+        motion = known_motion(lambda frame: translation(x_px(frame), 0))
+        return run(*(make_level(motion, number=number) for number in (1, 2)), timeline=timeline)[-1]
+
+    return estimated
+
+
+@pytest.mark.parametrize(
+    ("timeline", "given", "expected"),
+    [
+        (REGULAR, [(0, 40), (20, 60), (80, 120)], [(0, 40), (20, 60), (80, 120)]),
+        # The second part of the third group is short.
+        (
+            REGULAR.cut_at([cut_at(50)]),
+            [(0, 40), (20, 60), (48, 88), (80, 120)],
+            [(0, 40), (20, 50), (50, 60), (50, 88), (80, 120)],
+        ),
+        (REGULAR.cut_at([cut_at(50, FrameSpan(45, 56))]), [(30, 70)], [(30, 45), (56, 70)]),
+        (repeating(*range(31, 90)), [(0, 30), (30, 60), (50, 80), (90, 120)], [(0, 30), (90, 120)]),
+    ],
+    ids=["regular", "cut", "dark frames", "repeated frames"],
+)
+def test_groups_are_divided_at_cuts_and_leave_out_dark_and_repeated_frames(
+    timeline: Timeline, given: list[tuple[int, int]], expected: list[tuple[int, int]]
+) -> None:
+    assert timeline.parts(list(groups(*given))) == groups(*expected)
+
+
+def test_trajectory_jumps_at_cut_and_is_exact_beside_it(estimated: Callable[..., LevelResult]) -> None:
+    result = estimated(jumping, REGULAR.cut_at([cut_at(50)]))
+    # Between the outermost knots of each piece.
+    frames = np.r_[5:45, 55:115]
+    expected = [jumping(frame) - jumping(60) for frame in frames]
+    np.testing.assert_allclose(result.trajectory.at(frames)[:, 0, 2], expected, atol=1e-9)
+    assert not any(group.span.start < 50 < group.span.stop for group in result.groups)
+
+
+def test_shift_of_cut_is_that_of_trajectory_beyond_its_motion(known_motion: type) -> None:
+    moved = known_motion(lambda frame: translation(jumping(frame), -2 * (frame >= 49.5)))
+    np.testing.assert_allclose(cut_at(50).along(moved, (40, 60)).shift_px, [-7, 2], atol=1e-9)
+
+
+def test_repeated_frames_stand_still(estimated: Callable[..., LevelResult]) -> None:
+    """Every fifth frame is sent twice: the camera moves by 0.3 px in each of the others."""
+    timeline = repeating(*range(5, N_FRAMES, 6))
+    result = estimated(lambda frame: 0.3 * float(timeline.times(frame)), timeline)
+    steps = np.diff(result.trajectory.at(np.arange(10, 110))[:, 0, 2])
+    np.testing.assert_allclose(steps, np.where(np.arange(11, 110) % 6 == 5, 0, 0.3), atol=1e-9)
+
+
+def test_expected_error_grows_towards_cut_and_covers_jump_in_the_dark(estimated: Callable[..., LevelResult]) -> None:
+    whole = estimated(lambda frame: 0.3 * frame, REGULAR).uncertainty
+    cut = estimated(jumping, REGULAR.cut_at([cut_at(50)])).uncertainty
+    dark = estimated(jumping, REGULAR.cut_at([cut_at(50, FrameSpan(46, 54))])).uncertainty
+    assert cut.at([49])[0] > whole.at([49])[0]
+    np.testing.assert_array_equal(dark.at(np.arange(46, 54)) >= 7, True)
+    assert dark.at([45, 54]).max() < 2
+
+
+def test_decisions_name_cuts_jumps_in_the_dark_and_repeated_frames() -> None:
+    timeline = repeating(7, 8).cut_at([cut_at(50), cut_at(80, FrameSpan(75, 85))])
+    assert [(each.what, each.value, each.reason) for each in timeline.decisions] == [
+        ("repeated_frames", 2, "copies of the frame before; the motion stands still there"),
+        (
+            "cut",
+            50,
+            "the image jumps by 7 px (20 standard deviations) from the frame before to this one, as where frames are missing "
+            "or doubled; the interpolation is cut there",
+        ),
+        (
+            "jump_in_the_dark",
+            "frames 75 to 84",
+            "the image jumps by 7 px (20 standard deviations) while they show nothing; the interpolation is cut in the middle, "
+            "at frame 80",
+        ),
+    ]

@@ -1,16 +1,13 @@
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from photonpano.photometry import packed_along_width, packed_counts, reversed_bits
 
 
-@settings(deadline=None)
 @given(n=st.integers(0, 600), height=st.integers(1, 5), width=st.integers(1, 41), seed=st.integers(0, 2**32 - 1))
 def test_packed_counts_equals_sum_of_frames(n: int, height: int, width: int, seed: int) -> None:
     frames = np.random.default_rng(seed).integers(0, 2, (n, height, width), dtype=np.uint8)

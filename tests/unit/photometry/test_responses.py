@@ -1,11 +1,25 @@
-from __future__ import annotations
+"""Responses, contrast, tone, white balance and pictures."""
+
+from typing import get_args
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonpano.photometry import BinaryResponse, BinarySumResponse, IntensityResponse
+from photonpano.photometry import (
+    BinaryResponse,
+    BinarySumResponse,
+    IntensityResponse,
+    Tone,
+    balanced,
+    linear_to_srgb,
+    picture_of,
+    signal_to_noise,
+    srgb_to_linear,
+    tone_mapped,
+)
+from photonpano.testing import photographed
 
 RESPONSE = BinaryResponse()
 
@@ -111,3 +125,116 @@ def test_intensity_response_stabilises_noise(flux: float, n_frames: int) -> None
 
 def test_intensity_response_keeps_nan_of_unseen_pixels() -> None:
     assert np.isnan(GREY.stabilised(f32(np.nan), f32(0))).all()
+
+
+def waves(amplitude: float) -> np.ndarray:
+    """Flux whose arcsin(sqrt(mean count)) is a wave, much longer than the averaged blocks."""
+    x = np.arange(300)[None] + np.zeros((200, 1))
+    return -np.log1p(-(np.sin(np.pi / 4 + amplitude * np.sin(x / 20)) ** 2))
+
+
+@pytest.mark.parametrize(("amplitude", "frames"), [(0.05, 100), (0.2, 100), (0.05, 400)])
+def test_signal_to_noise_is_contrast_over_photon_noise(amplitude: float, frames: int) -> None:
+    """The standard deviation of a wave is its amplitude / sqrt(2), that of the noise of n frames 1 / (2 sqrt(n))."""
+    expected = amplitude / np.sqrt(2) * 2 * np.sqrt(frames)
+    assert signal_to_noise(photographed(waves(amplitude), frames)) == pytest.approx(expected, rel=0.05)
+
+
+def test_signal_to_noise_of_noise_is_near_0_also_with_unseen_pixels() -> None:
+    exposure = photographed(np.full((200, 300), 0.5), 100)
+    assert signal_to_noise(exposure) < 0.1
+    exposure.flux[:, :170], exposure.weight[:, :170] = np.nan, 0
+    assert signal_to_noise(exposure) < 0.1
+    exposure.flux[:], exposure.weight[:] = np.nan, 0
+    assert signal_to_noise(exposure) == 0
+
+
+def test_grey_world_makes_the_mean_grey_and_keeps_green() -> None:
+    flux = np.random.default_rng(0).uniform(0, [0.2, 1.0, 0.5], (20, 30, 3)).astype(np.float32)
+    flux[3] = np.nan
+    means = np.nanmean(balanced(flux, "grey-world"), axis=(0, 1))
+    assert means == pytest.approx(np.full(3, np.nanmean(flux[..., 1])), rel=1e-5)
+
+
+def test_factors_multiply_colours_and_leave_grey_images_alone() -> None:
+    flux = np.ones((2, 3, 3), np.float32)
+    assert balanced(flux, (2, 1, 0.5))[0, 0].tolist() == [2, 1, 0.5]
+    assert balanced(flux, "none") is flux
+    grey = flux[..., 0]
+    assert balanced(grey, (2, 1, 0.5)) is grey
+
+
+TONES = get_args(Tone)
+
+
+def night(colours: int = 0) -> np.ndarray:
+    """Stripes of 1 to 3 on light that falls by 100 dB from left to right; a corner is unknown."""
+    x = np.arange(240)
+    stripes = np.where(x // 6 % 2, 3.0, 1.0) * 10 ** (-5 * x / 240)
+    flux = np.tile(stripes, (60, 1)).astype(np.float32)
+    flux[:5, :5] = np.nan
+    return flux if not colours else np.repeat(flux[..., None], colours, axis=-1)
+
+
+def contrast(picture: np.ndarray, columns: slice) -> float:
+    """Standard deviation of the levels of a part."""
+    return float(picture[30, columns].astype(float).std())
+
+
+def test_picture_of_srgb_has_bytes_of_tone_mapped() -> None:
+    np.testing.assert_array_equal(picture_of(night(), 1.5), tone_mapped(night(), 1.5))
+
+
+@pytest.mark.parametrize("tone", TONES)
+@pytest.mark.parametrize("colours", [0, 3])
+def test_picture_of_keeps_shape_and_shows_unknown_pixels_black(tone: Tone, colours: int) -> None:
+    picture = picture_of(night(colours), 1.0, tone)
+    assert (picture.shape, picture.dtype) == (night(colours).shape, np.uint8)
+    assert (picture[:5, :5] == 0).all()
+    assert picture.max() == 255
+
+
+@pytest.mark.parametrize("tone", [tone for tone in TONES if tone != "srgb"])
+def test_picture_of_shows_details_at_both_ends(tone: Tone) -> None:
+    """Of a range of 100 dB, the sRGB curve shows the bright half only."""
+    bright, dark = slice(10, 40), slice(170, 200)
+    picture = picture_of(night(), 1.0, tone)
+    assert contrast(picture, bright) > 5
+    assert contrast(picture, dark) > 2
+    assert contrast(picture_of(night(), 1.0), dark) < 1
+
+
+@pytest.mark.parametrize("tone", TONES)
+def test_picture_of_grows_brighter_by_stops(tone: Tone) -> None:
+    levels = [int(picture_of(night(), 1.0, tone, stops)[30, 100:140].sum()) for stops in (-1.0, 0.0, 1.0)]
+    assert levels == sorted(levels)
+    assert levels[0] < levels[2]
+
+
+@pytest.mark.parametrize("tone", TONES)
+@pytest.mark.parametrize("level", [0.0, 0.3, np.nan])
+def test_picture_of_even_image_is_finite(tone: Tone, level: float) -> None:
+    picture = picture_of(np.full((40, 50), level, np.float32), 1.0, tone)
+    assert picture.shape == (40, 50)
+    assert (picture > 0).all() == (level > 0)
+
+
+def test_known_values_of_srgb() -> None:
+    """Values of the standard: middle grey of 8 bits, and the end of the linear part."""
+    np.testing.assert_allclose(srgb_to_linear(f32(0, 0.04045, 118 / 255, 1)), [0, 0.0031308, 0.18116, 1], rtol=1e-4)
+    np.testing.assert_allclose(linear_to_srgb(f32(0, 0.0031308, 0.5, 1)), [0, 0.04045, 0.73536, 1], rtol=1e-4)
+
+
+@given(st.floats(0, 1, width=32))
+def test_srgb_to_linear_inverts_linear_to_srgb(value: float) -> None:
+    np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(f32(value))), value, atol=1e-5)
+
+
+def test_linear_to_srgb_clips_and_keeps_nan() -> None:
+    np.testing.assert_allclose(linear_to_srgb(f32(-1, 2, np.nan)), f32(0, 1, np.nan), rtol=1e-6)
+
+
+def test_tone_mapped_is_white_at_white_flux_and_black_at_nan() -> None:
+    picture = tone_mapped(f32(0, 0.4, 0.2, 5, np.nan), white=0.4)
+    assert picture.dtype == np.uint8
+    np.testing.assert_array_equal(picture, [0, 255, 188, 255, 0])

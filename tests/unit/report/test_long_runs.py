@@ -1,7 +1,5 @@
 """What is done with every frame at the end of a run takes memory for its motion and little more, and pages do not grow."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,5 +1,6 @@
-from __future__ import annotations
+"""Pages of finished and failed runs: what they say, and that they need nothing from outside."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from ruamel.yaml import YAML
 from photonpano import FrameSpan, Group, LocationError, NotLocated
 from photonpano.motion.diagnosis import UntiedError
 from photonpano.report import figures, render_failure, render_report, residual_figures
+from photonpano.report.tables import failure_groups
 from photonpano.values import Edge
 
 TIMES = "\N{MULTIPLICATION SIGN}"
@@ -25,6 +27,23 @@ def no_figures(monkeypatch):
         monkeypatch.setattr(figures, name, lambda *_: "")
     for name in ("misfit_over_panorama", "over_sensor", "shifts_over_time"):
         monkeypatch.setattr(residual_figures, name, lambda *_: "")
+
+
+@pytest.fixture
+def page(record, explained, panorama, no_figures):
+    """Return the page of a run whose record is changed; `motion` holds changes of the motion."""
+
+    def page(rendered=panorama, motion=None, **changes):
+        found = explained if motion is None else replace(explained, motion=replace(explained.motion, **motion))
+        return render_report(record | changes, found, rendered)
+
+    return page
+
+
+@pytest.fixture
+def text(page):
+    """Return the text of such a page."""
+    return lambda *given, **changes: text_of(page(*given, **changes))
 
 
 def text_of(page: str) -> str:
@@ -60,23 +79,20 @@ def test_page_is_self_contained_and_deterministic(record, explained, panorama):
 
 
 @pytest.mark.parametrize(("share", "end"), [(0.0, ""), (0.012, "; 1.2 % of the pixels are saturated")])
-def test_page_shows_dynamic_range(record, explained, panorama, no_figures, share, end):
-    assert "dynamic range" not in text_of(render_report(record, explained, panorama))
+def test_page_shows_dynamic_range(record, text, share, end):
+    assert "dynamic range" not in text()
     measured = {"dynamic_range_db": 71.2, "measurable_range_db": 99.9, "saturated_share": share}
-    changed = record | {"panorama": record["panorama"] | measured}
-    text = text_of(render_report(changed, explained, panorama))
-    assert f"dynamic range 71 dB of 100 dB measurable{end} " in text
+    assert f"dynamic range 71 dB of 100 dB measurable{end} " in text(panorama=record["panorama"] | measured)
 
 
-def test_page_names_tone_in_place_of_white(record, explained, panorama, no_figures):
-    changed = record | {"spec": record["spec"] | {"render": {"tone": "local"}}}
-    text = text_of(render_report(changed, explained, panorama))
-    assert "shown with the tone local" in text
-    assert "white is" not in text
+def test_page_names_tone_in_place_of_white(record, text):
+    found = text(spec=record["spec"] | {"render": {"tone": "local"}})
+    assert "shown with the tone local" in found
+    assert "white is" not in found
 
 
-def test_page_shows_facts_warnings_and_failures(record, explained, panorama, no_figures):
-    text = text_of(render_report(record, explained, panorama))
+def test_page_shows_facts_warnings_and_failures(text, panorama):
+    found = text()
     height, width = panorama.canvas.shape
     for sentence in (
         "photonpano 0.1.0 done doubtful corridor-pan",
@@ -107,21 +123,22 @@ def test_page_shows_facts_warnings_and_failures(record, explained, panorama, no_
         "opencv-python-headless 5.0.0.93",
         "From examples/pipelines/corridor-pan.yaml , with all defaults filled in.",
     ):
-        assert sentence in text
+        assert sentence in found
 
 
-def test_page_counts_pairs_by_locator_if_a_fallback_located_some(record, explained, panorama, no_figures):
-    assert "located by" not in text_of(render_report(record, explained, panorama))
+def test_page_counts_pairs_by_locator_if_a_fallback_located_some(record, text):
+    assert "located by" not in text()
     for level, counts in zip(record["levels"], ((39, 0), (67, 1), (150, 6)), strict=True):
         level["located_by"] = dict(zip(("direct", "opencv-sift"), counts, strict=True))
-    text = text_of(render_report(record, explained, panorama))
-    assert "Level 1:" not in text
-    assert "Level 2: 67 pairs located by direct , 1 pair located by opencv-sift ." in text
-    assert "Level 3: 150 pairs located by direct , 6 pairs located by opencv-sift ." in text
+    found = text()
+    assert "Level 1:" not in found
+    assert "Level 2: 67 pairs located by direct , 1 pair located by opencv-sift ." in found
+    assert "Level 3: 150 pairs located by direct , 6 pairs located by opencv-sift ." in found
 
 
-def test_level_table_has_one_row_per_level(record, explained, panorama, no_figures):
-    tree = ElementTree.fromstring(render_report(record, explained, panorama))
+def test_page_has_the_resolved_spec_and_a_row_for_each_level_with_names_for_a_phone(record, page):
+    tree = ElementTree.fromstring(page())
+    assert YAML(typ="safe").load("".join(tree.find(".//pre").itertext())) == record["spec"]
     [table] = [table for table in tree.iter("table") if "levels" in table.get("class", "")]
     rows = [["".join(cell.itertext()) for cell in row] for row in table.find("tbody")]
     dash = "\N{EN DASH}"
@@ -130,17 +147,13 @@ def test_level_table_has_one_row_per_level(record, explained, panorama, no_figur
         ["2", "1", "79", "250", "78", "78", "10", "11 of 12", "1.83", "0.1", "0.21", "0.00", "4.76", "18.37", "0.04"],
         ["3", "1", "157", "250", "157", "156", "0", "22 of 24", "0.063", "0.07", "0.14", "0.00", "9.46", "36.50", "0.08"],
     ]
-
-
-def test_page_shows_resolved_spec(record, explained, panorama, no_figures):
-    tree = ElementTree.fromstring(render_report(record, explained, panorama))
-    assert YAML(typ="safe").load("".join(tree.find(".//pre").itertext())) == record["spec"]
+    assert all(cell.get("data-name") for row in table.find("tbody") for cell in row)
 
 
 HOSTILE = '</pre></style><script>alert("1")</script><img src="http://example.org/x.png"/>&amp;'
 
 
-def test_page_escapes_all_input(record, explained, panorama, no_figures):
+def test_page_escapes_all_input(record, page):
     record["spec_file"] = HOSTILE
     record["status"] = HOSTILE
     record["warnings"] = [HOSTILE]
@@ -151,31 +164,19 @@ def test_page_escapes_all_input(record, explained, panorama, no_figures):
     record["verdict"]["reasons"][0].update(where=HOSTILE, what_to_do=HOSTILE)
     record["refinements"][0].update(use=HOSTILE, rounds=[HOSTILE])
     record["libraries"][HOSTILE] = HOSTILE
-    page = render_report(record, explained, panorama)
-    check_self_contained(page)
-    assert "<script>" not in page
-    assert text_of(page).count('<script>alert("1")</script>') == 13
+    found = page()
+    check_self_contained(found)
+    assert "<script>" not in found
+    assert text_of(found).count('<script>alert("1")</script>') == 13
 
 
-def test_page_of_trusted_run_has_no_doubts(record, explained, panorama, no_figures):
-    record["verdict"] = {"status": "trusted", "reasons": [], "residual_ratio": None}
-    text = text_of(render_report(record, explained, panorama))
-    assert "photonpano 0.1.0 done trusted corridor-pan" in text
-    assert "Do not rely" not in text
-    assert "scatter of short spans" not in text
-
-
-def test_page_without_gaps_says_all_frames_located(record, explained, motion, panorama, no_figures):
-    page = render_report(record, replace(explained, motion=replace(motion, located=np.ones_like(motion.located))), panorama)
-    assert "All frames were located." in text_of(page)
-    assert "Shaded" not in page
-
-
-def test_page_counts_gaps_beyond_the_first_dozen(record, explained, motion, panorama, no_figures):
-    located = np.arange(len(motion.located)) % 100 > 0
-    text = text_of(render_report(record, replace(explained, motion=replace(motion, located=located)), panorama))
-    assert "100 frames of 10,000 were not located: 0; 100; 200;" in text
-    assert "1,000; 1,100 and 88 further spans" in text
+def test_page_lists_gaps_of_the_motion(page, text):
+    whole = page(motion={"located": np.ones(10_000, bool)})
+    assert "All frames were located." in text_of(whole)
+    assert "Shaded" not in whole
+    found = text(motion={"located": np.arange(10_000) % 100 > 0})
+    assert "100 frames of 10,000 were not located: 0; 100; 200;" in found
+    assert "1,000; 1,100 and 88 further spans" in found
 
 
 def test_page_omits_time_without_frame_rate(record, explained, panorama):
@@ -186,17 +187,13 @@ def test_page_omits_time_without_frame_rate(record, explained, panorama):
     assert "time (" not in page
 
 
-def test_page_has_title_without_spec_file(record, explained, panorama, no_figures):
-    record["spec_file"] = None
-    text = text_of(render_report(record, explained, panorama))
-    assert "A run without a spec file" in text
-    assert "From " not in text
-
-
-def test_page_reduces_large_panorama(record, explained, panorama, no_figures):
+def test_page_has_title_without_spec_file_and_reduces_large_panorama(page, text, panorama):
     large = replace(panorama, picture=np.repeat(panorama.picture, 2, axis=1))
-    assert "Reduced for this page; panorama.png has all pixels." in text_of(render_report(record, explained, large))
-    assert "Reduced for this page" not in render_report(record, explained, panorama)
+    found = text(large, spec_file=None)
+    assert "A run without a spec file" in found
+    assert "From " not in found
+    assert "Reduced for this page; panorama.png has all pixels." in found
+    assert "Reduced for this page" not in page()
 
 
 @pytest.fixture
@@ -236,75 +233,81 @@ def test_page_of_failed_run_shows_exposures_that_did_not_match(failed, record, e
     ]
 
 
-def test_page_of_failed_run_escapes_its_reasons(failed):
-    failed["warnings"] = [HOSTILE]
-    page = render_failure(failed, untied(reason=HOSTILE))
+def test_page_of_failed_run_escapes_its_reasons_and_has_its_message_alone_if_it_failed_otherwise(failed):
+    page = render_failure(failed | {"warnings": [HOSTILE]}, untied(reason=HOSTILE))
     check_self_contained(page)
     assert "<script>" not in page
-
-
-def test_page_of_run_that_failed_otherwise_has_its_message_alone(failed):
     page = render_failure(failed, LocationError("frames reach the horizon\n  and more"))
     check_self_contained(page)
     assert "The run failed: frames reach the horizon. and more The run folder" in text_of(page)
     assert "<svg" not in page
 
 
-def test_page_says_verdict_in_words(record, explained, panorama, no_figures):
+def test_page_says_verdict_in_words(record, text):
     record["motion"] = {"std_px": 0.1234, "worst_std_px": 1.5, "worst_frame": 9874}
     expected = (
         "The motion is expected to err by 0.12 px at the corners of a frame, and by 1.5 px at worst (frame 9,874). "
         "250 frames of 10,000 were not located."
     )
-    assert f"This panorama is doubtful: 1 thing speaks against it. {expected}" in text_of(
-        render_report(record, explained, panorama)
-    )
-    record["verdict"] = {"status": "trusted", "reasons": [], "residual_ratio": 1.04}
+    assert f"This panorama is doubtful: 1 thing speaks against it. {expected}" in text()
+    trusted = {"status": "trusted", "reasons": [], "residual_ratio": 1.04}
     words = (
         "This panorama can be relied on: motion and panorama explain the photons, and short spans of frames scatter 1.04 times"
     )
-    assert f"{words} as much as noise does. {expected}" in text_of(render_report(record, explained, panorama))
+    assert f"{words} as much as noise does. {expected}" in text(verdict=trusted)
+    unknown = text(verdict=trusted | {"residual_ratio": None})
+    assert "photonpano 0.1.0 done trusted corridor-pan" in unknown
+    assert "Do not rely" not in unknown
+    assert "scatter of short spans" not in unknown
 
 
-def test_page_lists_a_folder_once(record, explained, panorama, no_figures):
+def test_page_lists_a_folder_once(page):
     names = [f"exposures/level-1-{k:04d}.png" for k in range(4000)] + ["colmap/0/images.txt"]
-    record["files"] = {name: {"bytes": 1024, "sha256": "0" * 64} for name in names}
-    page = render_report(record, explained, panorama)
-    links = [element.attrib["href"] for element in ElementTree.fromstring(page).iter("a")]
+    found = page(files={name: {"bytes": 1024, "sha256": "0" * 64} for name in names})
+    links = [element.attrib["href"] for element in ElementTree.fromstring(found).iter("a")]
     assert links == ["./exposures/", "./run.json", "./colmap/"]
-    assert "exposures/ 3.91 MiB 4,000 files: the exposures of each level, linear flux and pictures" in text_of(page)
-    assert "colmap/ 1 KiB 1 file" in text_of(page)
+    assert "exposures/ 3.91 MiB 4,000 files: the exposures of each level, linear flux and pictures" in text_of(found)
+    assert "colmap/ 1 KiB 1 file" in text_of(found)
 
 
-def test_page_links_files_of_the_run(record, explained, panorama, no_figures):
+def test_page_links_files_of_the_run(page):
     names = ["strange #1?.txt", "panorama.tiff", "report.html", *(f"image-{k:02d}.png" for k in range(40))]
-    record["files"] = {name: {"bytes": 2048, "sha256": "0" * 64} for name in names}
-    page = render_report(record, explained, panorama)
-    check_self_contained(page)
-    tree = ElementTree.fromstring(page)
-    links = [element.attrib["href"] for element in tree.iter("a")]
+    found = page(files={name: {"bytes": 2048, "sha256": "0" * 64} for name in names})
+    check_self_contained(found)
+    links = [element.attrib["href"] for element in ElementTree.fromstring(found).iter("a")]
     assert links[:3] == ["./panorama.tiff", "./run.json", "./image-00.png"]
     assert len(links) == 30
-    assert "And 13 files more; run.json lists all." in text_of(page)
-    record["files"] = {"strange #1?.txt": {"bytes": 5, "sha256": "0" * 64}}
-    assert 'href="./strange%20%231%3F.txt"' in render_report(record, explained, panorama)
+    assert "And 13 files more; run.json lists all." in text_of(found)
+    assert 'href="./strange%20%231%3F.txt"' in page(files={"strange #1?.txt": {"bytes": 5, "sha256": "0" * 64}})
 
 
-def test_level_table_names_its_numbers_on_a_phone(record, explained, panorama, no_figures):
-    tree = ElementTree.fromstring(render_report(record, explained, panorama))
-    [table] = [table for table in tree.iter("table") if "levels" in table.get("class", "")]
-    assert all(cell.get("data-name") for row in table.find("tbody") for cell in row)
-
-
-def test_import_of_report_is_light():
-    heavy = ["jinja2", "matplotlib", "ruamel.yaml"]
-    code = f"import sys, photonpano.report; print([name for name in {heavy} if name in sys.modules])"
+def test_report_imports_no_library_before_it_draws_and_never_pyplot():
+    code = (
+        "import sys, photonpano.report; print(sorted(sys.modules)); "
+        "from photonpano.report.figures import stage_times; stage_times([], None); print(sorted(sys.modules))"
+    )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+    before, after = map(ast.literal_eval, result.stdout.splitlines())
+    assert not {"jinja2", "matplotlib", "ruamel.yaml"} & set(before)
+    assert "matplotlib.figure" in after
+    assert "matplotlib.pyplot" not in after
 
 
-def test_figures_do_not_import_pyplot():
-    code = "import sys; from photonpano.report.figures import stage_times; stage_times([], None); print(sorted(sys.modules))"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "matplotlib.figure" in result.stdout
-    assert "matplotlib.pyplot" not in result.stdout
+def failure(start: int, reason: str) -> dict:
+    return {"moving": [start, start + 5], "fixed": [start + 5, start + 10], "reason": reason}
+
+
+def test_failure_groups_ignore_numbers_in_reasons():
+    levels = [
+        {"level": 1, "failures": [failure(0, "too dark"), *(failure(k, f"only {k} of -3.5 agree") for k in range(5))]},
+        {"level": 2, "failures": [failure(9, "too dark"), failure(19, "too dark")]},
+    ]
+    groups = failure_groups(levels)
+    assert [(group.level, len(group.failures), group.reason) for group in groups] == [
+        (1, 5, "only 0 of -3.5 agree"),
+        (1, 1, "too dark"),
+        (2, 2, "too dark"),
+    ]
+    assert [group.alike for group in groups] == [False, True, True]
+    assert [group.more for group in groups] == [2, 0, 0]
+    assert [pair["moving"][0] for pair in groups[0].examples] == [0, 1, 2]

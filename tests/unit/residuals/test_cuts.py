@@ -1,7 +1,5 @@
 """Jumps of the image are found to the frame; tremor, turns and noise are not taken for jumps."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable
 

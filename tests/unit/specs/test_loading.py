@@ -1,16 +1,20 @@
-"""Files and Python data on their way to a plan."""
+"""What becomes of a spec: defaults, corrections and outcomes."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
+from ruamel.yaml import YAML, YAMLError
 
 from photonpano import Config, ExporterContribution, PluginError, SpecError
 from photonpano.registry import Catalog
 from photonpano.registry.description import snippet
-from photonpano.specs import builtin, load_spec, parse_spec
+from photonpano.specs import builtin, json_schema, load_spec, parse_spec
 
 MINIMAL = {"version": 1, "source": {"use": "simulator"}}
 
@@ -200,3 +204,114 @@ def test_reading_specs_imports_nothing_heavy():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr) == (0, "")
+
+
+def spec(*corrections: Any) -> dict[str, Any]:
+    return {"version": 1, "source": {"use": "simulator"}, "corrections": list(corrections)}
+
+
+def test_correction_paths_are_relative_to_spec(catalog: Catalog, tmp_path: Path) -> None:
+    np.save(tmp_path / "bad.npy", np.zeros((2, 2), bool))
+    plan = parse_spec(spec({"mask": {"file": "bad.npy"}}), directory=tmp_path, catalog=catalog)
+    assert plan.document["corrections"] == [{"mask": {"file": str(tmp_path / "bad.npy")}}]
+    assert parse_spec(plan.document, catalog=catalog).corrections == plan.corrections
+
+
+def test_missing_correction_file_is_an_error_at_its_place(catalog: Catalog, tmp_path: Path) -> None:
+    path = tmp_path / "scan.yaml"
+    path.write_text(
+        "version: 1\n"
+        "source: {use: simulator}\n"
+        "corrections:\n"
+        "  - mask: {file: bad.npy}\n"
+        "  - dark-counts:\n"
+        "      dark: dark.npz\n"
+        "  - hot-pixels\n"
+    )
+    with pytest.raises(SpecError) as caught:
+        load_spec(path, catalog=catalog)
+    assert str(caught.value) == (
+        f"{path}:4:18: corrections.0.mask.file: there is no file {tmp_path / 'bad.npy'}; check the path\n"
+        f"{path}:6:13: corrections.1.dark-counts.dark: there is no file {tmp_path / 'dark.npz'}; check the path"
+    )
+
+
+@pytest.mark.parametrize(("written", "still"), [({}, True), ({"corrections": "auto"}, True), ({"corrections": []}, False)])
+def test_still_pixels_are_masked_unless_corrections_are_listed(written: dict[str, Any], still: bool, catalog: Catalog) -> None:
+    plan = parse_spec({"version": 1, "source": {"use": "simulator"}} | written, catalog=catalog)
+    assert (plan.corrections, plan.corrects_itself) == ((), still)
+    assert parse_spec(plan.document, catalog=catalog).corrects_itself == still
+    assert list(plan.document)[:3] == ["version", "source", "corrections"]
+
+
+SPECS = Path(__file__).parents[2] / "specs"
+GOOD = sorted((SPECS / "good").glob("*.yaml"))
+BAD = sorted((SPECS / "bad").glob("*.yaml"))
+BEYOND_A_SCHEMA = {
+    "fallback_again",
+    "lens_of_homographies",
+    "projection_of_homographies",
+    "source_check",
+    "start_of_rotations",
+    "surrogate",
+    "validator",
+}
+"""What is wrong here is not wrong by its shape; the files that are no YAML are left out by themselves."""
+
+
+def name(path):
+    return path.stem
+
+
+def data(path):
+    """Return what an editor sees, None where there is no document to check."""
+    try:
+        return YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except (YAMLError, UnicodeDecodeError, ValueError, TypeError, RecursionError):
+        return None
+
+
+@pytest.fixture(scope="module")
+def validator(catalog):
+    schema = json_schema(catalog)
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+@pytest.mark.parametrize("path", BAD, ids=name)
+def test_bad_spec_gives_exactly_these_messages(path, catalog, monkeypatch):
+    monkeypatch.chdir(path.parent)
+    with pytest.raises(SpecError) as caught:
+        load_spec(path.name, catalog=catalog)
+    assert f"{caught.value}\n" == path.with_suffix(".txt").read_text(encoding="utf-8")
+    assert {problem.file for problem in caught.value.problems} == {Path(path.name)}
+
+
+@pytest.mark.parametrize("path", GOOD, ids=name)
+def test_good_spec_resolves_to_document_that_resolves_to_itself(path, catalog, validator):
+    plan = load_spec(path, catalog=catalog)
+    again = parse_spec(json.loads(json.dumps(plan.document)), catalog=catalog)
+    assert again.document == plan.document
+    assert (
+        again.source,
+        again.corrections,
+        again.levels,
+        again.refine,
+        again.graph,
+        again.render,
+        again.output,
+        again.run,
+    ) == ((plan.source, plan.corrections, plan.levels, plan.refine, plan.graph, plan.render, plan.output, plan.run))
+    validator.validate(plan.document)
+
+
+@pytest.mark.parametrize("path", GOOD, ids=name)
+def test_good_spec_is_valid_for_editors(path, validator):
+    validator.validate(data(path))
+
+
+@pytest.mark.parametrize("path", BAD, ids=name)
+def test_bad_spec_is_marked_by_editors(path, validator):
+    document = data(path)
+    if document is not None:
+        assert validator.is_valid(document) == (path.stem in BEYOND_A_SCHEMA)

@@ -4,8 +4,6 @@ Each case is a title, sections that are added to a minimal spec, and overrides. 
 Outcomes are written anew by `python tests/unit/specs/test_outcomes.py`; read what has changed before you commit it.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

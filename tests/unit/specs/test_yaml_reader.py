@@ -4,7 +4,7 @@ import json
 import string
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
@@ -100,14 +100,12 @@ documents = st.recursive(
 )
 
 
-@settings(deadline=None)  # the machine may be busy
 @given(documents)
 def test_yaml_reader_reads_json(document):
     """JSON is YAML, up to whole floats such as 1e16, which are read as integers."""
     assert read(json.dumps(document, ensure_ascii=False)).plain() == document
 
 
-@settings(deadline=None)  # the machine may be busy
 @given(st.text(string.ascii_letters + string.digits + " \n:-[]{},&*!|>'\"#%@`?<", max_size=40))
 def test_any_text_gives_value_or_problem(text):
     problems = []

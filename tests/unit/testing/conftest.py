@@ -1,7 +1,5 @@
 """Run single checks of the kit on components, most of them broken on purpose, and a small capture with them."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -134,12 +132,10 @@ def catalog(frames: np.ndarray) -> Catalog:
 
 
 @pytest.fixture
-def outcome_of(
-    catalog: Catalog, tmp_path: Path, capsys: pytest.CaptureFixture[str], heeded: None, without_report: None
-) -> Callable[..., Outcome]:
+def outcome_of(catalog: Catalog, tmp_path: Path, capsys: pytest.CaptureFixture[str], heeded: None) -> Callable[..., Outcome]:
     """Run the small capture as the command line does, with contributions of a strange plugin, over an earlier run.
 
-    SIGINT is handled as by the program. The report is left out, which takes longer than the rest of a small run.
+    SIGINT is handled as by the program.
     """
     earlier = tmp_path / "run" / "panorama.png"
 

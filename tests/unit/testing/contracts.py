@@ -1,7 +1,5 @@
 """Components that break a contract: how they differ from a good component. What is said of them stands in contracts.txt."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import count
@@ -217,6 +215,7 @@ BROKEN: Mapping[str, Mapping[str, Change]] = {
         "errors of text": refined(lambda found, std: Refined(found, std.astype(str), "text")),
         "fewer frames": refined(lambda found, std: Refined(found[1:], std[1:], "short")),
         "NaN": refined(lambda found, std: Refined(found * np.nan, std, "NaN")),
+        "one NaN": refined(lambda found, std: Refined(found, np.where(np.arange(len(std)) == 17, np.nan, std), "hollow")),
         "negative errors": refined(lambda found, std: Refined(found, -std, "sure")),
         "flat homographies": refined(lambda found, std: Refined(found * [[1], [0], [1]], std, "flat")),
         "infinite errors": refined(lambda found, std: Refined(found, std + np.inf, "unsure")),

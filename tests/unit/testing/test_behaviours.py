@@ -1,8 +1,10 @@
-"""What a component does wrong although it keeps its contract is found by one check of the kit each."""
+"""What a component does wrong although it keeps its contract is found by one check of the kit each.
 
-from __future__ import annotations
+What the check says of each is a regular expression in behaviours.txt.
+"""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +16,7 @@ from photonpano.testing.stages import AnswerConformance
 from . import images, motions
 from .conftest import known_path
 
+GOLDEN = dict(line.split(" -> ") for line in Path(__file__).with_name("behaviours.txt").read_text().splitlines())
 GOOD = {
     testing.ResamplerConformance: (motions.Hundreds, motions.RESAMPLERS),
     testing.MergerConformance: (images.merger, images.MERGERS),
@@ -23,25 +26,28 @@ GOOD = {
     testing.RendererConformance: (images.renderer, images.RENDERERS),
     testing.PoseEstimatorConformance: (motions.turning_refused(known_path), motions.pose_estimators(known_path)),
 }
-ROWS = [(kit, *row) for kit, (_, rows) in GOOD.items() for row in rows]
+BROKEN = {f"{kit.kind}, {name}": (kit, build) for kit, (_, builds) in GOOD.items() for name, build in builds.items()}
 
 
-@pytest.mark.parametrize(("kit", "check", "broken", "words"), ROWS, ids=[f"{kit.kind}-{check}" for kit, check, *_ in ROWS])
-def test_check_fails_on_broken_component(
-    kit: type, check: str, broken: Callable[[Any], Any], words: str, catches: Callable[..., None]
-) -> None:
-    catches(kit, check, broken, words)
+def check_of(name: str) -> str:
+    return f"test_{name.partition(',')[0]}"
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_check_fails_on_broken_component(name: str, catches: Callable[..., None]) -> None:
+    kit, broken = BROKEN[name]
+    catches(kit, check_of(name.partition(", ")[2]), broken, GOLDEN[name])
 
 
 @pytest.mark.parametrize("kit", GOOD)
 def test_good_component_passes_and_every_check_has_a_broken_one(
     kit: Any, checks_of: Callable[..., set[str]], failure: Callable[..., str | None]
 ) -> None:
-    good, rows = GOOD[kit]
+    good, broken = GOOD[kit]
     record = {"check": lambda _, stream: ["too short"] if stream.n_frames < 100 else []} if kit.kind == "resampler" else {}
     for check in checks_of(kit, Conformance):
         assert failure(kit, check, good, record=record) is None, check
-    assert checks_of(kit, AnswerConformance) == {check for check, *_ in rows}
+    assert checks_of(kit, AnswerConformance) == set(map(check_of, broken))
 
 
 INFORMATION = "test_information_is_inverse_covariance_of_errors"
@@ -74,7 +80,7 @@ DARK = "test_dark_counts_are_subtracted_or_source_is_refused"
         ),
         (
             testing.LocatorConformance,
-            "test_different_places_are_not_located",
+            PLACES,
             motions.locator,
             {"motions": (), "shape": (48, 64)},
         ),

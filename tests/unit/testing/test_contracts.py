@@ -1,7 +1,5 @@
 """What breaks a contract is refused with the same sentence, that of contracts.txt, by the conformance kit and by a run."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

@@ -1,22 +1,20 @@
-"""Plugins that raise whatever can be raised, wherever they are called."""
-
-from __future__ import annotations
+"""Plugins that misbehave: whatever they raise, wherever they are called, and before a run begins."""
 
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from itertools import count
+from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import Field, model_validator
 
-from photonpano import FrameSpan, hookimpl
-from photonpano.errors import described
-from photonpano.registry import Observer
-from photonpano.registry.plugins import observation_of
+from photonpano import Config, FrameSpan, MergerContribution, SourceContribution
+from photonpano.registry import Catalog
 from photonpano.testing import KnownMotion
 
-from .strange import ERRORS, ORIGIN, Around, Odd, Outcome, around, instead, raising, require_named
+from .strange import ERRORS, KINDS, Around, Keys, Outcome, SpeechlessError, around, instead, raising, require_named
 
 
 def failing_at(start: int, stop: int, error: BaseException) -> Callable[[Any], Any]:
@@ -61,20 +59,20 @@ PLACES: Mapping[str, tuple[str, Callable[[BaseException], Callable[[Any], Any]],
 }
 
 
-@pytest.mark.parametrize(("error", "words"), ERRORS.values(), ids=ERRORS)
-@pytest.mark.parametrize(("kind", "change", "message"), PLACES.values(), ids=PLACES)
-def test_exception_of_any_kind_names_plugin(
-    misbehaving: Callable[..., Outcome],
-    kind: str,
-    change: Callable[[BaseException], Callable[[Any], Any]],
-    message: str,
-    error: BaseException,
-    words: str,
-) -> None:
+# All errors where components are built, where they work, and where a trajectory is asked; two of them elsewhere.
+OFTEN = {"build a source", "counts", "merge", "at, after the fit"}
+
+
+@pytest.mark.parametrize(
+    ("place", "error"),
+    [(place, error) for place in PLACES for error in ERRORS if place in OFTEN or error in ("an error", "KeyboardInterrupt")],
+)
+def test_exception_of_any_kind_names_plugin(misbehaving: Callable[..., Outcome], place: str, error: str) -> None:
+    (kind, change, message), (error, words) = PLACES[place], ERRORS[error]
     require_named(misbehaving(kind, change(error)), kind, message + words)
 
 
-@pytest.mark.parametrize("error", [OSError("gone"), SystemExit(0), KeyboardInterrupt(), Odd("stop")], ids=repr)
+@pytest.mark.parametrize("error", [OSError("gone"), KeyboardInterrupt()], ids=repr)
 def test_source_that_cannot_be_closed_is_warned_of(misbehaving: Callable[..., Outcome], error: BaseException) -> None:
     """The results are whole: what was read is not affected."""
     outcome = misbehaving("source", instead("close", raising(error)))
@@ -83,25 +81,82 @@ def test_source_that_cannot_be_closed_is_warned_of(misbehaving: Callable[..., Ou
     assert {"panorama.png", "run.json", "trajectory.npz"} <= set(outcome.files)
 
 
-@pytest.mark.parametrize("error", [SystemExit(0), KeyboardInterrupt(), Odd("stop")], ids=repr)
-@pytest.mark.parametrize("hook", ["photonpano_run_started", "photonpano_stage_finished", "photonpano_run_finished"])
-def test_observer_cannot_end_a_run(outcome_of: Callable[..., Outcome], hook: str, error: BaseException) -> None:
-    class Watching:
-        pass
-
-    setattr(Watching, hook, staticmethod(hookimpl(raising(error))))
-    relay = observation_of(Watching())
-    assert relay is not None
-    outcome = outcome_of({}, observers=(Observer(ORIGIN, relay),))
-    assert outcome.code == 0
-    assert outcome.printed.startswith(
-        f"warning: {hook} of strange-plugin 1.2 (strange = strange.hooks) raised {described(error)};"
-    )
-    assert "panorama.png" in outcome.files
-
-
 def test_signal_while_a_plugin_works_is_an_interrupt(misbehaving: Callable[..., Outcome]) -> None:
     """A resampler works in the main thread, which Ctrl-C interrupts."""
     outcome = misbehaving("resampler", instead("groups", lambda *_: signal.raise_signal(signal.SIGINT)))
     assert (outcome.code, outcome.files) == (130, [])
     assert "strange" not in outcome.printed
+
+
+def strange(contribution: Any, **fields: Any) -> Any:
+    """Make a contribution that must not be built."""
+    fields = {"config": Keys, "build": raising(AssertionError("not built"))} | fields
+    return contribution(name="strange", summary="Strange", **fields)
+
+
+@pytest.mark.parametrize(
+    ("kind", "error"), [(kind, error) for kind in KINDS for error in ERRORS if kind == "source" or error == "BaseException"]
+)
+def test_check_that_raises_is_a_problem_of_the_spec(outcome_of: Callable[..., Outcome], kind: str, error: str) -> None:
+    section, contribution, _ = KINDS[kind]
+    raised, words = ERRORS[error]
+    sections = {section: [{"use": "strange"}] if kind == "refiner" else {"use": "strange"}}
+    outcome = outcome_of(sections, strange(contribution, check=raising(raised)))
+    where = "refine.0" if kind == "refiner" else section
+    problem = f"{where}: the check of the {kind} 'strange' of strange-plugin 1.2 raised {words}\n"
+    assert outcome.printed == problem + "error: the spec has 1 problem\n"
+    assert (outcome.code, outcome.files) == (2, [])
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        (None, "raised TypeError: 'NoneType' object is not iterable"),
+        (3, "raised TypeError: 'int' object is not iterable"),
+        ([SpeechlessError()], "raised RuntimeError: no words"),
+    ],
+    ids=["None", "a number", "no words"],
+)
+def test_check_that_returns_no_sentences_is_a_problem_of_the_spec(
+    outcome_of: Callable[..., Outcome], found: Any, words: str
+) -> None:
+    outcome = outcome_of({"source": {"use": "strange"}}, strange(SourceContribution, check=lambda _: found))
+    named = f"source: the check of the source 'strange' of strange-plugin 1.2 {words}"
+    assert outcome.printed == f"{named}\nerror: the spec has 1 problem\n"
+    assert outcome.code == 2
+
+
+def test_check_with_sentences_without_end_is_cut(outcome_of: Callable[..., Outcome]) -> None:
+    outcome = outcome_of({"source": {"use": "strange"}}, strange(SourceContribution, check=lambda _: map(str, count())))
+    assert outcome.code == 2
+    assert outcome.printed.endswith("source: 99\nerror: the spec has 100 problems\n")
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=ERRORS)
+def test_config_that_raises_is_a_problem_of_the_spec(outcome_of: Callable[..., Outcome], error: str) -> None:
+    raised, words = ERRORS[error]
+
+    class Raising(Config):
+        size: int = Field(1, description="any")
+
+        @model_validator(mode="before")
+        @classmethod
+        def fails(cls, _: Any) -> Any:
+            raise raised
+
+    outcome = outcome_of({"merge": {"use": "strange"}}, strange(MergerContribution, config=Raising))
+    named = f"the config of the merger 'strange' of strange-plugin 1.2 raised {words}"
+    assert outcome.printed == f"merge.with: {named}\nerror: the spec has 1 problem\n"
+    assert outcome.code == 2
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=ERRORS)
+def test_source_that_raises_on_recognising_is_named(
+    catalog: Catalog, outcome_of: Callable[..., Outcome], tmp_path: Path, error: str
+) -> None:
+    raised, words = ERRORS[error]
+    (tmp_path / "cube.odd").write_bytes(b"odd")
+    sections = {"source": {"use": "auto", "with": {"path": str(tmp_path / "cube.odd")}}}
+    outcome = outcome_of(sections, strange(SourceContribution, recognise=raising(raised)))
+    assert f"recognise of the source 'strange' of strange-plugin 1.2 raised {words}" in outcome.printed
+    assert (outcome.code, outcome.files) == (2, [])

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 
@@ -11,6 +9,8 @@ from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource, SourceConformance
 from photonpano.testing.conformance import Conformance
 
+from .test_behaviours import GOLDEN, check_of
+
 FRAMES = SourceConformance().known_frames()
 
 
@@ -19,123 +19,67 @@ class Honest(MemorySource):
         super().__init__(FRAMES.copy())
 
 
-class HasNoMask(Honest):
-    def __init__(self, context):
-        super().__init__(context)
-        del self.valid
+def having(change=lambda _: None, **methods):
+    """Return a source with other methods, or with what is done to it when it is made."""
+
+    def changed(self, context):
+        Honest.__init__(self, context)
+        change(self)
+
+    for name, method in methods.items():
+        method.__name__ = name  # as checks name it
+    return type("Toy", (Honest,), {"__init__": changed, **methods})
 
 
-class PromisesMore(Honest):
-    def __init__(self, context):
-        super().__init__(context)
-        self.info = replace(self.info, width=32)
+def counts_as(change):
+    return having(counts=lambda self, span: change(Honest.counts(self, span)))
 
 
-class NotBinary(Honest):
-    def frames(self, span):
-        return super().frames(span) * 3
+def frames_as(change):
+    return having(frames=lambda self, span: change(Honest.frames(self, span)))
 
 
-class BadPixels(Honest):
-    """Its mask is true for unusable pixels."""
-
-    def __init__(self, context):
-        super().__init__(context)
-        self.valid = ~self.valid
+def info(**fields):
+    return having(lambda source: setattr(source, "info", replace(source.info, **fields)))
 
 
-class CountsInFloat(Honest):
-    def counts(self, span):
-        return super().counts(span).astype(np.float32)
+def bad_pixels(source):
+    """Make the mask true for unusable pixels."""
+    source.valid = ~source.valid
 
 
-class CountsTooMuch(Honest):
-    def counts(self, span):
-        return super().counts(span) * 2
+def left_to_chance(source):
+    source.valid = np.random.Generator(np.random.get_bit_generator()).random(source.info.frame_shape) > 0.1  # the fault
 
 
-class RateOfText(Honest):
-    def __init__(self, context):
-        super().__init__(context)
-        self.info = replace(self.info, frame_rate_hz="fast")
+def one_more(self, span):
+    """Include the stop of a span."""
+    return Honest.counts(self, FrameSpan(span.start, min(span.stop + 1, self.info.n_frames)))
 
 
-class NarrowCounts(Honest):
-    def counts(self, span):
-        return super().counts(span).astype(np.uint16)
+def what_there_is(self, span):
+    self.info.require(FrameSpan(0, 1))
+    return self._frames[span.start : span.stop].sum(axis=0, dtype=np.uint32)
 
 
-class CountsOneMore(Honest):
-    """Includes the stop of a span."""
-
-    def counts(self, span):
-        return super().counts(FrameSpan(span.start, min(span.stop + 1, self.info.n_frames)))
+def lent_frames(self, span):
+    self.info.require(span)
+    return self._frames[span.start : span.stop]
 
 
-class CountsFromTheEnd(Honest):
-    """Frames of a span come backwards."""
-
-    def frames(self, span):
-        return super().frames(span)[::-1]
+def in_one_buffer(self, span):
+    self.buffer[:] = Honest.counts(self, span)
+    return self.buffer
 
 
-class SwapsRows(Honest):
-    def frames(self, span):
-        return super().frames(span)[:, ::-1]
+def packing(**options):
+    return having(packed=lambda self, span: np.packbits(self.frames(span), axis=-1, **options))
 
 
-class GivesWhatThereIs(Honest):
-    def counts(self, span):
-        self.info.require(FrameSpan(0, 1))
-        return self._frames[span.start : span.stop].sum(axis=0, dtype=np.uint32)
-
-
-class LendsItsFrames(Honest):
-    def frames(self, span):
-        self.info.require(span)
-        return self._frames[span.start : span.stop]
-
-
-class ReusesItsBuffer(Honest):
-    def __init__(self, context):
-        super().__init__(context)
-        self.buffer = np.zeros(self.info.frame_shape, np.uint32)
-
-    def counts(self, span):
-        self.buffer[:] = super().counts(span)
-        return self.buffer
-
-
-class Packed(Honest):
-    def packed(self, span):
-        return np.packbits(self.frames(span), axis=-1)
-
-
-class PacksFromTheRight(Packed):
-    def packed(self, span):
-        return np.packbits(self.frames(span), axis=-1, bitorder="little")
-
-
-class LendsPackedFrames(Packed):
-    def __init__(self, context):
-        super().__init__(context)
-        self.kept = super().packed(self.info.span)
-
-    def packed(self, span):
-        return self.kept[span.start : span.stop]
-
-
-class SharesAPosition(Honest):
-    def frames(self, span):
-        self.position = span.start
-        time.sleep(2e-3)
-        return super().frames(FrameSpan(self.position, self.position + len(span)))
-
-
-class LeftToChance(Honest):
-    def __init__(self, context):
-        super().__init__(context)
-        self.valid = np.random.Generator(np.random.get_bit_generator()).random(self.info.frame_shape) > 0.1  # the fault
+def at_a_shared_position(self, span):
+    self.position = span.start
+    time.sleep(2e-3)
+    return Honest.frames(self, FrameSpan(self.position, self.position + len(span)))
 
 
 class Doubled(BinaryResponse):
@@ -149,141 +93,82 @@ class Unbounded(BinaryResponse):
             return -np.log1p(-mean_count)
 
 
-class AnswersDoubled(Honest):
-    def __init__(self, context):
-        super().__init__(context)
-        self.response = Doubled()
-
-
-class AnswersUnbounded(Honest):
-    def __init__(self, context):
-        super().__init__(context)
-        self.response = Unbounded()
-
-
-class HidesErrors(Honest):
-    def __exit__(self, kind, error, trace):
-        return True
+def answering(response):
+    return having(lambda source: setattr(source, "response", response))
 
 
 def finds_fault(config):
     return ["there is no file capture.npy"]
 
 
-def arrived_without_the_last(config):
-    return Arrived(MemorySource(FRAMES[:-1]))
-
-
-def arrived_out_of_order(config):
-    return Arrived(MemorySource(FRAMES[:, ::-1]))
-
-
 def written(self, frames, folder):
     return {}
 
 
-BROKEN = [
-    ("test_source_passes_the_checks_of_a_run", RateOfText, "a run refuses the source: .*info.frame_rate_hz is a finite", {}),
-    (
-        "test_source_passes_the_checks_of_a_run",
-        CountsInFloat,
-        r"a run refuses the source: it broke its contract at frame 0: counts\(\) returns an array of whole numbers",
-        {},
-    ),
-    ("test_source_passes_the_checks_of_a_run", CountsTooMuch, r"counts\(\) returns numbers from 0 to 1 for these frames", {}),
-    ("test_source_has_required_attributes", HasNoMask, "HasNoMask has no valid", {}),
-    ("test_info_agrees_with_frames", PromisesMore, r"gives the shape \(5, 18, 32\) .* returns \(5, 18, 27\)", {}),
-    ("test_info_agrees_with_frames", NotBinary, "gives binary frames of 1 bits, so at most 1; frames.. returns a 3", {}),
-    ("test_valid_is_bool_mask_of_frame_shape", BadPixels, "false everywhere", {}),
-    ("test_counts_are_uint32_of_frame_shape", NarrowCounts, "uint32, got uint16", {}),
-    (
-        "test_counts_equal_sum_of_frames",
-        CountsOneMore,
-        r"for frame 0, \d+ pixels differ, first the one at row 0",
-        {},
-    ),
-    (
-        "test_packed_equals_packbits_of_frames",
-        PacksFromTheRight,
-        r"packed.span. must be numpy.packbits.* \d+ pixels differ",
-        {},
-    ),
-    (
-        "test_packed_equals_packbits_of_frames",
-        LendsPackedFrames,
-        "after its caller changed the array that packed.. returned",
-        {},
-    ),
-    (
-        "test_counts_of_adjacent_spans_add_up",
-        CountsOneMore,
-        "counts of frames 0 to 36 and of frames 37 to 74 must add up",
-        {},
-    ),
-    ("test_frame_is_the_same_in_any_span", CountsFromTheEnd, "frame 0 of frames 0 to 74 differs from that frame alone", {}),
-    ("test_frames_equal_written_frames", SwapsRows, "75 of 75 frames differ", {"write": written}),
-    (
-        "test_arrived_frames_are_those_of_the_capture",
-        Honest,
-        r"arrived\(\) has 74 binary frames of .*, and the complete capture 75 binary frames",
-        {"record": {"arrived": arrived_without_the_last}},
-    ),
-    (
-        "test_arrived_frames_are_those_of_the_capture",
-        Honest,
-        r"the frames of arrived\(\) must be those of the capture, but \d+ pixels differ",
-        {"record": {"arrived": arrived_out_of_order}},
-    ),
-    (
-        "test_arrived_frames_are_those_of_the_capture",
-        Honest,
-        r"arrived\(\) of a file must return an Arrived, got a Piped",
-        {"record": {"arrived": lambda _: Piped(0, 1)}},
-    ),
-    (
-        "test_span_beyond_capture_raises_input_error",
-        GivesWhatThereIs,
-        r"counts\(\) of frames 74 to 75 .* it returned a nd",
-        {},
-    ),
-    ("test_returned_arrays_belong_to_caller", LendsItsFrames, "after its caller changed the array that frames.. returned", {}),
-    ("test_returned_arrays_belong_to_caller", ReusesItsBuffer, "counts.. overwrites an array that it returned before", {}),
-    (
-        "test_threads_read_the_same_frames",
-        SharesAPosition,
-        "reading in several threads at once must not raise|are read differently",
-        {},
-    ),
-    ("test_reopened_source_gives_same_bytes", LeftToChance, "opened again, the source returns others", {}),
-    ("test_response_flux_inverts_mean_count", AnswersDoubled, "response.flux must invert response.mean_count", {}),
-    ("test_response_flux_inverts_mean_count", AnswersUnbounded, r"finite flux, got \[inf\]", {}),
-    ("test_with_block_returns_source_and_propagates_errors", HidesErrors, "__exit__ must not return True", {}),
-    (
-        "test_check_accepts_config_under_test",
-        Honest,
-        "must accept the capture under test; it returned: there is no file capture.npy",
-        {"record": {"check": finds_fault}},
-    ),
-    ("test_check_rejects_wrong_configs", Honest, "check.. must reject {}; it returned no problem", {"wrong": ({},)}),
-    (
-        "test_check_rejects_wrong_configs",
-        Honest,
-        "opening a capture with {} must raise InputError; it returned a Honest",
-        {"wrong": ({},), "record": {"check": finds_fault}},
-    ),
-]
+PACKED = packing()
+BUFFERED = having(lambda source: setattr(source, "buffer", np.zeros(source.info.frame_shape, np.uint32)), counts=in_one_buffer)
+LENT = having(
+    lambda source: setattr(source, "kept", np.packbits(source._frames, axis=-1)),
+    packed=lambda self, span: self.kept[span.start : span.stop],
+)
+ONE_MORE = having(counts=one_more)
+# By the check that finds each, and behind a comma what is broken; what is said of each stands in behaviours.txt.
+BROKEN = {
+    "source_passes_the_checks_of_a_run, rate of text": info(frame_rate_hz="fast"),
+    "source_passes_the_checks_of_a_run, counts in float": counts_as(lambda counts: counts.astype(np.float32)),
+    "source_passes_the_checks_of_a_run, counts twice": counts_as(lambda counts: counts * 2),
+    "source_has_required_attributes": having(lambda source: delattr(source, "valid")),
+    "info_agrees_with_frames, another width": info(width=32),
+    "info_agrees_with_frames, not binary": frames_as(lambda frames: frames * 3),
+    "valid_is_bool_mask_of_frame_shape": having(bad_pixels),
+    "counts_are_uint32_of_frame_shape": counts_as(lambda counts: counts.astype(np.uint16)),
+    "counts_equal_sum_of_frames": ONE_MORE,
+    "packed_equals_packbits_of_frames, from the right": packing(bitorder="little"),
+    "packed_equals_packbits_of_frames, lent": LENT,
+    "counts_of_adjacent_spans_add_up": ONE_MORE,
+    "frame_is_the_same_in_any_span": frames_as(lambda frames: frames[::-1]),
+    "frames_equal_written_frames": frames_as(lambda frames: frames[:, ::-1]),
+    "arrived_frames_are_those_of_the_capture, fewer": Honest,
+    "arrived_frames_are_those_of_the_capture, out of order": Honest,
+    "arrived_frames_are_those_of_the_capture, a pipe": Honest,
+    "span_beyond_capture_raises_input_error": having(counts=what_there_is),
+    "returned_arrays_belong_to_caller, lent": having(frames=lent_frames),
+    "returned_arrays_belong_to_caller, in one buffer": BUFFERED,
+    "threads_read_the_same_frames": having(frames=at_a_shared_position),
+    "reopened_source_gives_same_bytes": having(left_to_chance),
+    "response_flux_inverts_mean_count, doubled": answering(Doubled()),
+    "response_flux_inverts_mean_count, infinite": answering(Unbounded()),
+    "with_block_returns_source_and_propagates_errors": having(__exit__=lambda *_: True),
+    "check_accepts_config_under_test": Honest,
+    "check_rejects_wrong_configs, accepts": Honest,
+    "check_rejects_wrong_configs, opens": Honest,
+}
+# What else is broken: the contribution, or attributes of the class of the kit.
+MORE = {
+    "frames_equal_written_frames": {"write": written},
+    "arrived_frames_are_those_of_the_capture, fewer": {
+        "record": {"arrived": lambda _: Arrived(MemorySource(FRAMES[:-1]))},
+    },
+    "arrived_frames_are_those_of_the_capture, out of order": {
+        "record": {"arrived": lambda _: Arrived(MemorySource(FRAMES[:, ::-1]))},
+    },
+    "arrived_frames_are_those_of_the_capture, a pipe": {"record": {"arrived": lambda _: Piped(0, 1)}},
+    "check_accepts_config_under_test": {"record": {"check": finds_fault}},
+    "check_rejects_wrong_configs, accepts": {"wrong": ({},)},
+    "check_rejects_wrong_configs, opens": {"wrong": ({},), "record": {"check": finds_fault}},
+}
 
 
-@pytest.mark.parametrize(("check", "broken", "words", "more"), BROKEN)
-def test_check_fails_on_broken_component(check, broken, words, more, catches):
-    catches(SourceConformance, check, broken, words, **more)
+@pytest.mark.parametrize("name", BROKEN)
+def test_check_fails_on_broken_component(name, catches):
+    catches(SourceConformance, check_of(name), BROKEN[name], GOLDEN[f"source, {name}"], **MORE.get(name, {}))
 
 
 def test_every_check_has_a_broken_component(checks_of):
-    assert checks_of(SourceConformance, Conformance) == {check for check, *_ in BROKEN}
+    assert checks_of(SourceConformance, Conformance) == set(map(check_of, BROKEN))
 
 
-@pytest.mark.parametrize(("honest", "bit_depth"), [(Honest, 1), (Packed, 1), (Honest, 10)])
+@pytest.mark.parametrize(("honest", "bit_depth"), [(Honest, 1), (PACKED, 1), (Honest, 10)])
 def test_checks_pass_on_correct_component(honest, bit_depth, checks_of, failure):
     def build(context):
         source = honest(context)

@@ -1,7 +1,5 @@
 """A level of twelve exposures with a known motion, of which some pairs may fail."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,10 +9,11 @@ import pytest
 
 from photonpano import Group, Located, NotLocated, Trajectory
 from photonpano.context import Context
-from photonpano.geometry import inverse
-from photonpano.motion.level import Level, VirtualExposures
+from photonpano.geometry import inverse, translation
+from photonpano.motion.level import Level
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.specs.settings import GraphSettings
+from photonpano.testing import KnownMotion
 from photonpano.threads import Stopwatch
 
 SHAPE = (40, 60)
@@ -56,8 +55,8 @@ def _truth(moving: Group, fixed: Group, found: Located) -> Located:
 class Second:
     """A fallback that knows the motion, records what it describes, and returns what `answer` makes of the motion."""
 
-    def __init__(self, motion: Trajectory, answer: Callable[..., Any] = _truth) -> None:
-        self._motion, self._answer = motion, answer
+    def __init__(self, answer: Callable[..., Any] = _truth, px_per_frame: float = 0.3) -> None:
+        self._motion, self._answer = KnownMotion(lambda frame: translation(px_per_frame * frame, 0)), answer
         self.shown: list[int] = []
 
     def describe(self, exposure: Any) -> Any:

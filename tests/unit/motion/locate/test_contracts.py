@@ -1,7 +1,10 @@
-from __future__ import annotations
+"""Locators that fail or break their contract, and fallbacks."""
 
+import gc
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,15 +14,16 @@ from photonpano.contracts.information import why_undetermined
 from photonpano.contracts.loop import KNOTS, knot_errors, require_valid
 from photonpano.contracts.rules import BrokenContract
 from photonpano.geometry import jacobian, rescaled, translation
+from photonpano.motion.registration import BRIDGE
+from photonpano.specs.settings import GraphSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def test_invalid_motion_is_refused_with_the_name_of_the_locator(run: Callable, make_level: Callable, pan: Callable) -> None:
-    with pytest.raises(PluginError) as caught:
-        run(make_level(pan(0.3), lambda *_: None))
-    problem = "expected Located or NotLocated, got NoneType"
-    assert str(caught.value) == f"locator 'toy' of toys 1.0 broke its contract at level 1: {problem}"
+FIRST, SECOND = "locator 'toy' of toys 1.0", "locator 'second' of toys 1.0"
+BROKEN = "broke its contract at level 1: expected Located or NotLocated, got NoneType"
+STILL = (
+    "broke its contract at level 1: every pair that was located is exactly the identity, which a camera that stands still does "
+    "not give; a failure is NotLocated"
+)
 
 
 def test_valid_motion_is_accepted() -> None:
@@ -32,32 +36,51 @@ def test_valid_motion_is_accepted() -> None:
         assert require_valid(motion) is motion
 
 
-def in_whole_pixels(moving: Group, fixed: Group, found: Located) -> Located:
-    return replace(found, homography=np.round(found.homography))
+def failing_with(error: Exception) -> Callable[..., Any]:
+    def fail(*_: Any) -> Any:
+        raise error
+
+    return fail
 
 
-STILL = (
-    "broke its contract at level 1: every pair that was located is exactly the identity, which a camera that stands still does "
-    "not give; a failure is NotLocated"
+@pytest.mark.parametrize(
+    ("fallback", "message"),
+    [
+        ({}, f"{SECOND} {BROKEN}"),
+        ({"describe": failing_with(ZeroDivisionError("oops"))}, f"{SECOND} failed at level 1: ZeroDivisionError: oops"),
+        ({"register": failing_with(ZeroDivisionError("oops"))}, f"{SECOND} failed at level 1: ZeroDivisionError: oops"),
+    ],
+    ids=["wrong answer", "raises on an exposure", "raises on a pair"],
 )
-
-
-@pytest.mark.parametrize("scale", [1.0, 0.3])
-def test_level_is_refused_if_every_pair_is_exactly_the_identity(
-    run: Callable, make_level: Callable, pan: Callable, scale: float
+def test_fallback_that_raises_or_breaks_its_contract_is_named(
+    run: Callable, make_level: Callable, failing: Callable, make_second: type, fallback: dict[str, Any], message: str
 ) -> None:
+    second = make_second(lambda *_: None)
+    vars(second).update(fallback)
     with pytest.raises(PluginError) as caught:
-        run(make_level(pan(0.0), scale=scale))
-    assert str(caught.value) == f"locator 'toy' of toys 1.0 {STILL}"
+        run(make_level(answer=failing(4), fallbacks={"second": second}))
+    assert str(caught.value) == message
 
 
-def test_all_locators_that_return_the_identity_are_named(
-    run: Callable, make_level: Callable, pan: Callable, failing: Callable, make_second: type
+@pytest.mark.parametrize("scale", [1.0, 0.3, 0.5])
+@pytest.mark.parametrize("case", ["all pairs", "all locators", "against the motion known so far"])
+def test_identity_of_every_pair_is_refused(
+    run: Callable, make_level: Callable, pan: Callable, failing: Callable, make_second: type, scale: float, case: str
 ) -> None:
+    previous, message = None, f"{FIRST} {STILL}"
+    level = make_level(pan(0.0), scale=scale)
+    if case == "all locators":
+        level = make_level(pan(0.0), failing(4), scale=scale, fallbacks={"second": make_second(px_per_frame=0)})
+        message = f"{FIRST} and {SECOND} {STILL.replace('its', 'their')}"
+    elif case == "against the motion known so far":
+        previous = pan(0.6)
+        message = (
+            f"{FIRST} broke its contract at level 1: got the identity where the motion known so far moves the corners by 6 px; "
+            "a failure is NotLocated"
+        )
     with pytest.raises(PluginError) as caught:
-        run(make_level(pan(0.0), failing(4), fallbacks={"second": make_second(pan(0.0))}))
-    both = "locator 'toy' of toys 1.0 and locator 'second' of toys 1.0"
-    assert str(caught.value) == f"{both} {STILL.replace('its', 'their')}"
+        run(level, previous)
+    assert str(caught.value) == message
 
 
 def test_nearly_the_identity_is_accepted_for_a_still_camera(run: Callable, make_level: Callable, pan: Callable) -> None:
@@ -69,22 +92,14 @@ def test_nearly_the_identity_is_accepted_for_a_still_camera(run: Callable, make_
 
 def test_identity_is_accepted_for_small_motion_in_whole_pixels(run: Callable, make_level: Callable, known_motion: type) -> None:
     """Slow at first: pairs are the identity in whole pixels, and the motion known so far is off by 2 px."""
+
+    def in_whole_pixels(moving: Group, fixed: Group, found: Located) -> Located:
+        return replace(found, homography=np.round(found.homography))
+
     motion = known_motion(lambda frame: translation(0.001 * frame**2, 0))
     found = run(make_level(motion, in_whole_pixels), known_motion(lambda frame: translation(0.2 * frame, 0)))
     identities = [bool((edge.motion.homography == np.eye(3)).all()) for edge in found.edges]
     assert identities == [True] * 2 + [False] * 9
-
-
-@pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_identity_is_refused_if_the_motion_known_so_far_is_large(
-    run: Callable, make_level: Callable, pan: Callable, scale: float
-) -> None:
-    with pytest.raises(PluginError) as caught:
-        run(make_level(pan(0.0), scale=scale), pan(0.6))
-    assert str(caught.value) == (
-        "locator 'toy' of toys 1.0 broke its contract at level 1: got the identity where the motion known so far moves the "
-        "corners by 6 px; a failure is NotLocated"
-    )
 
 
 def informed(along_px: float, across_px: float) -> Located:
@@ -93,17 +108,21 @@ def informed(along_px: float, across_px: float) -> Located:
     return Located(translation(3, 1), np.diag(std**-2.0))
 
 
-def test_motion_that_the_images_do_not_determine_is_told() -> None:
+@pytest.mark.parametrize(
+    ("motion", "error"),
+    [
+        (informed(0.1, 100.0), None),
+        (informed(0.1, 590.0), None),
+        (informed(0.1, 1e4), "1e+04"),
+        (Located(translation(3, 1), residual_px=5e6), "5e+06"),
+        (Located(translation(3, 1)), None),
+    ],
+    ids=["100 px", "590 px", "10,000 px", "residual", "nothing known"],
+)
+def test_motion_that_the_images_do_not_determine_is_told(motion: Located, error: str | None) -> None:
     """The limit is ten times the longer side of a frame."""
-    assert why_undetermined(informed(0.1, 100.0), (40, 60)) is None
-    assert why_undetermined(informed(0.1, 590.0), (40, 60)) is None
-    assert why_undetermined(informed(0.1, 1e4), (40, 60)) == (
-        "the images do not determine the motion: its expected error is 1e+04 px at a corner"
-    )
-    assert why_undetermined(Located(translation(3, 1), residual_px=5e6), (40, 60)) == (
-        "the images do not determine the motion: its expected error is 5e+06 px at a corner"
-    )
-    assert why_undetermined(Located(translation(3, 1)), (40, 60)) is None
+    sentence = f"the images do not determine the motion: its expected error is {error} px at a corner"
+    assert why_undetermined(motion, (40, 60)) == (sentence if error else None)
 
 
 def test_correlated_errors_of_small_size_are_determined() -> None:
@@ -113,14 +132,14 @@ def test_correlated_errors_of_small_size_are_determined() -> None:
     assert why_undetermined(Located(np.eye(3), to_points.T @ to_points / 0.1**2), (40, 60)) is None
 
 
-def test_pair_that_stripes_leave_undetermined_is_not_located(run: Callable, make_level: Callable, pan: Callable) -> None:
+def test_pair_that_stripes_leave_undetermined_is_not_located(run: Callable, make_level: Callable) -> None:
     """Along the stripes, every shift fits."""
 
     def along_stripes(moving: Group, fixed: Group, found: Located) -> Located:
         return replace(found, information=informed(0.1, 1e7).information)
 
     with pytest.raises(LocationError) as caught:
-        run(make_level(pan(0.3), along_stripes))
+        run(make_level(answer=along_stripes))
     assert str(caught.value).startswith(
         "level 1: none of the 30 pairs of exposures could be located\n"
         "  frames 10 to 19 onto frames 0 to 9: the images do not determine the motion: its expected error is 1e+07 px at a "
@@ -163,3 +182,132 @@ def test_trajectory_that_has_nothing_to_do_with_its_knots_is_refused(
     with pytest.raises(BrokenContract) as caught:
         knots_kept(known_motion(motion))
     assert str(caught.value) == problem
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_fallback_gets_pairs_that_the_locator_does_not_locate_and_no_others(
+    run: Callable, make_level: Callable, threads: int, failing: Callable, make_second: type
+) -> None:
+    second, third = make_second(), make_second()
+    level = make_level(answer=failing(4, 5), fallbacks={"second": second, "third": third})
+    found = run(level, graph=GraphSettings(skips=(1.0, 2.0)), threads=threads)
+    assert found.n_located == 12
+    np.testing.assert_allclose(found.homographies[:, 0, 2], 0.3 * (found.instants - found.instants[6]), atol=1e-9)
+    by_second = {(edge.moving, edge.fixed) for edge in found.edges if edge.locator == "second"}
+    assert by_second == {(4, 3), (4, 2), (5, 4), (5, 3), (6, 5), (6, 4), (7, 5)}
+    assert {edge.locator for edge in found.edges} == {"toy", "second"}
+    assert sorted(second.shown) == [2, 3, 4, 5, 6, 7]
+    assert third.shown == []
+
+
+def test_pair_with_an_implausible_motion_is_refused_or_given_to_a_fallback(
+    run: Callable, make_level: Callable, make_second: type
+) -> None:
+    def mirror(moving: Group, fixed: Group, found: Located) -> Located:
+        mirrored = translation(59, 0) @ np.diag([-1.0, 1.0, 1.0])
+        return Located(mirrored, evidence={"inliers": 30}) if 40 in (moving.span.start, fixed.span.start) else found
+
+    alone = run(make_level(answer=mirror))
+    assert {(edge.motion.reason, edge.motion.evidence["inliers"]) for edge in alone.failures} == {
+        ("the homography mirrors or folds the image", 30)
+    }
+    found = run(make_level(answer=mirror, fallbacks={"second": make_second()}))
+    assert [(edge.moving, edge.fixed) for edge in found.edges if edge.locator == "second"] == [(4, 3), (5, 4)]
+    assert found.failures == ()
+
+
+def test_failure_of_all_locators_joins_their_reasons(run: Callable, make_level: Callable, make_second: type) -> None:
+    def lost(reason: str, **evidence: float) -> Callable[..., Any]:
+        def answer(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
+            return NotLocated(reason, evidence) if 40 in (moving.span.start, fixed.span.start) else found
+
+        return answer
+
+    second = make_second(lost("2 matches", matches=2))
+    found = run(make_level(answer=lost("the overlap is 3 %", overlap=0.03), fallbacks={"second": second}))
+    (failure, *_) = found.failures
+    assert failure.locator == ""
+    assert failure.motion.reason == "toy: the overlap is 3 %; second: 2 matches"
+    assert failure.motion.evidence == {"toy.overlap": 0.03, "second.matches": 2}
+    assert [(edge.moving, edge.fixed) for edge in found.failures] == [(4, 3), (4, 2), (4, 1), (5, 4)]
+
+
+def test_fallback_is_not_believed_where_it_contradicts_pairs_of_the_locator_in_between(
+    run: Callable, make_level: Callable, make_second: type
+) -> None:
+    """Distant exposures share an object rather than the scene: the first locator fails, and the second follows the object."""
+
+    def near(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
+        return found if moving.span.start - fixed.span.start == 10 else NotLocated("lost")
+
+    second = make_second(px_per_frame=-0.5)
+    found = run(make_level(answer=near, fallbacks={"second": second}), graph=GraphSettings(skips=(1.0, 4.0)))
+    np.testing.assert_allclose(found.homographies[:, 0, 2], 0.3 * (found.instants - found.instants[6]), atol=1e-9)
+    reasons = {edge.moving - edge.fixed: edge.motion.reason for edge in found.failures}
+    assert reasons[4] == "second: the motion is 32 px from that along the pairs of toy in between"
+    assert 1 not in reasons
+
+
+def test_fallback_is_believed_where_the_locator_does_not_tie_the_exposures(
+    run: Callable, make_level: Callable, make_second: type
+) -> None:
+    def behind(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
+        return NotLocated("lost") if moving.span.start >= 60 > fixed.span.start else found
+
+    jump = make_second(lambda _, __, found: Located(translation(50, 0) @ found.homography))
+    found = run(make_level(answer=behind, fallbacks={"second": jump}), graph=GraphSettings(skips=(1.0, 2.0)))
+    np.testing.assert_allclose(found.homographies[6:, 0, 2] - found.homographies[5, 0, 2], 50 + 3 * np.arange(1, 7), atol=1e-6)
+
+
+def test_no_locator_describes_blank_exposures(
+    run: Callable, make_level: Callable, failing: Callable, make_second: type
+) -> None:
+    locator, second = make_second(failing(4)), make_second()
+    level = make_level(locator=locator, fallbacks={"second": second})
+    merge = level.merger.merge
+
+    class Shuttered:
+        def merge(self, source: Any, group: Group, trajectory: Any, scale: float) -> Any:
+            exposure = merge(source, group, trajectory, scale)
+            return replace(exposure, flux=np.zeros_like(exposure.flux)) if group.span.start == 40 else exposure
+
+    found = run(replace(level, merger=Shuttered()))
+    assert sorted(locator.shown) == [0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11]
+    assert second.shown == []
+    assert {(edge.locator, edge.motion.reason) for edge in found.failures} == {
+        ("", "frames 40 to 49: no pixel detected a photon; is the shutter closed, or is it the wrong file?")
+    }
+
+
+@pytest.mark.parametrize(
+    ("of", "most"),
+    # Those that may still be bridged to, the current one, and those described ahead.
+    [("locator", BRIDGE + 1 + 3), ("fallback", BRIDGE + 2)],
+)
+def test_features_are_described_once_and_released_after_their_last_pair(
+    run: Callable, make_level: Callable, failing: Callable, make_second: type, of: str, most: int
+) -> None:
+    described: list[Group] = []
+    alive: weakref.WeakSet[Any] = weakref.WeakSet()
+    n_alive: list[int] = []
+
+    class Features:
+        def __init__(self, group: Group) -> None:
+            self.group = group
+
+    class Watched(make_second):
+        def describe(self, exposure: Any) -> Features:
+            described.append(exposure.group)
+            features = Features(exposure.group)
+            alive.add(features)
+            gc.collect()
+            n_alive.append(len(alive))
+            return features
+
+    if of == "locator":
+        found = run(make_level(locator=Watched()), threads=1)
+    else:
+        found = run(make_level(answer=failing(*range(12)), fallbacks={"second": Watched()}), threads=1)
+        assert [edge.locator for edge in found.edges] == ["second"] * 11
+    assert sorted(described, key=lambda group: group.span) == list(found.groups)
+    assert max(n_alive) <= most < len(found.groups)

@@ -1,10 +1,8 @@
 """Loop closures of a level: which pairs are registered, accepted, refused or dropped."""
 
-from __future__ import annotations
-
 import gc
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -18,17 +16,18 @@ from photonpano.geometry import inverse, rescaling, translation
 from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, locate
-from photonpano.photometry import BinaryResponse
+from photonpano.motion.merge import VirtualExposures
 from photonpano.specs.settings import GraphSettings
+from photonpano.testing import KnownMotion, MemorySource, photographed
+from photonpano.testing.scenes import seen_along
 from photonpano.threads import Stopwatch
+from photonpano.values import Edge
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SHAPE = (40, 60)
-N = 24
-"""Exposures of ten frames: twelve on the way there, 9 px apart, and twelve on the way back."""
-PAIRS = [(12 + i, 11 - i) for i in range(2, 12)]
-"""The exposures that see one place twice, apart from those around the turn."""
+N = 24  # exposures of ten frames: twelve on the way there, 9 px apart, and twelve on the way back
+PAIRS = [(12 + i, 11 - i) for i in range(2, 12)]  # that see one place twice, apart from those around the turn
 PERIOD_PX = 20
 DRIFT_PX = 0.05
 
@@ -44,15 +43,12 @@ class Scenery:
         self._plane = np.exp(3 * np.tile(tile[:PERIOD_PX, :PERIOD_PX], (4, 12)))
 
     def merge(self, source: Any, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
-        height, width = (round(side * scale) for side in SHAPE)
-        to_plane = self._motion.at([group.reference])[0] @ inverse(rescaling(scale))
-        mean = cv2.warpPerspective(self._plane, to_plane, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-        counts = np.random.default_rng(group.span.start).binomial(1000, 1 - np.exp(-mean))
-        weight = np.full(mean.shape, 1000, np.float32)
-        flux = BinaryResponse().flux((counts / 1000).astype(np.float32), weight)
+        shape = tuple(round(side * scale) for side in SHAPE)
+        mean = seen_along(self._plane, self._motion.at([group.reference])[0] @ inverse(rescaling(scale)), shape)[0]
+        exposure = replace(photographed(mean, 1000, seed=group.span.start), group=group, scale=scale)
         self.merged.append(group.span.start // 10)
-        self._images.append(weakref.ref(flux))
-        return VirtualExposure(flux, weight, group, scale, BinaryResponse())
+        self._images.append(weakref.ref(exposure.flux))
+        return exposure
 
     @property
     def alive(self) -> int:
@@ -61,23 +57,21 @@ class Scenery:
         return sum(image() is not None for image in self._images)
 
 
-@pytest.fixture(scope="module")
-def there_and_back(known_motion: type) -> Trajectory:
-    """A path of 0.9 px a frame that returns after half of the frames."""
-    return known_motion(lambda frame: translation(20 + 0.9 * min(frame, 10 * N - 1 - frame), 20))
+# 0.9 px a frame, back after half of the frames
+THERE_AND_BACK = KnownMotion(lambda frame: translation(20 + 0.9 * min(frame, 10 * N - 1 - frame), 20))
 
 
 @pytest.fixture
-def level(make_level: Callable, there_and_back: Trajectory) -> Callable[..., Level]:
-    def level(answer: Callable[..., Any] = drifting, **changes: Any) -> Level:
-        return make_level(there_and_back, answer, **{"merger": Scenery(there_and_back)} | changes)
+def level(make_level: Callable) -> Callable[..., Level]:
+    def level(answer: Callable[..., Any] = drifting, motion: Trajectory = THERE_AND_BACK, **changes: Any) -> Level:
+        return make_level(motion, answer, **{"merger": Scenery(motion)} | changes)
 
     return level
 
 
 @pytest.fixture
-def run(memory_source: type) -> Callable[..., LocatedLevel]:
-    source = memory_source(np.zeros((10 * N, *SHAPE)))
+def run() -> Callable[..., LocatedLevel]:
+    source = MemorySource(np.zeros((10 * N, *SHAPE)))
 
     def run(level: Level, closure_overlap: float | None = 0.5, threads: int = 2) -> LocatedLevel:
         groups = level.resampler.groups(10 * N, level.number)
@@ -109,23 +103,19 @@ def drift_px(found: LocatedLevel) -> float:
     return abs(float(found.homographies[-1, 1, 2] - found.homographies[0, 1, 2]))
 
 
-def closures_of(found: LocatedLevel) -> list[tuple[int, int]]:
-    return [(edge.moving, edge.fixed) for edge in found.closures]
+def pairs_of(edges: Iterable[Edge]) -> list[tuple[int, int]]:
+    return [(edge.moving, edge.fixed) for edge in edges]
 
 
 def test_loop_closures_stop_the_drift(run: Callable, level: Callable) -> None:
     with_them, without = run(level()), run(level(), closure_overlap=None)
-    assert closures_of(with_them) == PAIRS
-    assert closures_of(without) == []
+    assert pairs_of(with_them.closures) == PAIRS
+    assert pairs_of(without.closures) == []
     assert len(with_them.edges) == len(without.edges) + len(PAIRS)
     assert drift_px(without) == pytest.approx(DRIFT_PX * (N - 1), rel=0.02)
     assert drift_px(with_them) < 0.1 * drift_px(without)
-
-
-def test_accepted_closure_records_its_similarity(run: Callable, level: Callable) -> None:
-    for edge in run(level()).closures:
-        assert edge.locator == "toy"
-        assert edge.motion.evidence["inliers"] == 30
+    for edge in with_them.closures:
+        assert (edge.locator, edge.motion.evidence["inliers"]) == ("toy", 30)
         assert 0.9 < edge.motion.evidence["closure_similarity"] < 1.05
 
 
@@ -157,7 +147,7 @@ def test_closure_that_returns_exactly_is_accepted_however_far_the_others_drifted
 def test_closure_of_different_places_is_refused(run: Callable, level: Callable, scale: float) -> None:
     wrong = at_closures(lambda found: replace(found, homography=translation(7, 9) @ found.homography, evidence={"inliers": 12}))
     found = run(level(wrong, scale=scale))
-    assert [(edge.moving, edge.fixed) for edge in found.failures] == PAIRS == closures_of(found)
+    assert pairs_of(found.failures) == PAIRS == pairs_of(found.closures)
     for edge in found.failures:
         assert edge.locator == ""
         assert edge.motion.evidence["inliers"] == 12
@@ -175,29 +165,24 @@ def test_right_closures_stop_the_drift_although_others_are_refused(run: Callable
         )
 
     found = run(level(answer))
-    assert [(edge.moving, edge.fixed) for edge in found.failures] == [pair for pair in PAIRS if pair[0] % 2]
+    assert pairs_of(found.failures) == [pair for pair in PAIRS if pair[0] % 2]
     assert found.solution.outliers == ()
     assert drift_px(found) < 0.15
 
 
 def test_closure_that_no_locator_locates_keeps_its_reason(run: Callable, level: Callable) -> None:
     found = run(level(at_closures(lambda _: NotLocated("3 matches", {"matches": 3}))))
-    assert [(edge.moving, edge.fixed) for edge in found.failures] == PAIRS
+    assert pairs_of(found.failures) == PAIRS
     assert {edge.motion.reason for edge in found.failures} == {"3 matches"}
     assert found.n_located == N
 
 
-def test_closure_located_by_a_fallback_is_checked(
-    run: Callable, level: Callable, make_level: Callable, known_motion: type
-) -> None:
-    def lost(_: Located) -> NotLocated:
-        return NotLocated("3 matches")
-
-    still = make_level(known_motion(lambda _: np.eye(3))).locators[0].component
-    found = run(level(at_closures(lost), fallbacks={"second": still}))
+def test_closure_located_by_a_fallback_is_checked(run: Callable, level: Callable, make_level: Callable, pan: Callable) -> None:
+    lost = at_closures(lambda _: NotLocated("3 matches"))
+    still, astray = (make_level(pan(px_per_frame)).locators[0].component for px_per_frame in (0, 0.1))
+    found = run(level(lost, fallbacks={"second": still}))
     assert {edge.locator for edge in found.closures} == {"second"}
-    astray = make_level(known_motion(lambda frame: translation(0.1 * frame, 0))).locators[0].component
-    found = run(level(at_closures(lost), fallbacks={"second": astray}))
+    found = run(level(lost, fallbacks={"second": astray}))
     assert all("of this loop closure" in edge.motion.reason for edge in found.failures)
     assert (len(PAIRS) - 2) <= len(found.failures) <= len(PAIRS)
 
@@ -236,8 +221,13 @@ def test_closures_that_agree_on_the_next_period_do_not_outvote_neighbours(run: C
 
 
 @pytest.mark.parametrize("threads", [2, 4])
-def test_closures_do_not_depend_on_the_number_of_threads(run: Callable, level: Callable, threads: int) -> None:
-    alone, several = run(level(), threads=1), run(level(), threads=threads)
+def test_only_exposures_of_closures_are_merged_again_with_any_number_of_threads(
+    run: Callable, level: Callable, threads: int
+) -> None:
+    toy = level()
+    alone, several = run(toy, threads=1), run(level(), threads=threads)
+    assert toy.merger.merged[:N] == list(range(N))
+    assert toy.merger.merged[N:] == [index for pair in PAIRS for index in pair]
     np.testing.assert_array_equal(several.homographies, alone.homographies)
     np.testing.assert_array_equal(several.std_px, alone.std_px)
     assert [(each.moving, each.fixed, each.locator) for each in several.edges] == [
@@ -246,20 +236,12 @@ def test_closures_do_not_depend_on_the_number_of_threads(run: Callable, level: C
     assert [each.motion.evidence for each in several.edges] == [each.motion.evidence for each in alone.edges]
 
 
-def test_only_exposures_of_closures_are_merged_again(run: Callable, level: Callable) -> None:
-    toy = level()
-    run(toy, threads=1)
-    assert toy.merger.merged[:N] == list(range(N))
-    assert toy.merger.merged[N:] == [index for pair in PAIRS for index in pair]
-
-
-def test_exposure_of_several_closures_is_merged_again_once(run: Callable, level: Callable, known_motion: type) -> None:
+def test_exposure_of_several_closures_is_merged_again_once(run: Callable, level: Callable) -> None:
     """Three sweeps over six places: the last has closures with both others."""
-    sweeps = known_motion(lambda frame: translation(20 + 0.9 * abs((frame + 80) % 160 - 80), 20))
-    toy = level(merger=Scenery(sweeps), locator=level().locators[0].component.__class__(sweeps, drifting))
+    toy = level(motion=KnownMotion(lambda frame: translation(20 + 0.9 * abs((frame + 80) % 160 - 80), 20)))
     found = run(toy, threads=1)
-    needed = {index for pair in closures_of(found) for index in pair}
-    assert len(closures_of(found)) > len(needed) / 2
+    needed = {index for pair in pairs_of(found.closures) for index in pair}
+    assert len(pairs_of(found.closures)) > len(needed) / 2
     assert sorted(toy.merger.merged[N:]) == sorted(needed)
 
 

@@ -1,1 +1,0 @@
-"""The motion graph: its solution, how certain that is, and the equations beneath."""

@@ -1,0 +1,407 @@
+"""The motion graph: its solution with outliers and in several parts, its normal equations, and the expected errors."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from photonpano import Located, NotLocated
+from photonpano.geometry import (
+    align_planes,
+    corner_displacements,
+    corners,
+    from_parameters,
+    inverse,
+    jacobian,
+    normalised,
+    parameters,
+    rescaled,
+    transform_points,
+    translation,
+)
+from photonpano.motion import adjustment
+from photonpano.motion.graph import components, solve
+from photonpano.values import Edge
+
+SHAPE = (254, 496)
+NOISE_PX = 0.1
+
+
+def true_motion(n_nodes: int, seed: int = 0) -> np.ndarray:
+    """A camera that wanders by about 20 px from exposure to exposure, and turns."""
+    steps = np.random.default_rng(seed).normal(size=(n_nodes, 8)) * [2e-3, 2e-3, 2e-3, 2e-3, 20, 5, 2e-6, 2e-6]
+    return from_parameters(np.cumsum(steps, axis=0))
+
+
+def edge(true: np.ndarray, moving: int, fixed: int, rng: np.random.Generator | None = None, std_px: float = NOISE_PX) -> Edge:
+    """Measure a pair; with a generator, corners have errors of `std_px` along each axis, as the information predicts."""
+    homography = normalised(inverse(true[fixed]) @ true[moving])
+    to_corners = jacobian(homography, corners(SHAPE)).reshape(8, 8)
+    information = to_corners.T @ to_corners / std_px**2
+    if rng is not None:
+        change = np.linalg.solve(to_corners, rng.normal(scale=std_px, size=8))
+        homography = from_parameters(parameters(homography) + change)
+    return Edge(moving, fixed, Located(homography, information))
+
+
+def measured(
+    true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator | None = None, std_px: float = NOISE_PX
+) -> list[Edge]:
+    return [edge(true, moving, moving - skip, rng, std_px) for moving in range(len(true)) for skip in skips if skip <= moving]
+
+
+def graph(n_nodes: int, skips: tuple[int, ...] = (1, 2, 4)) -> tuple[np.ndarray, list[Edge]]:
+    """Return a true motion, and its pairs measured with noise."""
+    true = true_motion(n_nodes)
+    return true, measured(true, skips, np.random.default_rng(0))
+
+
+def confident(edges: list[Edge], times: float) -> list[Edge]:
+    """Scale the information of edges as if their errors were `times` smaller."""
+    return [replace(each, motion=replace(each.motion, information=each.motion.information * times**2)) for each in edges]
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def error_px(homographies: np.ndarray, true: np.ndarray, anchor: int) -> float:
+    moved = inverse(normalised(inverse(true[anchor]) @ true)) @ homographies
+    return float(corner_displacements(moved, np.eye(3), SHAPE).mean())
+
+
+def moved(wrong: Edge, x_px: float, y_px: float) -> Edge:
+    """Return the edge with an error of (x_px, y_px)."""
+    return replace(wrong, motion=replace(wrong.motion, homography=translation(x_px, y_px) @ wrong.motion.homography))
+
+
+def without_information(edges: list[Edge]) -> list[Edge]:
+    return [Edge(each.moving, each.fixed, replace(each.motion, information=None)) for each in edges]
+
+
+@pytest.mark.parametrize("skips", [(1,), (1, 2, 4), (1, 29)], ids=["chain", "loops", "closed once"])
+@pytest.mark.parametrize("anchor", [0, 15, 29])
+def test_solve_is_exact_without_noise(skips: tuple[int, ...], anchor: int) -> None:
+    true = true_motion(30)
+    solution = solve(30, measured(true, skips), anchor, SHAPE)
+    assert error_px(solution.homographies, true, anchor) < 1e-9
+    assert solution.located.all()
+    assert solution.outliers == ()
+    assert solution.residual_px < 1e-9
+
+
+@pytest.mark.parametrize(("n", "times", "rel"), [(200, 1, 0.05), (60, 3, 0.1)], ids=["expected", "overconfident"])
+def test_residual_is_that_of_the_measurements_and_no_edge_is_an_outlier(n: int, times: float, rel: float) -> None:
+    """Every corner has an error of 0.1 px along two axes; the unknowns absorb half of the residuals.
+
+    The spanning tree that the solution starts from contains one pair in two; errors are `times` what information predicts.
+    """
+    _, edges = graph(n, (1, 2))
+    solution = solve(n, confident(edges, times), n // 2, SHAPE)
+    assert solution.residual_px == pytest.approx(NOISE_PX * np.sqrt(2) * np.sqrt(1 - (n - 1) / len(edges)), rel=rel)
+    if times > 1:
+        assert solution.outliers == ()
+    np.testing.assert_array_equal(solution.homographies[n // 2], np.eye(3))
+    np.testing.assert_array_equal(solution.homographies[:, 2, 2], 1)
+
+
+def test_solve_accepts_pairs_in_either_direction_and_twice() -> None:
+    true = true_motion(4)
+    edges = [edge(true, 1, 0), edge(true, 1, 2), edge(true, 2, 1), edge(true, 2, 3), edge(true, 0, 3), edge(true, 1, 0)]
+    assert error_px(solve(4, edges, 0, SHAPE).homographies, true, 0) < 1e-9
+
+
+def test_solve_error_falls_with_more_edges_than_a_chain() -> None:
+    """Errors of 0.1 px a pair: over 120 exposures a chain drifts by 0.7 px; second and fourth neighbours leave 0.14 px."""
+    errors: dict[tuple[int, ...], list[float]] = {(1,): [], (1, 2, 4): [], (1, 2, 4, 40): []}
+    for seed in range(2):
+        true, rng = true_motion(120, seed), np.random.default_rng(seed)
+        for skips, found in errors.items():
+            found.append(error_px(solve(120, measured(true, skips, rng), 60, SHAPE).homographies, true, 60))
+    chain, neighbours, closures = (float(np.mean(found)) for found in errors.values())
+    assert chain > 0.5
+    assert neighbours < 0.35 * chain
+    assert closures < 0.15 * chain
+
+
+@pytest.mark.parametrize("weighted_by", ["information", "residual_px"])
+def test_solve_weights_edges_by_information_or_residual(weighted_by: str) -> None:
+    """Every second measurement of a pair is twenty times as noisy."""
+    true, rng = true_motion(40), np.random.default_rng(0)
+    good = measured(true, (1, 2), rng)
+    noisy = [edge(true, each.moving, each.fixed, rng, 20 * NOISE_PX) for each in good]
+    best = error_px(solve(40, good, 20, SHAPE).homographies, true, 20)
+    edges = good + noisy
+    if weighted_by == "residual_px":
+        stds = np.repeat([NOISE_PX, 20 * NOISE_PX], len(good))
+        edges = [
+            Edge(each.moving, each.fixed, replace(each.motion, residual_px=std_px))
+            for each, std_px in zip(without_information(edges), stds, strict=True)
+        ]
+    weighted = error_px(solve(40, edges, 20, SHAPE).homographies, true, 20)
+    unweighted = error_px(solve(40, without_information(good + noisy), 20, SHAPE).homographies, true, 20)
+    assert weighted < 1.2 * best
+    assert unweighted > 1.5 * weighted
+
+
+def test_solve_drops_one_gross_outlier_at_any_edge() -> None:
+    true, edges = graph(9)
+    clean = error_px(solve(9, edges, 4, SHAPE).homographies, true, 4)
+    for index, each in enumerate(edges):
+        solution = solve(9, [*edges[:index], moved(each, 40, -30), *edges[index + 1 :]], 4, SHAPE)
+        assert solution.outliers == (index,)
+        assert error_px(solution.homographies, true, 4) < 1.5 * clean
+
+
+def test_solve_with_outliers_equals_solve_without_them() -> None:
+    """The positions of outliers count failed edges."""
+    _, edges = graph(20)
+    failure = Edge(5, 3, NotLocated("nothing to see"))
+    edges[:0], edges[20:20] = [failure], [failure]
+    wrong = {7: moved(edges[7], 3, 0), 30: moved(edges[30], 40, -30), 31: moved(edges[31], 0, 500)}
+    solution = solve(20, [wrong.get(index, each) for index, each in enumerate(edges)], 10, SHAPE)
+    without = solve(20, [each for index, each in enumerate(edges) if index not in wrong], 10, SHAPE)
+    assert solution.outliers == tuple(wrong)
+    assert without.outliers == ()
+    assert corner_displacements(solution.homographies, without.homographies, SHAPE).max() < 1e-3
+    assert solution.residual_px == pytest.approx(without.residual_px, rel=1e-4)
+    assessed, assessed_without = solution.assess(), without.assess()
+    np.testing.assert_allclose(
+        assessed.information, assessed_without.information, rtol=0.01, atol=1e-4 * assessed.information.max()
+    )
+    # Both are estimated from 64 draws.
+    np.testing.assert_allclose(assessed.std_px, assessed_without.std_px, rtol=0.25)
+
+
+def test_solve_keeps_outliers_if_graph_disconnects_without_them() -> None:
+    """The last exposure has two pairs that are 40 px apart: either may be right, and the expected error includes both."""
+    still = np.broadcast_to(np.eye(3), (21, 3, 3))
+    edges = [*measured(still[:20], (1, 2)), moved(edge(still, 20, 19), 20, 0), moved(edge(still, 20, 19), -20, 0)]
+    solution = solve(21, without_information(edges), 10, SHAPE)
+    assert solution.located.all()
+    assert solution.outliers == ()
+    assert error_px(solution.homographies, still, 10) < 1e-6
+    assert solution.residual_px == pytest.approx(20 * np.sqrt(2 / len(edges)))
+    std_px = solution.assess().std_px
+    assert std_px[:20].max() < 2 < 5 < std_px[20] < 40
+
+
+@pytest.mark.parametrize(("skips", "n"), [((1, 2, 8), 300), ((2, 3, 8), 400)], ids=["disjoint", "half overlapping"])
+def test_solve_of_a_long_capture_does_not_depend_on_its_start(skips: tuple[int, ...], n: int) -> None:
+    """Errors of 8 px a pair, as of blurred exposures: along skips of 8, paths to neighbours drift apart by far more."""
+    true = true_motion(n)
+    edges = measured(true, skips, np.random.default_rng(0), 8.0)
+    found, expected = (solve(n, edges, n // 2, SHAPE, start) for start in (None, true))
+    assert found.residual_px == pytest.approx(expected.residual_px, rel=0.01)
+    neighbours = inverse(found.homographies[:-1]) @ found.homographies[1:]
+    assert corner_displacements(neighbours, inverse(true[:-1]) @ true[1:], SHAPE).mean() < 8
+
+
+def test_solve_leaves_nodes_not_tied_to_the_anchor_unknown() -> None:
+    true = true_motion(7)
+    edges = [edge(true, 1, 0), edge(true, 2, 1), edge(true, 2, 0), Edge(3, 2, NotLocated("lost")), edge(true, 5, 4)]
+    solution = solve(7, edges, 1, SHAPE)
+    np.testing.assert_array_equal(solution.located, [True, True, True, False, False, False, False])
+    assert error_px(solution.homographies[:3], true[:3], 1) < 1e-9
+    assert np.isnan(solution.homographies[3:]).all()
+    assessed = solution.assess()
+    assert (assessed.information.shape, assessed.std_px.shape) == ((3, 8, 8), (3,))
+    assert np.isfinite(assessed.information).all()
+    assert np.isfinite(assessed.std_px).all()
+    alone = solve(3, [], 2, SHAPE)
+    np.testing.assert_array_equal(alone.located, [False, False, True])
+    np.testing.assert_array_equal(alone.homographies[2], np.eye(3))
+    assert np.isnan(alone.homographies[:2]).all()
+    np.testing.assert_array_equal(alone.assess().information, np.full((1, 8, 8), np.nan))
+    np.testing.assert_array_equal(alone.assess().std_px, [np.nan])
+
+
+def test_solve_does_not_depend_on_the_unit_of_length() -> None:
+    edges = without_information(graph(20)[1])
+    halved = [
+        Edge(each.moving, each.fixed, replace(each.motion, homography=rescaled(each.motion.homography, 0.5))) for each in edges
+    ]
+    whole = solve(20, edges, 10, SHAPE)
+    # Rescaling keeps pixel edges in place, so that corner pixels are not quite the same points: to 1/1000 px it is one motion.
+    half = solve(20, halved, 10, (SHAPE[0] // 2, SHAPE[1] // 2))
+    moved = inverse(whole.homographies) @ rescaled(half.homographies, 2)
+    assert corner_displacements(moved, np.eye(3), SHAPE).max() < 1e-3
+
+
+def test_components_are_numbered_from_the_largest() -> None:
+    true = true_motion(7)
+    edges = [edge(true, 1, 0), Edge(2, 1, NotLocated("lost")), edge(true, 3, 2), edge(true, 4, 3), edge(true, 6, 4)]
+    assert [len(np.flatnonzero(components(7, edges) == part)) for part in (0, 1, 2)] == [4, 2, 1]
+    np.testing.assert_array_equal(components(7, edges) == 0, [False, False, True, True, True, False, True])
+    assert sorted(components(3, [])) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("closures", "most"), [(0, 20), (100, 50)])
+def test_solve_of_a_large_graph_takes_few_steps_with_sparse_factors(
+    monkeypatch: pytest.MonkeyPatch, closures: int, most: int
+) -> None:
+    """The factors of the normal equations stay sparse: at most `most` blocks for each exposure."""
+    filled: list[int] = []
+    factorise = adjustment.splu
+
+    def counting(matrix: Any, **options: Any) -> Any:
+        factors = factorise(matrix, **options)
+        filled.append(factors.L.nnz + factors.U.nnz)
+        return factors
+
+    monkeypatch.setattr(adjustment, "splu", counting)
+    true, rng = true_motion(300), np.random.default_rng(0)
+    edges = measured(true, (1, 2, 4), rng)
+    ends = np.sort(rng.choice(300, (closures, 2)))
+    edges += [
+        Edge(int(late), int(early), Located(normalised(inverse(true[early]) @ true[late])))
+        for early, late in ends
+        if late - early > 4
+    ]
+    solve(300, edges, 150, SHAPE)
+    assert len(filled) <= 12
+    assert max(filled) < 300 * 8**2 * most
+
+
+def any_edges(seed: int) -> tuple[int, list[Edge]]:
+    """Draw a graph of edges that contradict each other, with information from nearly singular to far too certain."""
+    rng = np.random.default_rng(seed)
+    n_nodes, edges = int(rng.integers(2, 9)), []
+    units = np.array([1e-2, 1e-2, 1e-2, 1e-2, 1, 1, 1e-4, 1e-4])
+    for moving in range(1, n_nodes):
+        for fixed in {moving - 1, int(rng.integers(0, moving))}:
+            change = rng.normal(size=8) * units * [5, 5, 5, 5, 40, 40, 1, 1] * 10.0 ** rng.uniform(-3, 0)
+            rotation, _ = np.linalg.qr(rng.normal(size=(8, 8)))
+            span = float(rng.choice([0, 4, 7]))
+            information = (rotation * 10.0 ** rng.uniform(-span, span, 8)) @ rotation.T / np.outer(units, units)
+            residual_px = float(10.0 ** rng.uniform(-12, 12)) if rng.random() < 0.5 else None
+            given = None if rng.random() < 0.3 else (information + information.T) / 2
+            edges.append(Edge(moving, fixed, Located(from_parameters(change), given, residual_px)))
+    return n_nodes, edges
+
+
+def test_solve_is_finite_for_any_information() -> None:
+    """Nearly singular systems are damped: nothing raises, and what is not determined is uncertain."""
+    for seed in range(15):
+        n_nodes, edges = any_edges(seed)
+        solution = solve(n_nodes, edges, 0, SHAPE)
+        assessed = solution.assess()
+        for each in (solution.homographies[solution.located], assessed.information, assessed.std_px):
+            assert np.isfinite(each).all(), f"seed {seed}"
+
+
+def test_singular_system_leaves_undetermined_unknowns_and_calls_them_uncertain() -> None:
+    """Of four unknowns, the last two are only known to be equal."""
+    jacobian = np.array([[2.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -1]])
+    normal = sparse.csr_array(jacobian.T @ jacobian)
+    right = np.array([8.0, 3.0, 1.0, -1.0])
+    np.testing.assert_allclose(adjustment._solved(normal, right)[:2], [2, 3], rtol=1e-6)
+    draws = np.random.default_rng(0).normal(size=(3, 500))
+    std = adjustment._solved(normal, jacobian.T @ draws, draws=True).std(axis=1)
+    np.testing.assert_allclose(std[:2], [0.5, 1], rtol=0.15)
+    assert (std[2:] > 1e3).all()
+
+
+def squared_errors(homographies: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return the mean square distance of the corners from where they should be, after the best alignment of planes: (N,)."""
+    frame = corners(SHAPE)
+    missed = transform_points(np.linalg.inv(true) @ align_planes(homographies, true, SHAPE) @ homographies, frame) - frame
+    return np.sum(missed**2, axis=-1).mean(axis=-1)
+
+
+def unequal(true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator) -> list[Edge]:
+    """Measure pairs with errors of 0.03 to 0.3 px, and matching information."""
+    stds = np.random.default_rng(1).choice([0.03, 0.1, 0.3], size=len(true) * len(skips))
+    pairs = [(moving, moving - skip) for moving in range(len(true)) for skip in skips if skip <= moving]
+    return [edge(true, *pair, rng, std_px) for pair, std_px in zip(pairs, stds, strict=False)]
+
+
+GRAPHS: dict[str, Callable[..., list[Edge]]] = {
+    "a chain": lambda true, rng: measured(true, (1,), rng),
+    "second neighbours": lambda true, rng: measured(true, (1, 2), rng),
+    "closed at the end": lambda true, rng: measured(true, (1, len(true) - 1), rng),
+    "closed in a part": lambda true, rng: [*measured(true, (1,), rng), edge(true, 8, 1, rng)],
+    "unequal noise": lambda true, rng: unequal(true, (1, 2), rng),
+    "overconfident": lambda true, rng: confident(measured(true, (1, 2), rng), 3),
+}
+
+
+@pytest.mark.parametrize("graph", GRAPHS)
+def test_expected_error_matches_actual_error_of_every_exposure(graph: str) -> None:
+    """Sixteen measurements of one motion: the error of every exposure is as large as expected."""
+    true = true_motion(10)
+    found = [solve(10, GRAPHS[graph](true, np.random.default_rng(seed)), 5, SHAPE) for seed in range(16)]
+    squares = np.array([squared_errors(solution.homographies, true) for solution in found])
+    expected = np.array([solution.assess().std_px for solution in found])
+    ratios = np.sqrt(squares.mean(axis=0) / (expected**2).mean(axis=0))
+    assert 0.7 < ratios.min() < ratios.max() < 1.2
+    # A single loop hardly determines the scale of errors; the larger one is taken.
+    assert 0.8 < np.sqrt(squares.mean() / (expected**2).mean()) < 1.1
+    assert np.mean(np.sqrt(squares) < 3 * expected) > 0.99
+
+
+@pytest.mark.parametrize("n_nodes", [9, 36])
+def test_expected_error_of_a_chain_is_that_of_a_random_walk(n_nodes: int) -> None:
+    """Step j of a walk over N exposures weighs j / N in the distance of those after it from the mean, (N - j) / N before.
+
+    The camera stands still, so that the best alignment of planes takes out the mean.
+    """
+    true = np.broadcast_to(np.eye(3), (n_nodes, 3, 3))
+    solution = solve(n_nodes, measured(true, (1,)), 0, SHAPE)
+    steps = np.arange(1, n_nodes)
+    shares = [np.where(steps <= k, steps, n_nodes - steps) / n_nodes for k in range(n_nodes)]
+    walk = NOISE_PX * np.sqrt(2) * np.linalg.norm(shares, axis=1)
+    np.testing.assert_allclose(solution.assess().std_px, walk, rtol=0.12)
+
+
+def test_expected_error_does_not_depend_on_the_anchor() -> None:
+    _, edges = graph(20, (1, 2))
+    first, last = (solve(20, edges, anchor, SHAPE).assess().std_px for anchor in (0, 19))
+    np.testing.assert_allclose(first, last, rtol=0.01)
+
+
+@pytest.mark.parametrize("skips", [(1, 2), (1,)], ids=["loops", "chain"])
+def test_expected_error_corrects_overconfident_edges_only_with_loops(skips: tuple[int, ...]) -> None:
+    _, edges = graph(40, skips)
+    honest, overconfident, modest = (
+        solve(40, confident(edges, times), 20, SHAPE).assess().std_px.mean() for times in (1, 5, 0.2)
+    )
+    assert overconfident == pytest.approx(honest if skips == (1, 2) else honest / 5, rel=0.1)
+    assert modest == pytest.approx(5 * honest, rel=0.15)
+
+
+def test_information_of_a_node_is_the_curvature_of_the_cost_with_others_held() -> None:
+    true = true_motion(5)
+    edges = [
+        edge(true, 1, 0),
+        edge(true, 2, 1, std_px=0.2),
+        edge(true, 2, 0),
+        edge(true, 1, 3, std_px=0.05),
+        edge(true, 4, 3),
+        edge(true, 4, 2),
+    ]
+    solution = solve(5, edges, 1, SHAPE)
+    found = solution.assess().information
+
+    def cost(node: int, change: np.ndarray) -> float:
+        homographies = solution.homographies.copy()
+        homographies[node] = from_parameters(parameters(homographies[node]) + change)
+        total = 0.0
+        for each in (each for each in edges if node in (each.moving, each.fixed)):
+            relative = normalised(inverse(homographies[each.fixed]) @ homographies[each.moving])
+            missed = parameters(relative) - parameters(each.motion.homography)
+            total += missed @ each.motion.information @ missed / 2
+        return total
+
+    # Each step moves the corners by about as much.
+    steps = 1e-3 / np.array([250, 250, 250, 250, 1, 1, 250**2, 250**2])
+    for node in range(5):
+        curvature = np.zeros((8, 8))
+        for first, second in np.ndindex(8, 8):
+            for one, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                change = one * steps * (np.arange(8) == first) + other * steps * (np.arange(8) == second)
+                curvature[first, second] += one * other * cost(node, change) / 4
+        information = found[node] * np.outer(steps, steps)
+        np.testing.assert_allclose(information, curvature, rtol=0.01, atol=1e-3 * np.abs(information).max())
