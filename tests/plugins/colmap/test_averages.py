@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -171,11 +170,6 @@ def test_size_is_chosen_by_light_and_motion(flux: float, speed_px: float | None,
     chosen, reason = chosen_size(CaptureSummary(flux, speed_px, "measured"), n_frames)
     assert chosen == size
     assert f"averages of {size} frames hold" in reason
-
-
-def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert "needs pycolmap, which is not installed" in str(discover().find("pose-estimator", "colmap-averages").unavailable)
 
 
 def test_spline_is_exact_for_a_smooth_path_and_keeps_its_velocity_beyond() -> None:

@@ -1,4 +1,4 @@
-"""Super-resolution against known fluxes, with photon noise."""
+"""Super-resolution against known fluxes, and sharpening of what was interpolated, with photon noise."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Light, Panorama
+from photonpano import Light, Panorama
 from photonpano.geometry import Canvas, translation
 from photonpano.lighting import in_light
-from photonpano.merging import MergeRenderer
+from photonpano.merging import MergeRenderer, PhotonSum
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import SuperResolutionConfig
+from photonpano_core.dense_motion.frames import count_variance
+from photonpano_core.dense_motion.sharpening import sharpened
 from photonpano_core.super_resolution.collaborative import Patches, filter_groups, find_similar
 from photonpano_core.super_resolution.estimate import Observations, counts_in_light, expected, pixel_area, rounds_of
 from photonpano_core.super_resolution.renderer import SuperResolutionRenderer
@@ -152,14 +154,6 @@ def test_panorama_keeps_fine_detail_of_pixels_with_a_small_area() -> None:
     assert right > wrong + 1
 
 
-def test_frames_outside_of_the_span_do_not_count() -> None:
-    source, motion = capture(fine_scene())
-    renderer = SuperResolutionRenderer(SuperResolutionConfig(), 1, lambda *_: None)
-    span = FrameSpan(0, FRAMES)
-    panorama = renderer.render(source, motion, span, CANVAS, 0.125, lambda _: None)
-    assert panorama.weight.max() == pytest.approx(FRAMES, rel=0.3)
-
-
 @pytest.mark.parametrize("width", [0.3, 1.0, 2.0, 3.3])
 def test_pixel_area_is_the_convolution_of_pixel_cell_and_flux(width: float) -> None:
     """Integrate over random places of the middle of a pixel in a cell, and of a photon in the pixel."""
@@ -264,3 +258,73 @@ def test_black_parts_of_a_scene_are_estimated_and_predicted(caplog: pytest.LogCa
     assert panorama.flux[INNER][:, :20].max() < 1e-3
     assert "nan" not in "".join(reason for _, _, reason in decisions)
     assert decisions[0][1] > 1
+
+
+SHAPE, N = (96, 128), 5000
+RESPONSE = MemorySource(np.zeros((1, 4, 4), np.uint8)).response
+EVERYWHERE = np.ones(SHAPE, bool)
+
+
+def texture() -> np.ndarray:
+    """Probability of a photon, with detail of a few pixels."""
+    noise = np.random.default_rng(0).standard_normal(SHAPE)
+    return 0.35 + 0.25 * np.tanh(2 * cv2.GaussianBlur(noise, (0, 0), 1.0))
+
+
+def interpolated(mean: np.ndarray, fractions: np.ndarray) -> np.ndarray:
+    """Sums of photons of N frames, shifted by fractions of a pixel and linearly interpolated back."""
+    rng, parts = np.random.default_rng(1), len(fractions)
+    total = np.zeros(SHAPE, np.float32)
+    rows, columns = np.indices(SHAPE, np.float32)
+    for x, y in fractions.astype(np.float32):
+        there = cv2.remap(mean.astype(np.float32), columns - x, rows - y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        counts = rng.binomial(N // parts, np.clip(there, 0, 1)).astype(np.float32)
+        total += cv2.remap(counts, columns + x, rows + y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    return total
+
+
+FRACTIONS = np.random.default_rng(2).uniform(0, 1, (50, 2))
+BLUR = np.full(SHAPE, (FRACTIONS * (1 - FRACTIONS)).mean(), np.float32)
+
+
+def errors(mean: np.ndarray, counts: np.ndarray, blur: np.ndarray = BLUR) -> tuple[float, float]:
+    """Mean squared errors before and after."""
+    weight = np.full(SHAPE, N, np.float32)
+    found = sharpened(PhotonSum(counts, weight), blur, EVERYWHERE, RESPONSE)
+    inside = (slice(4, -4), slice(4, -4))
+    before, after = (float(np.mean((each / weight - mean)[inside] ** 2)) for each in (counts, found.counts))
+    return before, after
+
+
+def test_blur_of_interpolation_is_undone() -> None:
+    before, after = errors(texture(), interpolated(texture(), FRACTIONS))
+    assert after < 0.6 * before
+
+
+def test_photon_noise_of_a_plain_surface_is_not_amplified() -> None:
+    plain = np.full(SHAPE, 0.3)
+    before, after = errors(plain, interpolated(plain, FRACTIONS))
+    assert after < 1.05 * before
+
+
+def test_what_was_not_interpolated_is_not_sharpened() -> None:
+    counts = interpolated(texture(), np.zeros((1, 2)))
+    weight = np.full(SHAPE, N, np.float32)
+    found = sharpened(PhotonSum(counts, weight), np.zeros(SHAPE, np.float32), EVERYWHERE, RESPONSE)
+    np.testing.assert_allclose(found.counts, counts, rtol=1e-5)
+
+
+def test_pixels_beside_unseen_ones_and_outside_are_kept() -> None:
+    counts, weight = interpolated(texture(), FRACTIONS), np.full(SHAPE, N, np.float32)
+    counts[40, 50] = weight[40, 50] = 0
+    where = EVERYWHERE.copy()
+    where[:20] = False
+    found = sharpened(PhotonSum(counts, weight), BLUR, where, RESPONSE).counts
+    np.testing.assert_array_equal(found[39:42, 49:52], counts[39:42, 49:52])
+    np.testing.assert_array_equal(found[:20], counts[:20])
+    assert (found[60:80] != counts[60:80]).any()
+
+
+def test_variance_of_binary_counts_is_that_of_a_coin() -> None:
+    mean = np.linspace(0.05, 0.8, 16, dtype=np.float32)
+    assert count_variance(mean, RESPONSE) == pytest.approx(mean * (1 - mean), rel=0.03)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonpano import InputError, Located, NotLocated
+from photonpano import InputError, Located, NotLocated, StreamInfo, discover
 from photonpano.geometry import apply, corner_displacements, from_parameters
 
 pytest.importorskip("torch")
@@ -160,3 +160,20 @@ def test_images_below_32_px_are_rejected(build: Callable, photograph: Callable) 
     tiny = locator.describe(photograph(np.full((20, 40), 0.5)))
     assert locator.register(tiny, tiny, None).reason == "the images have 20 x 40 px, LoFTR needs at least 32 along each side"
     assert sum(each.nbytes for each in tiny) == 2 * 20 * 40
+
+
+def test_missing_weights_are_a_problem_of_the_spec(tmp_path: Path) -> None:
+    contribution = discover().find("locator", "kornia-loftr").contribution
+    stream = StreamInfo(100, 64, 96, frame_rate_hz=None)
+    weights = tmp_path / "loftr.ckpt"
+    config = contribution.config(weights=weights)
+    assert contribution.check(config, stream) == (
+        f"there is no file {weights} with weights of LoFTR, and nothing is downloaded: set `weights` to your file",
+    )
+    weights.touch()
+    assert contribution.check(config, stream) == ()
+
+
+def test_path_of_weights_is_relative_to_folder_of_spec(tmp_path: Path) -> None:
+    config = KorniaLoftrConfig.model_validate({"weights": "loftr.ckpt"}, context={"directory": tmp_path})
+    assert config.weights == tmp_path / "loftr.ckpt"

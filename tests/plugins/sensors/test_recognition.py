@@ -4,24 +4,39 @@ from __future__ import annotations
 
 import gzip
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from photonpano import FrameSpan, Recognised, Source, SourceContext, discover
 from photonpano.photometry import BinaryResponse
 
-NAMES = "packed-npy npy swissspad-half swissspad-full spad512 spad512-sparse mat-parts visionsim ubicept-h5"
+NAMES = (
+    "packed-npy npy zarr swissspad-half swissspad-full spad512 spad512-sparse mat-parts visionsim ubicept-h5 "
+    "video fastcam-mraw image-folder"
+)
 SOURCES = {name: discover().find("source", name).contribution for name in NAMES.split()}
+PHOTRON = Path(__file__).parents[2] / "data" / "photron"
+FRAMES = np.random.default_rng(0).integers(0, 2, (6, 10, 16), dtype=np.uint8)
 
 
 def recognised(path: Path) -> dict[str, Recognised]:
     """Return who takes a path for its own."""
     answers = {name: source.recognise(path) for name, source in SOURCES.items()}
     return {name: answer for name, answer in answers.items() if answer is not None}
+
+
+def reasons(path: Path) -> dict[str, str]:
+    """Return who takes a path for its own, and why; and check that the keys are a config of theirs."""
+    found = recognised(path)
+    assert all(SOURCES[name].config.model_validate(answer.keys).path == path for name, answer in found.items())
+    return {name: answer.because for name, answer in found.items()}
 
 
 def opened(name: str, keys: Any) -> Source:
@@ -79,9 +94,6 @@ def test_spad512_sparse_is_recognised_by_last_word(tmp_path: Path, bin_file: Cal
     assert set(recognised(tmp_path)) == {"spad512-sparse"}
 
 
-FRAMES = np.random.default_rng(0).integers(0, 2, (6, 10, 16), dtype=np.uint8)
-
-
 def test_packed_npy_is_recognised_by_header(tmp_path: Path) -> None:
     np.save(tmp_path / "cube.npy", np.packbits(FRAMES, axis=-1))
     found = recognised(tmp_path / "cube.npy")
@@ -123,12 +135,6 @@ def test_unpacked_bits_with_frames_last_are_recognised(tmp_path: Path, clouds: C
     )
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_sums_and_floats_are_not_recognised(tmp_path: Path, clouds: Callable[..., np.ndarray], dtype: Any) -> None:
-    np.save(tmp_path / "cube.npy", clouds().reshape(12, 32, 64, 96).sum(axis=1).astype(dtype))
-    assert recognised(tmp_path / "cube.npy") == {}
-
-
 @pytest.mark.parametrize(
     ("axis", "bit_order", "keys"),
     [
@@ -150,8 +156,17 @@ def test_order_of_packed_pixels_is_recognised(
         np.testing.assert_array_equal(source.frames(FrameSpan(0, 5)), frames[:5])
 
 
-def test_packed_frames_along_the_last_axis_are_not_recognised(tmp_path: Path, clouds: Callable[..., np.ndarray]) -> None:
-    np.save(tmp_path / "cube.npy", np.ascontiguousarray(np.moveaxis(np.packbits(clouds()[:, :32, :48], axis=2), 0, -1)))
+@pytest.mark.parametrize(
+    "stored",
+    [
+        lambda frames: frames.reshape(12, 32, 64, 96).sum(axis=1).astype(np.uint8),
+        lambda frames: frames.reshape(12, 32, 64, 96).sum(axis=1).astype(np.float32),
+        lambda frames: np.ascontiguousarray(np.moveaxis(np.packbits(frames[:, :32, :48], axis=2), 0, -1)),
+    ],
+    ids=["sums", "floats", "packed, frames last"],
+)
+def test_other_layouts_are_not_recognised(tmp_path: Path, clouds: Callable[..., np.ndarray], stored: Callable) -> None:
+    np.save(tmp_path / "cube.npy", stored(clouds()))
     assert recognised(tmp_path / "cube.npy") == {}
 
 
@@ -181,10 +196,50 @@ def test_mat_parts_and_ubicept_are_recognised_by_name(tmp_path: Path) -> None:
     assert set(recognised(tmp_path / "capture.ubi.h5")) == {"ubicept-h5"}
 
 
+@pytest.mark.parametrize(
+    ("name", "because"),
+    [("beam.cihx", "beam.mraw beside it holds the frames"), ("beam.mraw", "beam.cihx beside it is its header")],
+)
+def test_fastcam_recordings_are_recognised(name: str, because: str) -> None:
+    assert reasons(PHOTRON / name) == {"fastcam-mraw": because}
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "because"),
+    [
+        ("a.avi", "mjpeg", "by its first bytes it is an AVI file"),
+        ("a.mp4", "mpeg4", "by its first bytes it is an MP4 or MOV file"),
+        ("a.mkv", "mpeg4", "by its first bytes it is a Matroska or WebM file"),
+    ],
+)
+def test_videos_are_recognised_by_their_first_bytes(
+    moving: Callable, write_video: Callable, tmp_path: Path, name: str, codec: str, because: str
+) -> None:
+    path = write_video(moving(2), name, codec, "yuvj420p" if codec == "mjpeg" else "yuv420p")
+    assert reasons(shutil.copy(path, tmp_path / "without-a-suffix")) == {"video": because}
+
+
+def test_pictures_and_infinicam_files_are_recognised(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
+    tifffile.imwrite(tmp_path / "b.tif", np.zeros((2, 4, 4), np.uint8))
+    (tmp_path / "c.mdat").touch()
+    (tmp_path / "c.cih").touch()
+    assert reasons(tmp_path / "b.tif") == {"image-folder": "by its first bytes it is a TIFF file"}
+    assert reasons(tmp_path / "c.mdat") == {"fastcam-mraw": "Photron's cameras write .mdat files"}
+    assert reasons(tmp_path / "c.cih") == {"fastcam-mraw": "c.mdat beside it holds the frames"}
+    (tmp_path / "b.tif").unlink()
+    assert reasons(tmp_path) == {"image-folder": "it holds 1 .png file"}
+
+
 def test_other_files_are_not_recognised(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    (tmp_path / "empty.bin").touch()
-    (tmp_path / "text.bin").write_bytes(b"some text of no length in particular")
-    (tmp_path / "capture.ubi.h5").write_bytes(b"no HDF5")
-    for path in (*tmp_path.iterdir(), tmp_path / "nothing"):
+    for name, content in {
+        "empty.bin": b"",
+        "text.bin": b"some text of no length in particular",
+        "capture.ubi.h5": b"no HDF5",
+        "a.npy": b"\x93NUMPY",
+        "lonely.cih": b"",
+    }.items():
+        (tmp_path / name).write_bytes(content)
+    for path in (*tmp_path.iterdir(), tmp_path / "nothing", tmp_path / "missing.mp4"):
         assert recognised(path) == {}

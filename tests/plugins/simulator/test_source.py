@@ -1,24 +1,95 @@
+"""Simulated captures of a plane: settings, frames, truth and sensors."""
+
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from photonpano import FrameSpan, InputError
+from photonpano import FrameSpan, InputError, SourceContext
 from photonpano.captures.writing import write_packed
 from photonpano.testing.scenes import z_scores
+from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig
+from photonpano_simulator.hooks import photonpano_sources
+from photonpano_simulator.sensor import Draw, IntensityCamera, SpadSensor, generator
+from photonpano_simulator.source import SimulatorSource
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
+SIMULATOR, CAMERA, _ = photonpano_sources()
 
-    from photonpano_simulator.source import SimulatorSource
 
-    Simulated = Callable[..., SimulatorSource]
+def problems(**settings: Any) -> list[str]:
+    return list(SIMULATOR.check(SimulatorConfig.model_validate(settings)))
 
+
+def test_defaults_are_small_demos() -> None:
+    config = SimulatorConfig()
+    assert (config.n_frames, config.frame_shape, config.scene.kind, config.path.kind) == (2000, (254, 496), "street", "pan")
+    assert problems() == []
+    camera = CAMERA.config()
+    assert (camera.n_frames, camera.frame_rate_hz, camera.sensor.bits) == (200, 500, 8)
+    assert CAMERA.check(camera) == []
+
+
+def test_relative_paths_are_relative_to_the_spec(tmp_path: Path) -> None:
+    config = SimulatorConfig.model_validate(
+        {"scene": {"kind": "photo", "file": "a.png"}, "sensor": {"dark_rates": "b.npy"}}, context={"directory": tmp_path}
+    )
+    assert list(SIMULATOR.check(config)) == [
+        f"there is no file {tmp_path / 'b.npy'}; check the path",
+        f"there is no file {tmp_path / 'a.png'}; check the path",
+    ]
+
+
+def test_check_refuses_path_that_leaves_the_street() -> None:
+    scene = {"kind": "street", "width": 800, "height": 600}
+    assert problems(scene=scene, path={"kind": "pan", "length_px": 400, "shake": {}}, n_frames=1_000_000) == [
+        "the camera path leaves the scene of 800x600 px by 49.1 px at the right, 100% of the way along; "
+        "shorten or move the path, or take a larger scene"
+    ]
+    (problem,) = problems(path={"kind": "file", "file": "nowhere.npy"})
+    assert problem == "there is no file nowhere.npy; check the path"
+
+
+def test_check_refuses_dropped_frames_that_do_not_exist() -> None:
+    assert problems(drops=[{"at": 1990, "frames": 20}], repeats=[{"at": 2000}]) == [
+        "drops names the frames 1990 to 2009, but the camera takes 2000 frames (0 to 1999); shorten the range, "
+        "or raise n_frames",
+    ]
+    assert problems(drops=[{"at": 0, "frames": 2000}]) == ["drops leaves none of the 2000 frames; drop fewer of them"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "place"),
+    [
+        ({"flux": 0}, "flux"),
+        ({"flux": float("nan")}, "flux"),
+        ({"n_frames": 0}, "n_frames"),
+        ({"frame_shape": (254, 4)}, "frame_shape"),
+        ({"sensor": {"quantum_efficiency": 1.5}}, "sensor"),
+        ({"sensor": {"hot_rate": (0, 1)}}, "sensor"),
+        ({"path": {"kind": "zigzag"}}, "path"),
+        ({"path": {"kind": "pan", "rows": 3}}, "path"),
+        ({"path": {"kind": "pan", "shake": {"frequencies_hz": ()}}}, "path"),
+        ({"lens": {"k1": 0.3}}, "lens"),
+        ({"lens": {"vignette": 1.1}}, "lens"),
+        ({"objects": [{"size": (0, 1)}]}, "objects"),
+        ({"drops": [{"frames": 3}]}, "drops"),
+        ({"drift": 0}, "drift"),
+        ({"exposure": 1}, "exposure"),
+    ],
+)
+def test_values_out_of_range_are_refused(settings: dict[str, Any], place: str) -> None:
+    with pytest.raises(ValidationError) as caught:
+        SimulatorConfig.model_validate(settings)
+    assert {error["loc"][0] for error in caught.value.errors()} == {place}
+
+
+Simulated = Callable[..., SimulatorSource]
 NOISY = {"sensor": {"dark_rate": 0.01, "hot_fraction": 0.05}, "path": {"kind": "loop", "length_px": 100, "shake": {}}}
 
 
@@ -27,29 +98,6 @@ def opencv_threads() -> Iterator[None]:
     before = cv2.getNumThreads()
     yield
     cv2.setNumThreads(before)
-
-
-def test_info_describes_the_frames(simulated: Simulated) -> None:
-    with simulated(frame_rate_hz=1000) as source:
-        info = source.info
-        assert (info.n_frames, info.frame_shape, info.frame_rate_hz) == (50, (40, 52), 1000)
-        assert (info.kind, info.bit_depth) == ("binary", 1)
-        frames = source.frames(info.span)
-    assert (frames.shape, frames.dtype) == ((50, 40, 52), np.uint8)
-    assert set(np.unique(frames)) == {0, 1}
-
-
-def test_frames_are_the_same_in_any_order_and_from_any_thread(simulated: Simulated) -> None:
-    with simulated(**NOISY) as source:
-        frames = source.frames(source.info.span)
-        order = np.random.default_rng(0).permutation(50)
-        with ThreadPoolExecutor(4) as pool:
-            again = list(pool.map(lambda index: source.frames(FrameSpan(index, index + 1))[0], order.tolist()))
-        np.testing.assert_array_equal(again, frames[order])
-        np.testing.assert_array_equal(source.counts(FrameSpan(7, 31)), frames[7:31].sum(axis=0))
-        assert source.counts(FrameSpan(0, 1)).dtype == np.uint32
-    with simulated(**NOISY) as other:
-        np.testing.assert_array_equal(other.frames(FrameSpan(20, 50)), frames[20:])
 
 
 @pytest.mark.usefixtures("opencv_threads")
@@ -102,14 +150,11 @@ def test_hot_pixels_do_not_change_the_others(simulated: Simulated) -> None:
     clean = simulated(flux=0.2)
     hot = simulated(flux=0.2, sensor={"hot_fraction": 0.1, "mask_hot_pixels": True})
     assert clean.valid.all()
+    assert simulated(sensor={"hot_fraction": 0.1}).valid.all()
     assert 0.07 < 1 - hot.valid.mean() < 0.13
     span = clean.info.span
     np.testing.assert_array_equal(clean.frames(span)[:, hot.valid], hot.frames(span)[:, hot.valid])
     assert hot.counts(span)[~hot.valid].mean() > 1.5 * clean.counts(span)[~hot.valid].mean()
-
-
-def test_hot_pixels_are_valid_unless_they_are_masked(simulated: Simulated) -> None:
-    assert simulated(sensor={"hot_fraction": 0.1}).valid.all()
 
 
 def test_written_capture_has_the_same_frames(simulated: Simulated, tmp_path: Path) -> None:
@@ -132,14 +177,6 @@ def test_written_capture_has_the_same_frames(simulated: Simulated, tmp_path: Pat
     np.testing.assert_allclose(replayed.truth()["homographies"], homographies, rtol=0, atol=1e-12)
 
 
-def test_span_beyond_the_end_is_refused(simulated: Simulated) -> None:
-    with simulated() as source:
-        for read in (source.counts, source.frames):
-            with pytest.raises(InputError) as caught:
-                read(FrameSpan(40, 51))
-            assert str(caught.value) == "frames 40 to 50 were requested, but the capture has 50 frames (0 to 49)"
-
-
 @pytest.mark.parametrize(("fill_factor", "side"), [(1.0, 4), (0.25, 2), (0.05, 1)])
 def test_pixels_before_a_finer_scene_average_it_over_their_areas(simulated: Simulated, fill_factor: float, side: int) -> None:
     keys = {"scene_scale": 4, "fill_factor": fill_factor, "path": {"kind": "pan", "length_px": 1e-9}, "flux": 0.3}
@@ -158,7 +195,7 @@ def test_pixels_before_a_finer_scene_average_it_over_their_areas(simulated: Simu
 
 
 def test_path_of_a_finer_scene_is_in_pixels_of_a_frame(simulated: Simulated) -> None:
-    keys = {"scene": {"kind": "street", "width": 600, "height": 400}, "path": {"kind": "pan", "length_px": 40}}
+    keys = {"path": {"kind": "pan", "length_px": 40}}
     with simulated(**keys) as coarse, simulated(scene_scale=2, **keys) as fine:
         middles = [
             np.array([h @ (25.5, 19.5, 1) / (h @ (25.5, 19.5, 1))[2] for h in source.truth()["homographies"]])
@@ -167,3 +204,141 @@ def test_path_of_a_finer_scene_is_in_pixels_of_a_frame(simulated: Simulated) -> 
     moved, moved_fine = (np.linalg.norm(each[-1] - each[0]) for each in middles)
     assert (moved, moved_fine) == (pytest.approx(40, rel=1e-3), pytest.approx(80, rel=1e-3))
     np.testing.assert_allclose(middles[0].mean(axis=0), middles[1].mean(axis=0), atol=0.1)
+
+
+SHAPE = (60, 81)
+CAMERA_SHAPE = (200, 301)
+
+
+def counts(sensor: SpadSensor, flux: float, n_frames: int) -> np.ndarray:
+    total = np.zeros(SHAPE)
+    for index in range(n_frames):
+        total += sensor.expose(np.full(SHAPE, flux, np.float32), generator(0, Draw.PHOTONS, index))
+    return total
+
+
+@pytest.mark.parametrize(("flux", "dark"), [(0.5, 0.0), (0.02, 0.0), (0.1, 0.05), (3.0, 0.0), (0.0, 0.01)])
+def test_pixel_is_lit_with_probability_of_equation_2(flux: float, dark: float) -> None:
+    n = 400
+    chance = 1 - np.exp(-(flux + dark))
+    z = z_scores(counts(SpadSensor(Sensor(dark_rate=dark), SHAPE, 0), flux, n), n, flux + dark)
+    assert abs(z.mean()) < 5 / np.sqrt(z.size)
+    # The variance of a binomial count's square deviation is 2 + (1 - 6 p (1 - p)) / (n p (1 - p)).
+    kurtosis = 2 + (1 - 6 * chance * (1 - chance)) / (n * chance * (1 - chance))
+    assert abs(z.var() - 1) < 5 * np.sqrt(kurtosis / z.size)
+
+
+def test_zero_flux_lights_no_pixel_and_high_flux_all() -> None:
+    sensor = SpadSensor(Sensor(), SHAPE, 0)
+    assert counts(sensor, 0.0, 200).max() == 0
+    assert counts(sensor, 1e6, 200).min() == 200
+
+
+def test_small_probabilities_are_not_rounded() -> None:
+    """At 8 bits a chance of 1 / 1000 would be 0 or 1 / 256."""
+    n = 1000
+    lit = counts(SpadSensor(Sensor(), SHAPE, 0), 1e-3, n).sum()
+    expected = n * SHAPE[0] * SHAPE[1] * -np.expm1(-1e-3)
+    assert abs(lit - expected) < 5 * np.sqrt(expected)
+
+
+def test_hot_pixels_have_fraction_and_rates_of_the_config() -> None:
+    sensor = SpadSensor(Sensor(hot_fraction=0.3, hot_rate=(0.01, 1.0), dark_rate=0.5), (200, 200), seed=3)
+    share = sensor.hot.mean()
+    assert abs(share - 0.3) < 5 * np.sqrt(0.3 * 0.7 / 40_000)
+    np.testing.assert_array_equal(sensor.dark_rates[~sensor.hot], np.float32(0.5))
+    logarithms = np.log10(sensor.dark_rates[sensor.hot] - 0.5)
+    assert -2.001 < logarithms.min() < -1.95
+    assert -0.05 < logarithms.max() < 0.001
+    assert abs(logarithms.mean() + 1) < 5 * 2 / np.sqrt(12 * logarithms.size)
+    assert (SpadSensor(Sensor(hot_fraction=0.3), (200, 200), seed=4).hot != sensor.hot).any()
+
+
+def test_files_of_rates_and_hot_pixels_are_added(tmp_path: Path) -> None:
+    rates, hot = np.zeros(SHAPE), np.zeros(SHAPE, bool)
+    rates[3, 4], hot[5, 6] = 0.25, True
+    np.save(tmp_path / "rates.npy", rates)
+    np.save(tmp_path / "hot.npy", hot)
+    config = Sensor(dark_rate=0.01, dark_rates=tmp_path / "rates.npy", hot_pixels=tmp_path / "hot.npy", hot_rate=(0.5, 0.5))
+    sensor = SpadSensor(config, SHAPE, 0)
+    expected = np.full(SHAPE, 0.01)
+    expected[3, 4] += 0.25
+    expected[5, 6] += 0.5
+    np.testing.assert_allclose(sensor.dark_rates, expected, rtol=1e-6)
+    np.testing.assert_array_equal(sensor.hot, hot)
+
+
+@pytest.mark.parametrize(
+    ("field", "array", "message"),
+    [
+        (
+            "dark_rates",
+            np.zeros((2, 3)),
+            "{path} holds float64 of shape (2, 3); rates are numbers of the frame's shape (60, 81)",
+        ),
+        ("dark_rates", np.full(SHAPE, -1.0), "{path} holds rates that are negative or not finite"),
+        ("dark_rates", np.full(SHAPE, np.nan), "{path} holds rates that are negative or not finite"),
+        ("hot_pixels", np.zeros(SHAPE), "{path} holds float64 of shape (60, 81); a mask is bool of the frame's shape (60, 81)"),
+        ("hot_pixels", np.array([{}]), "{path} is not a mask: it is no .npy or .npz file of plain numbers"),
+        ("hot_pixels", None, "there is no file {path}; check the path"),
+    ],
+)
+def test_wrong_rate_and_mask_files_are_refused(tmp_path: Path, field: str, array: np.ndarray | None, message: str) -> None:
+    path = tmp_path / "file.npy"
+    if array is not None:
+        np.save(path, array)
+    with pytest.raises(InputError) as caught:
+        SpadSensor(Sensor.model_validate({field: path}), SHAPE, 0)
+    assert str(caught.value) == message.format(path=path)
+
+
+def test_archive_is_refused_as_a_mask(tmp_path: Path) -> None:
+    path = tmp_path / "truth.npz"
+    np.savez(path, hot=np.zeros(SHAPE, bool))
+    with pytest.raises(InputError) as caught:
+        SpadSensor(Sensor(hot_pixels=path), SHAPE, 0)
+    assert str(caught.value) == f"{path} is an archive; name a .npy file"
+
+
+def exposed(flux: float, **keys: float) -> tuple[IntensityCamera, np.ndarray]:
+    camera = IntensityCamera(IntensitySensor(**keys), CAMERA_SHAPE)
+    return camera, camera.expose(np.full(CAMERA_SHAPE, flux, np.float32), generator(0, Draw.PHOTONS))
+
+
+@pytest.mark.parametrize(("bits", "read_noise"), [(8, 20.0), (8, 0.0), (12, 20.0), (16, 5.0)])
+def test_levels_have_mean_and_noise_of_the_response(bits: int, read_noise: float) -> None:
+    flux = 1000.0
+    camera, levels = exposed(flux, bits=bits, read_noise=read_noise, black_level=10)
+    estimate = camera.response.flux(levels.astype(np.float32), 1)
+    variance = flux + camera.response.read_noise**2
+    assert estimate.mean(dtype=np.float64) == pytest.approx(flux, abs=5 * np.sqrt(variance / levels.size))
+    assert estimate.var(dtype=np.float64) == pytest.approx(variance, rel=0.05)
+
+
+def test_pixel_saturates_at_full_well() -> None:
+    _, levels = exposed(20_000, bits=12)
+    assert (levels == 4095).all()
+
+
+def test_open_shutter_blurs_along_the_motion_and_keeps_the_flux() -> None:
+    def frame(exposure: float) -> np.ndarray:
+        config = CameraSimulatorConfig.model_validate(
+            {
+                "scene": {"kind": "street", "width": 512, "height": 341},
+                "path": {"kind": "pan", "length_px": 200},
+                "n_frames": 11,
+                "frame_shape": (80, 100),
+                "sensor": {"full_well": 1e7, "bits": 16, "read_noise": 0, "exposure": exposure},
+                "flux": 1e6,
+            }
+        )
+        with SimulatorSource(config, SourceContext()) as source:
+            return source.counts(FrameSpan(5, 6)).astype(float)
+
+    sharp, blurred = frame(0.0), frame(0.8)
+    assert blurred[:, 20:-20].mean() == pytest.approx(sharp[:, 20:-20].mean(), rel=0.05)
+    # 16 px along x, as an average of the sharp one over as many says.
+    averaged = np.mean([np.roll(sharp, shift, axis=1) for shift in range(-8, 9)], axis=0)
+    inside = np.s_[:, 12:-12]
+    assert np.corrcoef(blurred[inside].ravel(), averaged[inside].ravel())[0, 1] > 0.99
+    assert np.corrcoef(blurred[inside].ravel(), sharp[inside].ravel())[0, 1] < 0.95

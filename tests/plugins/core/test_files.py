@@ -1,3 +1,5 @@
+"""Captures in .npy files, packed and not, and in files without a header: layouts, compression, and what is refused."""
+
 from __future__ import annotations
 
 import gzip
@@ -9,27 +11,37 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from pydantic import ValidationError
 
-from photonpano import FrameSpan, InputError, OutputError, SourceContext
-from photonpano.reading import PackedFileSource
-from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
+from photonpano import FrameSpan, InputError, OutputError, PackedSource, Piped, Source, SourceContext
+from photonpano.photometry import BinarySumResponse
+from photonpano_core.sources.npy import NPY, PACKED_NPY, NpyConfig, PackedNpyConfig
+from photonpano_core.sources.packed_raw import PACKED_RAW, PackedRawConfig
 
 
 def cube(n: int = 40, height: int = 6, width: int = 24, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 2, (n, height, width), dtype=np.uint8)
 
 
-def saved(path: Path, array: np.ndarray, **options: Any) -> Path:
-    np.save(path, array, **options)
+BITS, PACKED = cube(width=19), np.packbits(cube(), axis=-1)
+SUMS = np.random.default_rng(1).integers(0, 301, (40, 6, 19), dtype=np.uint16)
+
+
+def saved(path: Path, array: np.ndarray) -> Path:
+    np.save(path, array)
     return path
 
 
-def opened(path: Path, **config: Any) -> PackedFileSource:
-    source = PACKED_NPY.build(PackedNpyConfig(path=path, **config), SourceContext())
-    assert isinstance(source, PackedFileSource)
-    return source
+def opened(path: Path, **config: Any) -> PackedSource:
+    return PACKED_NPY.build(PackedNpyConfig(path=path, **config), SourceContext())
+
+
+def unpacked(path: Path, **config: Any) -> Source:
+    return NPY.build(NpyConfig(path=path, **config), SourceContext())
+
+
+def frames_last(frames: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(np.moveaxis(frames, 0, -1))
 
 
 ALONG = {"packed_along": "height"}
@@ -80,12 +92,6 @@ def test_frames_are_read_in_any_layout(tmp_path: Path, layout: str) -> None:
             np.testing.assert_array_equal(source.packed(span), np.packbits(part, axis=-1))
 
 
-def test_width_defaults_to_whole_bytes(tmp_path: Path) -> None:
-    path = saved(tmp_path / "cube.npy", np.packbits(cube(width=19), axis=-1))
-    with opened(path) as source:
-        assert source.info.frame_shape == (6, 24)
-
-
 def test_lit_padding_bits_are_ignored(tmp_path: Path) -> None:
     with opened(saved(tmp_path / "cube.npy", np.full((3, 2, 2), 255, np.uint8)), width=11) as source:
         np.testing.assert_array_equal(source.counts(FrameSpan(0, 3)), np.full((2, 11), 3))
@@ -132,40 +138,6 @@ def test_full_disk_is_reported_before_unpacking(gzipped: Path, monkeypatch: pyte
     assert list(gzipped.parent.iterdir()) == [gzipped]
 
 
-PACKED = np.packbits(cube(), axis=-1)
-
-
-def test_file_that_shrinks_while_read_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "cube.npy"
-    np.save(path, np.zeros((100, 16, 2), np.uint8))
-    with opened(path) as source:
-        os.truncate(path, 1000)
-        assert not source.counts(FrameSpan(0, 10)).any()
-        with pytest.raises(InputError) as caught:
-            source.counts(FrameSpan(10, 100))
-    assert str(caught.value) == f"{path} has become shorter while it was read; copy or record it again"
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("fuzz")
-
-
-@settings(deadline=None, max_examples=100)
-@given(changes=st.dictionaries(st.integers(0, 127), st.integers(0, 255), min_size=1, max_size=4))
-def test_damaged_headers_raise_input_error_only(folder: Path, changes: dict[int, int]) -> None:
-    path = saved(folder / "cube.npy", PACKED)
-    content = bytearray(path.read_bytes())
-    for place, value in changes.items():
-        content[place] = value
-    path.write_bytes(content)
-    try:
-        with opened(path) as source:
-            source.counts(FrameSpan(0, 1))
-    except InputError:
-        pass
-
-
 def problem_of(path: Path, array: np.ndarray, **config: Any) -> str | None:
     """Return what the check says of an array."""
     problems = PACKED_NPY.check(PackedNpyConfig(path=saved(path, array), **config))
@@ -195,3 +167,100 @@ def test_layout_of_a_compressed_capture_is_checked(tmp_path: Path, clouds: Calla
         np.save(file, np.packbits(clouds(), axis=2, bitorder="little"))
     (problem,) = PACKED_NPY.check(PackedNpyConfig(path=path))
     assert problem.endswith("write bit_order: little, or bit_order: big if it is right")
+
+
+@pytest.mark.parametrize("dtype", [bool, np.uint8, np.int64, ">u2"])
+@pytest.mark.parametrize("last", [False, True])
+def test_bits_of_any_integer_type_are_a_packed_source(tmp_path: Path, dtype: Any, last: bool) -> None:
+    stored = frames_last(BITS) if last else BITS
+    path = saved(tmp_path / "cube.npy", stored.astype(dtype))
+    with unpacked(path, holds="bits", frame_axis="last" if last else "first", frame_rate_hz=96800) as source:
+        assert str(source.info) == "40 binary frames of 6x19 at 96,800 Hz"
+        assert isinstance(source, PackedSource)
+        span = FrameSpan(3, 30)
+        np.testing.assert_array_equal(source.frames(span), BITS[3:30])
+        np.testing.assert_array_equal(source.packed(span), np.packbits(BITS[3:30], axis=-1))
+        np.testing.assert_array_equal(source.counts(span), BITS[3:30].sum(axis=0))
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.int64, ">u2"])
+@pytest.mark.parametrize("last", [False, True])
+def test_sums_have_the_response_of_their_number(tmp_path: Path, dtype: Any, last: bool) -> None:
+    stored = frames_last(SUMS) if last else SUMS
+    path = saved(tmp_path / "cube.npy", stored.astype(dtype))
+    with unpacked(path, holds="sums", frames_per_sum=300, frame_axis="last" if last else "first") as source:
+        assert str(source.info) == "40 9-bit frames of 6x19"
+        assert source.response == BinarySumResponse(300)
+        frames = source.frames(FrameSpan(3, 30))
+        assert frames.dtype == np.uint16
+        np.testing.assert_array_equal(frames, SUMS[3:30])
+        np.testing.assert_array_equal(source.counts(FrameSpan(3, 30)), SUMS[3:30].sum(axis=0))
+
+
+def test_long_span_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("photonpano.reading.packed_files._READ_BYTES", 7 * 6 * 19)
+    with unpacked(saved(tmp_path / "cube.npy", BITS), holds="bits") as source:
+        np.testing.assert_array_equal(source.frames(source.info.span), BITS)
+        np.testing.assert_array_equal(source.counts(FrameSpan(1, 40)), BITS[1:].sum(axis=0))
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"holds": "sums"}, "sums need frames_per_sum, the number of binary frames in each"),
+        ({"holds": "bits", "frames_per_sum": 3}, "frames_per_sum is for sums; leave it out, or write holds: sums"),
+    ],
+)
+def test_frames_per_sum_belongs_to_sums(keys: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        NpyConfig(path=Path("cube.npy"), **keys)
+
+
+def test_axis_of_frames_that_the_spec_states_is_believed(tmp_path: Path, clouds: Callable) -> None:
+    path = saved(tmp_path / "cube.npy", frames_last(clouds()))
+    for frames in ("first", "last"):
+        assert list(NPY.check(NpyConfig(path=path, holds="bits", frame_axis=frames))) == []
+
+
+def test_frames_before_a_wrong_value_are_read(tmp_path: Path) -> None:
+    array = BITS.copy()
+    array[21, 4, 17] = 2
+    with unpacked(saved(tmp_path / "cube.npy", array), holds="bits") as source:
+        source.counts(FrameSpan(0, 21))
+        for read in (source.counts, source.frames):
+            with pytest.raises(InputError, match="holds the value 2 in frame 21, row 4, column 17"):
+                read(FrameSpan(10, 30))
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "keys", "message"),
+    [
+        (
+            47,
+            {},
+            "{path} ends within a frame: after 3 frames of 15 bytes come 2 bytes more; correct height and width, or cut off "
+            "the rest with `truncate -s 45 {path}`",
+        ),
+        (14, {}, "{path} has 14 bytes, and a frame of 5x20 px takes 15; correct height and width"),
+        (
+            45,
+            {"header_bytes": 40},
+            "{path} has 45 bytes, and a frame of 5x20 px takes 15 after 40 bytes; correct height and width",
+        ),
+    ],
+)
+def test_file_without_whole_frames_is_refused(tmp_path: Path, n_bytes: int, keys: dict[str, int], message: str) -> None:
+    path = tmp_path / "capture.raw"
+    path.write_bytes(bytes(n_bytes))
+    with pytest.raises(InputError) as caught:
+        PACKED_RAW.build(PackedRawConfig(path=path, height=5, width=20, **keys), SourceContext())
+    assert str(caught.value) == message.format(path=path)
+
+
+def test_standard_input_is_for_following() -> None:
+    config = PackedRawConfig(path="-", height=5, width=20, header_bytes=7)
+    assert PACKED_RAW.arrived is not None
+    assert PACKED_RAW.arrived(config) == Piped(header_bytes=7, frame_bytes=15)
+    assert PACKED_RAW.check(config) == ()
+    with pytest.raises(InputError, match="run with --follow, or name a file"):
+        PACKED_RAW.build(config, SourceContext())

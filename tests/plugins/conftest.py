@@ -40,3 +40,15 @@ WRITERS = {
 def bin_file() -> Callable[[str, np.ndarray], bytes]:
     """Make the content of a .bin file of a source from frames (n, H, W)."""
     return lambda source, frames: WRITERS[source](frames)
+
+
+@pytest.fixture
+def moving() -> Callable[..., np.ndarray]:
+    """Return frames, (n, 48, 66) uint8, of a pattern that moves by a pixel a frame, so that each differs from all others."""
+
+    def make(n_frames: int = 40) -> np.ndarray:
+        rows = np.linspace(40, 200, 48)[:, None]
+        wave = 25 * np.sin(np.arange(66 + n_frames) / 3)
+        return np.stack([rows + wave[first : first + 66] for first in range(n_frames)]).astype(np.uint8)
+
+    return make

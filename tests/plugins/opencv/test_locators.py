@@ -1,0 +1,234 @@
+"""What the conformance kit does not test of the locators of OpenCV."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from photonpano import Located, NotLocated, VirtualExposure
+from photonpano.geometry import apply, corner_displacements, from_parameters, generators, jacobian, translation
+from photonpano.locating import View
+from photonpano_opencv.brightness import EccLocator, PhaseCorrelationLocator
+from photonpano_opencv.configs import OpencvEccConfig, OpencvOrbConfig, PhaseCorrelationConfig
+from photonpano_opencv.keypoints import Keypoints, OrbLocator
+from photonpano_opencv.matching import match_everywhere, match_nearby, unit_bits, unit_descriptors
+
+SHAPE = (160, 240)
+STILL = np.eye(3)
+ECC = EccLocator(OpencvEccConfig())
+PHASE = PhaseCorrelationLocator(PhaseCorrelationConfig())
+
+
+def register(
+    locator: EccLocator | PhaseCorrelationLocator, moving: VirtualExposure, fixed: VirtualExposure
+) -> Located | NotLocated:
+    return locator.register(locator.describe(moving), locator.describe(fixed), None)
+
+
+def test_pyramid_is_finest_first_and_ends_above_smallest_side(seen_from: Callable) -> None:
+    views = ECC.describe(seen_from(STILL))
+    assert [view.shape for view in views] == [(160, 240), (80, 120), (40, 60)]
+    assert len(EccLocator(OpencvEccConfig(pyramid_levels=1)).describe(seen_from(STILL))) == 1
+
+
+def test_ecc_locates_pair_of_different_brightness_with_less_certainty(seen_from: Callable) -> None:
+    """The correlation coefficient does not depend on brightness; the expected error does."""
+    true = translation(10, -3)
+    equal, dimmed = (register(ECC, seen_from(true, 1), seen_from(STILL, 2, brightness)) for brightness in (1.0, 0.7))
+    for motion in (equal, dimmed):
+        assert isinstance(motion, Located), motion
+        assert corner_displacements(motion.homography, true, SHAPE).mean() < 0.15
+    assert dimmed.residual_px > 2 * equal.residual_px
+
+
+def test_ecc_skips_layers_that_fail(seen_from: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    find = cv2.findTransformECCWithMask
+
+    def on_fine_levels_only(moving: np.ndarray, *rest: object) -> object:
+        if moving.shape != SHAPE:
+            raise cv2.error("the coarse levels see nothing")
+        return find(moving, *rest)
+
+    monkeypatch.setattr(cv2, "findTransformECCWithMask", on_fine_levels_only)
+    true = translation(10.5, -3.25)
+    motion = register(ECC, seen_from(true, 1), seen_from(STILL, 2))
+    assert isinstance(motion, Located), motion
+    assert motion.evidence["aligned_levels"] == 1
+    assert corner_displacements(motion.homography, true, SHAPE).mean() < 0.15
+
+
+def test_ecc_reports_error_of_opencv_as_reason(seen_from: Callable) -> None:
+    """From an initial motion without overlap OpenCV raises on every layer."""
+    pair = (ECC.describe(seen_from(each, seed)) for seed, each in enumerate((STILL, STILL)))
+    motion = ECC.register(*pair, translation(235, 0))
+    assert isinstance(motion, NotLocated)
+    assert motion.reason == "the correlation cannot be maximised: NaN encountered"
+
+
+def described(exposure: object, **config: object) -> Keypoints:
+    return OrbLocator(OpencvOrbConfig.model_validate(config), seed=0).describe(exposure)
+
+
+def test_keypoints_of_coarse_levels_are_not_off_by_half_a_pixel(seen_from: Callable) -> None:
+    """The keypoints of an exposure turned by 180 degrees are those of the exposure, turned."""
+    exposure = seen_from(np.eye(3))
+    here = described(exposure)
+    turned = described(replace(exposure, flux=exposure.flux[::-1, ::-1].copy(), weight=exposure.weight[::-1, ::-1].copy()))
+    back = np.array([SHAPE[1] - 1, SHAPE[0] - 1]) - turned.points
+    offsets = []
+    for point, size in zip(here.points, here.sizes, strict=True):
+        distances = np.linalg.norm(back - point, axis=1)
+        distances[turned.sizes != size] = np.inf
+        if size > 31 * 1.2**2.5 and distances.min() < 2:
+            offsets.append(back[distances.argmin()] - point)
+    assert len(offsets) > 50
+    # Where OpenCV says that they are, it is half a pixel.
+    assert np.abs(np.mean(offsets, axis=0)).max() < 0.1
+
+
+def test_information_accounts_for_common_rounding_of_keypoints(seen_from: Callable) -> None:
+    """A shift of a third of a pixel, which rounding to whole pixels hides."""
+    locator, true = OrbLocator(OpencvOrbConfig(), seed=0), translation(0.3, -0.2)
+    motion = locator.register(locator.describe(seen_from(true, 1)), locator.describe(seen_from(np.eye(3), 2)), None)
+    assert isinstance(motion, Located)
+    assert 0.1 < corner_displacements(motion.homography, true, SHAPE).mean() < 0.6
+    assert np.diag(np.linalg.inv(motion.information)[4:6, 4:6]).min() > 1 / 12
+
+
+def waves(x_px: float, y_px: float) -> View:
+    """A sum of 40 plane waves, shifted: band-limited, so that the shift is exact."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:80, :120]
+    image = np.zeros(x.shape)
+    for fx, fy, phase in rng.uniform(-0.1, 0.1, (40, 3)) * [1, 1, 30]:
+        image += np.cos(2 * np.pi * (fx * (x - x_px) + fy * (y - y_px)) + phase)
+    return View(image.astype(np.float32), np.ones(image.shape, np.float32), 1.0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(x_px=st.floats(-8, 8), y_px=st.floats(-8, 8))
+def test_phase_correlation_finds_sub_pixel_shifts(x_px: float, y_px: float) -> None:
+    motion = PHASE.register(waves(0, 0), waves(x_px, y_px), None)
+    assert isinstance(motion, Located), motion
+    np.testing.assert_allclose(motion.homography, translation(x_px, y_px), atol=0.2)
+
+
+def test_phase_correlation_drops_roll_and_perspective_of_initial_motion(seen_from: Callable) -> None:
+    """Otherwise their errors, which no pair measures, would be fed back from level to level."""
+    true = translation(37, -11)
+    known = true @ from_parameters([0.01, 0.004, -0.006, 0.02, 2, -3, 2e-5, -3e-5])
+    exposures = PHASE.describe(seen_from(true, 1)), PHASE.describe(seen_from(STILL, 2))
+    for initial in (known / known[2, 2], None):
+        motion = PHASE.register(*exposures, initial)
+        assert isinstance(motion, Located)
+        np.testing.assert_array_equal(motion.homography[:, :2], STILL[:, :2])
+        np.testing.assert_allclose(motion.homography, true, atol=0.1)
+
+
+def test_information_predicts_errors_if_camera_also_rolls(seen_from: Callable) -> None:
+    """Over 20 pairs with six other parameters drawn from the prior, to a factor of 2.5, in the centre and at the corners."""
+    rng = np.random.default_rng(3)
+    points = np.array([[119.5, 79.5], [0, 0], [239, 159]])
+    errors, predicted = [], []
+    for seed in range(20):
+        p = rng.normal(0, 0.01, 8)
+        p[4:6] = 0
+        true = translation(4, 3) @ (STILL + np.tensordot(p, generators(SHAPE), 1))
+        true /= true[2, 2]
+        motion = register(PHASE, seen_from(true, 2 * seed), seen_from(STILL, 2 * seed + 1))
+        assert isinstance(motion, Located), motion
+        errors.append(np.sum((apply(motion.homography, points) - apply(true, points)) ** 2, axis=1))
+        j = jacobian(motion.homography, points)
+        predicted.append(np.trace(j @ np.linalg.inv(motion.information) @ j.transpose(0, 2, 1), axis1=1, axis2=2))
+    # The parameters have a third of the standard deviation of the prior, so that the pairs are accepted.
+    ratio = 3 * np.sqrt(np.mean(errors, axis=0) / np.mean(predicted, axis=0))
+    assert np.all((ratio > 0.4) & (ratio < 2.5)), ratio
+
+
+@pytest.mark.parametrize("brightness", [1.0, 0.1])
+def test_information_predicts_errors_of_pure_shifts(seen_from: Callable, brightness: float) -> None:
+    """Over 12 pairs; p5 and p6 with the other parameters held."""
+    true = translation(10, -3)
+    errors, predicted = [], []
+    for seed in range(12):
+        motion = register(PHASE, *(seen_from(each, 2 * seed + i, brightness) for i, each in enumerate((true, STILL))))
+        assert isinstance(motion, Located), motion
+        errors.append(np.sum((motion.homography - true) ** 2))
+        predicted.append(np.trace(np.linalg.inv(motion.information[4:6, 4:6])))
+    assert 0.5 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 2
+
+
+def test_phase_correlation_rejects_roll_of_17_degrees(seen_from: Callable) -> None:
+    roll = from_parameters([np.cos(0.3) - 1, np.sin(0.3), -np.sin(0.3), np.cos(0.3) - 1, 25, -30, 0, 0])
+    motion = register(PHASE, seen_from(roll, 1), seen_from(STILL, 2))
+    assert isinstance(motion, NotLocated)
+    assert "the similarity of the images" in motion.reason
+
+
+counts = st.integers(0, 12)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Descriptors of few values, so that there are near ties and distinct matches."""
+    return unit_descriptors(rng.integers(0, 4, (count, 128), dtype=np.uint8) ** rng.integers(1, 5, (count, 1), dtype=np.uint8))
+
+
+def chosen(moving: np.ndarray, fixed: np.ndarray, allowed: np.ndarray, ratio: float) -> set[tuple[int, int]]:
+    """Match pair by pair: mutual nearest neighbours that pass Lowe's ratio test."""
+    distance = np.where(allowed, np.sqrt(np.maximum(2 - 2 * moving.astype(float) @ fixed.T.astype(float), 0)), np.inf)
+    pairs = set()
+    for i in range(len(moving)):
+        if not allowed[i].any():
+            continue
+        j = int(distance[i].argmin())
+        others = np.delete(distance[i], j)
+        second = others.min() if np.isfinite(others).any() else 2.0
+        if distance[:, j].argmin() == i and distance[i, j] <= ratio * second:
+            pairs.add((i, j))
+    return pairs
+
+
+def test_unit_descriptors_are_square_roots_of_length_1() -> None:
+    unit = unit_descriptors(np.array([[1, 4, 4] + [0] * 125, [0] * 128], np.uint8))
+    np.testing.assert_allclose(unit[0, :3], [1 / 3, 2 / 3, 2 / 3], rtol=1e-6)
+    np.testing.assert_array_equal(unit[1], 0)
+
+
+@given(seed=seeds)
+def test_unit_bits_have_hamming_distance_as_squared_distance(seed: int) -> None:
+    raw = np.random.default_rng(seed).integers(0, 256, (2, 32), dtype=np.uint8)
+    first, second = unit_bits(raw)
+    differing = np.count_nonzero(np.unpackbits(raw[0]) != np.unpackbits(raw[1]))
+    np.testing.assert_allclose(np.sum((first - second) ** 2), 4 / 256 * differing, rtol=1e-5)
+    np.testing.assert_allclose(first @ first, 1, rtol=1e-6)
+
+
+@given(n_moving=counts, n_fixed=counts, seed=seeds)
+def test_match_everywhere_keeps_mutual_distinct_matches(n_moving: int, n_fixed: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    moving, fixed = descriptors(rng, n_moving), descriptors(rng, n_fixed)
+    pairs = match_everywhere(moving, fixed, 0.95)
+    assert pairs.shape == (len(pairs), 2)
+    if min(n_moving, n_fixed) < 2:
+        assert len(pairs) == 0
+    else:
+        assert {tuple(pair) for pair in pairs} == chosen(moving, fixed, np.ones((n_moving, n_fixed), bool), 0.95)
+
+
+@given(n_moving=counts, n_fixed=counts, seed=seeds, radius_px=st.floats(1, 200))
+def test_match_nearby_keeps_mutual_distinct_matches_within_radius(
+    n_moving: int, n_fixed: int, seed: int, radius_px: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    moving, fixed = descriptors(rng, n_moving), descriptors(rng, n_fixed)
+    predicted, points = rng.uniform(0, 100, (n_moving, 2)), rng.uniform(0, 100, (n_fixed, 2)).astype(np.float32)
+    pairs = match_nearby(moving, fixed, predicted, points, radius_px, 0.95)
+    near = np.linalg.norm(predicted[:, None] - points[None], axis=-1) <= radius_px
+    assert {tuple(pair) for pair in pairs} == chosen(moving, fixed, near, 0.95)
