@@ -49,7 +49,7 @@ from numpy.typing import NDArray
 
 from photonpano import FrameSpan, open_source, parse_spec
 from photonpano.captures.writing import truth_path
-from photonpano.corrections.colours import with_colours
+from photonpano.corrections.colour_filter import with_colours
 from photonpano.evaluation import covered, image_score, true_panorama, white_flux
 from photonpano.geometry import Canvas, FrameTrajectory, canvas_of, inverse, normalised
 from photonpano.merging import chunks_of

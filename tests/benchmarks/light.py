@@ -19,7 +19,7 @@ import numpy as np
 from harness import Compared, Study, chosen, command, packed, passing, record_of, rendered, scores_of, simulator, table
 
 from photonpano import LocationError, parse_spec
-from photonpano.captures.repeats import timeline_of
+from photonpano.captures.obstacles import timeline_of
 from photonpano.captures.writing import truth_path
 from photonpano.context import Context
 from photonpano.corrections import divided_by

@@ -34,12 +34,12 @@ from harness import Study, chosen, command, groups, least, packed, passing, seen
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext, load_trajectory
 from photonpano.geometry import FrameTrajectory, apply, inverse, translation
 from photonpano_core.configs import BurstConfig, LocalFlowConfig, PhotonMleConfig, RobustMergeConfig
-from photonpano_core.dense_motion.burst import BurstMerger
-from photonpano_core.dense_motion.local_flow import LocalFlowMerger
-from photonpano_core.photon_mle import PhotonMleMerger
-from photonpano_core.robust_merge import RobustMerger
+from photonpano_core.mergers.burst import BurstMerger
+from photonpano_core.mergers.local_flow import LocalFlowMerger
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.robust_merge import RobustMerger
+from photonpano_core.mergers.splat import SplatMerger
 from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
-from photonpano_core.splat import SplatMerger
 from photonpano_simulator.config import SimulatorConfig, StreetScene
 from photonpano_simulator.scenes import scene_flux
 from photonpano_simulator.source import SimulatorSource

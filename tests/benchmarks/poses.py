@@ -22,7 +22,8 @@ from harness import Study, chosen, command, in_child, packed, simulator, table, 
 
 from photonpano import CameraGuess, PhotonpanoError, evaluate_poses, parse_spec, simulate
 from photonpano.captures.writing import truth_path
-from photonpano.evaluation import PoseScore, load_true_poses, pose_errors
+from photonpano.evaluation import PoseScore, pose_errors
+from photonpano.evaluation.poses import load_true_poses
 from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.reconstruction import reconstruct
 

@@ -34,7 +34,7 @@ from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulated
 from photonpano import ExecutorContext, FrameSpan, Source, discover, parse_spec, run
 from photonpano.context import Quiet
 from photonpano.execution import CaptureElsewhere, LocalExecutor
-from photonpano.execution.packing import packed as packed_for_worker
+from photonpano.execution.remote import packed as packed_for_worker
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging import chunks_of
 from photonpano.pipeline.executors import as_read

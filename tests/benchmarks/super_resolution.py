@@ -44,7 +44,7 @@ from photonpano.context import Context
 from photonpano.evaluation import covered, load_truth
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging.panorama import plan_canvas, render
-from photonpano.pipeline.components import build_renderer
+from photonpano.pipeline.rendering import build_renderer
 from photonpano.record.environment import peak_memory_bytes
 
 FLUXES = (0.5, 0.1, 0.02)

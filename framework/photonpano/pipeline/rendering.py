@@ -13,9 +13,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from photonpano.context import Context
-from photonpano.contracts.rules import attributing
 from photonpano.contracts.results import FILES, require_panorama
-from photonpano.contracts.rules import BrokenContract
+from photonpano.contracts.rules import BrokenContract, attributing
 from photonpano.contributions import ExporterContribution, RendererContribution
 from photonpano.corrections import Vignette, write_vignette
 from photonpano.errors import ExtentError, InputError, OutputError, ProjectionError

@@ -12,14 +12,13 @@ from photonpano import FrameSpan, Group, Source, Trajectory, VirtualExposure
 from photonpano.photometry import BinaryResponse, flux_std
 from photonpano.testing import MemorySource
 from photonpano_core.configs import BurstConfig, LocalFlowConfig, PhotonMleConfig, RobustMergeConfig
-from photonpano_core.dense_motion.burst import BurstMerger, aligned, at_instant, wiener_mean
-from photonpano_core.dense_motion.field import MotionField
-from photonpano_core.dense_motion.local_flow import LocalFlowMerger, number_of
-from photonpano_core.dense_motion.patches import PatchGrid
-from photonpano_core.dense_motion.polynomials import fit_each
-from photonpano_core.dense_motion.sub_exposures import blurred, noise_area_px2
-from photonpano_core.photon_mle import PhotonMleMerger
-from photonpano_core.robust_merge import RobustMerger
+from photonpano_core.mergers.burst import BurstMerger, PatchGrid, aligned, at_instant, wiener_mean
+from photonpano_core.mergers.dense_motion.field import MotionField, fit_each
+from photonpano_core.mergers.dense_motion.frames import blurred
+from photonpano_core.mergers.dense_motion.sub_exposures import noise_area_px2
+from photonpano_core.mergers.local_flow import LocalFlowMerger, number_of
+from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.mergers.robust_merge import RobustMerger
 
 N, HEIGHT, WIDTH = 270, 80, 112
 GROUP = Group(FrameSpan(0, N), (N - 1) / 2)

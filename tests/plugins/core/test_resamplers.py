@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from photonpano import CaptureSummary, CaptureUnreadError, FrameSpan, Group, InputError, StageContext, StreamInfo
 from photonpano_core.configs import MidpointConfig
-from photonpano_core.group_size import choose_group_size, whole_periods
 from photonpano_core.hooks import photonpano_resamplers
-from photonpano_core.resamplers import MidpointResampler
+from photonpano_core.resamplers import MidpointResampler, choose_group_size, whole_periods
 
 NAMES = ("midpoint", "constant-groups", "sliding-window", "stratified")
 CONTRIBUTIONS = {each.name: each for each in photonpano_resamplers()}

@@ -10,7 +10,7 @@ from photonpano import FrameSpan, Group, InputError, Light, Trajectory, VirtualE
 from photonpano.geometry import inverse, rescaling
 from photonpano.lighting import in_light
 from photonpano.testing import KnownMotion, MemorySource
-from photonpano_core.splat import SplatMerger
+from photonpano_core.mergers.splat import SplatMerger
 
 N, HEIGHT, WIDTH = 24, 30, 41
 GROUP = Group(FrameSpan(2, N - 2), 10.5)

@@ -16,8 +16,7 @@ from photonpano.geometry import apply, corner_displacements, from_parameters, ge
 from photonpano.locating import View
 from photonpano_opencv.brightness import EccLocator, PhaseCorrelationLocator
 from photonpano_opencv.configs import OpencvEccConfig, OpencvOrbConfig, PhaseCorrelationConfig
-from photonpano_opencv.keypoints import Keypoints, OrbLocator
-from photonpano_opencv.matching import match_everywhere, match_nearby, unit_bits, unit_descriptors
+from photonpano_opencv.keypoints import Keypoints, OrbLocator, match_everywhere, match_nearby, unit_bits, unit_descriptors
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

@@ -15,8 +15,8 @@ import tifffile
 from scipy.io import savemat
 
 from photonpano import Arrived, FrameSpan, InputError, PackedSource, Source, SourceContext, Url, discover
-from photonpano_sensors.intensity.cih import read_header
-from photonpano_sensors.intensity.levels import Encoding
+from photonpano_sensors.intensity.mraw import read_header
+from photonpano_sensors.intensity.source import Encoding
 
 CATALOG = discover()
 PHOTRON = Path(__file__).parents[2] / "data" / "photron"

@@ -22,8 +22,7 @@ from photonpano import (
     simulate,
 )
 from photonpano.captures.fingerprint import CaptureRecord, changes, fingerprint
-from photonpano.captures.obstacles import naming_obstacles, obstacles, order_warning, repetition_px
-from photonpano.captures.repeats import timeline_of
+from photonpano.captures.obstacles import naming_obstacles, obstacles, order_warning, repetition_px, timeline_of
 from photonpano.captures.summary import require_photons
 from photonpano.captures.writing import truth_path
 from photonpano.context import Context

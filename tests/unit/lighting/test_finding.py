@@ -11,7 +11,7 @@ from photonpano.context import Context
 from photonpano.corrections import Vignette, divided_by
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, rotation_matrices, translation
 from photonpano.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
-from photonpano.lighting.series import flicker_frequency, gain_of_frames
+from photonpano.lighting.finding import flicker_frequency, gain_of_frames
 from photonpano.merging.light import gain_image
 from photonpano.merging.panorama import render
 from photonpano.protocols import WeightedSource

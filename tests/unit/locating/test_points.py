@@ -20,7 +20,7 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.locating import PointLimits, information_on_turn, motion_from_points, turn_slopes
-from photonpano.locating.fitting import MIN_NOISE_PX, fit_homography
+from photonpano.locating.points import MIN_NOISE_PX, fit_homography
 
 SHAPE = (160, 240)
 TRUE = from_parameters([0.03, -0.02, 0.01, -0.04, 12, 9, 1e-4, -5e-5])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.corrections.colours import with_colours
+from photonpano.corrections.colour_filter import with_colours
 from photonpano.geometry import Canvas, rescaling, translation
 from photonpano.merging import accumulate
 from photonpano.merging.averaging import Averaging

@@ -13,7 +13,7 @@ from photonpano import FrameSpan, InputError
 from photonpano.geometry import Canvas, corner_displacements, from_parameters, inverse, rescaling, transform_points, translation
 from photonpano.merging import CountsCache, chunks_of, clipped
 from photonpano.merging.footprints import Footprint, footprints_of
-from photonpano.merging.warping import add_footprint, add_warped
+from photonpano.merging.warping import Grid, Texture, add_warped
 
 SHAPE = (30, 40)
 
@@ -145,9 +145,9 @@ def footprints(to_grid: np.ndarray) -> list[Footprint]:
     return footprints_of(GRID, None, to_grid, FRAME)
 
 
-def test_footprint_of_shift_is_straight_and_covers_shifted_frame() -> None:
+def test_footprint_of_shift_covers_shifted_frame() -> None:
     (footprint,) = footprints(translation(10.5, 20.25)[None])
-    assert (footprint.shrink, footprint.straight) == (1, True)
+    assert footprint.shrink == 1
     assert (footprint.rows, footprint.columns) == (range(19, 276), (range(9, 508),))
     assert footprint.to_image == pytest.approx(translation(-10.5, -20.25))
 
@@ -156,11 +156,6 @@ def test_footprint_is_empty_outside_of_grid() -> None:
     for shift in (translation(800, 0), translation(-600, 0), translation(0, 400)):
         (footprint,) = footprints(shift[None])
         assert not (footprint.rows and footprint.columns)
-
-
-def test_footprint_is_not_straight_beyond_small_rotation() -> None:
-    turned = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in (0.005, 0.02)]
-    assert [footprint.straight for footprint in footprints(np.array(turned))] == [True, False]
 
 
 def test_footprint_shrinks_frame_on_coarse_grid() -> None:
@@ -186,6 +181,14 @@ def interpolated(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int]
     return ((1 - b) * upper + b * lower).reshape(shape)
 
 
+def warped(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int], seen: np.ndarray | None = None) -> Grid:
+    """Warp an image, and its share of each pixel times 3, onto a grid of zeros."""
+    grid, footprint = Grid.zeros(Canvas(*shape, np.eye(3)), 1), Footprint(1, to_image, range(shape[0]), (range(shape[1]),))
+    textures = [None if each is None else Texture.of(each.astype(np.float32)) for each in (image, seen)]
+    add_warped(textures[0], textures[1], np.array([3.0]), footprint, grid)
+    return grid
+
+
 @settings(max_examples=60)
 @given(
     x=st.floats(-45, 45),
@@ -195,32 +198,34 @@ def interpolated(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int]
 )
 def test_add_warped_equals_bilinear_interpolation(x: float, y: float, linear: list[float], perspective: list[float]) -> None:
     to_image = np.array([[1 + linear[0], linear[1], x], [linear[2], 1 + linear[3], y], [*perspective, 1]])
-    shape = (31, 53)
-    total = np.full(shape, 7, np.float32)
-    add_warped(IMAGE, to_image, total)
-    np.testing.assert_allclose(total, 7 + interpolated(IMAGE, to_image, shape), atol=1e-4)
+    grid = warped(IMAGE, to_image, (31, 53), seen=IMAGE > 0.5)
+    np.testing.assert_allclose(grid.total, interpolated(IMAGE, to_image, (31, 53)), atol=1e-4)
+    np.testing.assert_allclose(grid.coverages[0], 3 * interpolated(IMAGE > 0.5, to_image, (31, 53)), atol=4e-4)
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (3, -5), (2.25, 1.5), (-0.5, 0.5), (36.5, 0), (37, 0), (0, -22.5), (200, 0)])
 def test_add_warped_is_exact_up_to_the_border(shift: tuple[float, float]) -> None:
-    total = np.zeros((40, 60), np.float32)
-    add_warped(IMAGE, translation(*shift), total)
-    np.testing.assert_allclose(total, interpolated(IMAGE, translation(*shift), total.shape), atol=1e-6)
+    grid = warped(IMAGE, translation(*shift), (40, 60))
+    np.testing.assert_allclose(grid.total, interpolated(IMAGE, translation(*shift), (40, 60)), atol=2e-5)
+    whole = np.ones(IMAGE.shape)
+    np.testing.assert_allclose(grid.coverages[0], 3 * interpolated(whole, translation(*shift), (40, 60)), atol=2e-5)
 
 
-@pytest.mark.parametrize(
-    "to_image",
-    [
-        translation(0, 0),
-        translation(-2.25, 1.5),
-        np.array([[0.9, 0.2, -4], [-0.1, 1.1, 3], [1e-3, -5e-4, 1]]),
-        translation(500, 0),
-    ],
-    ids=["identity", "shift", "perspective", "outside"],
-)
-def test_add_footprint_equals_warp_of_uniform_image(to_image: np.ndarray) -> None:
-    shape = (40, 60)
-    expected, total, steps = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros((40, 61), np.float32)
-    add_warped(np.full(IMAGE.shape, 3, np.float32), to_image, expected)
-    add_footprint(IMAGE.shape, to_image, 3.0, steps, total)
-    np.testing.assert_allclose(total + np.cumsum(steps, axis=1)[:, :-1], expected, atol=1e-4)
+def test_places_on_a_wide_grid_are_exact_to_a_thousandth_of_a_pixel() -> None:
+    ramp = np.tile(np.arange(64, dtype=np.float32), (16, 1))
+    to_image = np.array([[0.5, 0.001, -20_000.25], [0, 1, 0], [0, 0, 1]])
+    grid = warped(ramp, to_image, (16, 40_200))
+    inside = slice(40_010, 40_110)
+    np.testing.assert_allclose(grid.total[5, inside], 0.5 * np.arange(40_200)[inside] + 0.005 - 20_000.25, atol=0.01)
+
+
+@pytest.mark.parametrize("largest", [1, 7, 65_535], ids=str)
+def test_texture_keeps_whole_numbers(largest: int) -> None:
+    image = np.random.default_rng(1).integers(0, largest + 1, (9, 14)).astype(np.uint32)
+    image[0, 0] = largest
+    np.testing.assert_array_equal(warped(image, np.eye(3), (9, 14)).total, image)
+
+
+def test_texture_rounds_other_numbers_to_its_range() -> None:
+    image = np.random.default_rng(1).normal(-3, 10, (9, 14)).astype(np.float32)
+    np.testing.assert_allclose(warped(image, np.eye(3), (9, 14)).total, image, atol=np.ptp(image) / 65_000)

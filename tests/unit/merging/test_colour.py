@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from photonpano.merging.colour import filled, noise_of_a_frame, with_clear, with_shared_detail
-from photonpano.photometry import BinaryResponse
+from photonpano.merging.colour import filled, with_clear, with_shared_detail
+from photonpano.photometry import BinaryResponse, frame_variance
 from photonpano.reading import bayer_array
 
 SHAPE = (64, 80)
@@ -125,6 +125,6 @@ def test_detail_of_single_colours_stays_with_many_photons() -> None:
     assert (rms_of_colours(found, truth) < 1.05 * rms_of_colours(flux, truth)).all()
 
 
-def test_noise_of_a_frame_is_the_binomial_one() -> None:
+def test_frame_variance_is_the_binomial_one() -> None:
     flux = np.float32([0.01, 0.1, 1, 3])
-    assert noise_of_a_frame(flux, BinaryResponse()) == pytest.approx(np.expm1(flux), rel=0.01)
+    assert frame_variance(flux, BinaryResponse()) == pytest.approx(np.expm1(flux), rel=0.01)

@@ -20,8 +20,7 @@ from photonpano.geometry import (
     transform_points,
     translation,
 )
-from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.smooth_path import smooth_view
+from photonpano.motion.frame_motion import FrameMotion, smooth_view
 from photonpano.motion.tracking import StartingMotion, starting_motion
 from photonpano.motion.tracking.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
 from photonpano.testing.scenes import detected, seen_along, textured

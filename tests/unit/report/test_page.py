@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 from photonpano import FrameSpan, Group, LocationError, NotLocated
 from photonpano.motion.diagnosis import UntiedError
 from photonpano.report import figures, render_failure, render_report, residual_figures
-from photonpano.report.tables import failure_groups
+from photonpano.report.page import failure_groups
 from photonpano.values import Edge
 
 TIMES = "\N{MULTIPLICATION SIGN}"

@@ -10,7 +10,7 @@ import pytest
 
 from photonpano.geometry import Canvas
 from photonpano.report import residual_figures
-from photonpano.report.pose_views import path_views, scene_views, viewpoints
+from photonpano.report.pose_page import path_views, scene_views, viewpoints
 from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX
 from photonpano.values import Light, PoseEstimate, ScenePoints
 

@@ -16,7 +16,7 @@ from photonpano.merging.panorama import render
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
-from photonpano.residuals.unexplained import bounded_std_px, residual_ratio, unexplained_px
+from photonpano.residuals.refinement import bounded_std_px, residual_ratio, unexplained_px
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, recorded
 from photonpano.testing.scenes import Scene
 from photonpano.values import FloatArray

@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field
 
 from photonpano import Config, MergerContribution, SpecError
 from photonpano.registry import KINDS, Catalog, discover
-from photonpano.registry.schema_text import config_schema
+from photonpano.registry.description import config_schema
 from photonpano.specs import json_schema, load_spec, parse_spec
 from photonpano.specs.settings import GraphSettings, RenderSettings, RunSettings
 

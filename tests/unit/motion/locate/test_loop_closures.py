@@ -16,7 +16,6 @@ from photonpano.geometry import inverse, rescaling, translation
 from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, locate
-from photonpano.motion.merge import VirtualExposures
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import KnownMotion, MemorySource, photographed
 from photonpano.testing.scenes import seen_along
