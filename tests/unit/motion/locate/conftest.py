@@ -10,7 +10,7 @@ import pytest
 from photonpano import Group, Located, NotLocated, Trajectory
 from photonpano.context import Context
 from photonpano.geometry import inverse, translation
-from photonpano.motion.level import Level
+from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import KnownMotion
