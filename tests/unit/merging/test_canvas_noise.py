@@ -1,11 +1,13 @@
 """The noise of panoramas, and how interpolation lowers it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from photonpano import FrameSpan
+from photonpano.capture import capture_of
 from photonpano.corrections.colour_filter import with_colours
 from photonpano.geometry import Canvas, rescaling, translation
 from photonpano.merging import accumulate
@@ -125,3 +127,11 @@ def test_dynamic_range_of_nothing_is_unknown() -> None:
     found = DynamicRange(CanvasNoise(BinaryResponse()))
     found.add(image(np.nan), image(0), 0, 0)
     assert (found.decibels, found.measurable_decibels, found.saturated_share) == (None, None, 0)
+
+
+def test_noise_of_weighted_pixels_is_that_of_their_counts(pan: Callable) -> None:
+    """The weight of a frame of weight w is w, but its photons say as much as before."""
+    rates, weights = np.full((8, 12), 0.2), np.linspace(0.3, 1, 96).reshape(8, 12).astype(np.float32)
+    noise = CanvasNoise.of(replace(capture_of(DarkCounts(rates)), weight=weights), pan(0), SPAN, CANVAS)
+    std = noise.std(image(0.1), weights * np.float32(1e6))
+    np.testing.assert_allclose(std, np.sqrt(np.expm1(0.3) / 1e6), rtol=0.01)

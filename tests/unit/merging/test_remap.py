@@ -205,3 +205,16 @@ def test_corrections_are_laid_on_a_sphere_as_counts_are() -> None:
     assert np.allclose(sums[0], photons.counts, rtol=1e-4, atol=0.1)
     assert np.allclose(share, photons.weight, atol=1e-3)
     assert np.allclose(sums[1], share, atol=1e-3)
+
+
+def test_tangential_distortion_moves_pixels_as_the_camera_says() -> None:
+    """Frames whose counts are x, or y: on the canvas of ideal pixels, the mean count is the place of the distorted pixel."""
+    lens = Camera.of(60.0, SHAPE, [0.0, 0.0, 0.05, -0.03])
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    places = lens.distorted(np.stack([x, y], axis=-1).astype(float))
+    canvas, inside = Canvas(*SHAPE, np.eye(3)), ((places > 1) & (places < np.array(SHAPE[::-1]) - 2)).all(axis=-1)
+    for axis, ramp in enumerate((x, y)):
+        source = seen_through(MemorySource(ramp[None].astype(np.uint8)), lens)
+        photons = accumulate(source, [Chunk(FrameSpan(0, 1), np.eye(3))], canvas, SHAPE)
+        found = photons.counts[inside] / photons.weight[inside]
+        np.testing.assert_allclose(found, places[inside][:, axis], atol=0.01)

@@ -23,7 +23,7 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.motion import adjustment
-from photonpano.motion.graph import components, solve
+from photonpano.motion.graph import _Tied, components, solve
 from photonpano.values import Edge
 
 SHAPE = (254, 496)
@@ -405,3 +405,11 @@ def test_information_of_a_node_is_the_curvature_of_the_cost_with_others_held() -
                 curvature[first, second] += one * other * cost(node, change) / 4
         information = found[node] * np.outer(steps, steps)
         np.testing.assert_allclose(information, curvature, rtol=0.01, atol=1e-3 * np.abs(information).max())
+
+
+def test_start_of_the_graph_follows_exact_edges_in_both_directions() -> None:
+    """Edges lead from each exposure to an earlier one, and the anchor is in the middle."""
+    true, anchor = true_motion(9), 4
+    tied = _Tied.of(len(true), measured(true, (1,)), anchor, SHAPE)
+    start = normalised(tied.composed(tied.problem.observed))
+    assert error_px(start, true, anchor) < 1e-6

@@ -199,3 +199,20 @@ def test_lens_distortion_is_not_significant_without_a_lens() -> None:
 def test_lens_distortion_needs_blocks() -> None:
     still = np.tile(np.eye(3), (10, 1, 1))
     assert lens_distortion(np.zeros((2, 2, 2)), np.tile(np.eye(2), (2, 2, 1, 1)), still, (32, 32)) is None
+
+
+@pytest.mark.parametrize(("number", "generator"), [(2, [[0, -1], [1, 0]]), (3, [[1, 0], [0, 1]])], ids=["roll", "zoom"])
+def test_steps_have_the_sign_of_a_roll_and_of_a_zoom(number: int, generator: list[list[int]]) -> None:
+    """Spans are compared with a panorama along another motion, which lacks a roll, or a zoom, about the middle of the frame."""
+    middle, span = translation((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2), FrameSpan(0, FRAMES)
+    size = 0.01
+    matrix = np.eye(3)
+    matrix[:2, :2] += size * np.array(generator)
+    still = FrameTrajectory(np.array([shaken(frame, 0) for frame in range(FRAMES)]))
+    missing = FrameTrajectory(still.at(np.arange(FRAMES)) @ np.linalg.inv(middle @ matrix @ np.linalg.inv(middle)))
+    source = capture()
+    canvas = plan_canvas(still, span, SHAPE, 1.0, 2**30)
+    panorama = render(source, still, span, canvas, 0.25, Context())
+    steps = measure(span, Predictions.of(source, panorama, canvas, missing, SHAPE), Context()).steps().steps
+    ratio = np.median(steps[:, number]) / np.median(np.abs(steps[:, [n for n in (0, 1, 2, 3) if n != number]]), axis=0).max()
+    assert ratio > 2
