@@ -53,8 +53,8 @@ def align_planes(
     to_plane, to_frame = estimated[chosen], np.linalg.inv(true[chosen])
     first = start
     if first is None:
-        ends = (transform_points(each, frame).reshape(-1, 2) for each in (to_plane, true[chosen]))
-        first = np.asarray(cv2.findHomography(*ends)[0], np.float64)  # the direct linear transform (Hartley 1997)
+        here, there = (transform_points(each, frame).reshape(-1, 2) for each in (to_plane, true[chosen]))
+        first = np.asarray(cv2.findHomography(here, there)[0], np.float64)  # the direct linear transform (Hartley 1997)
     left = first @ np.linalg.inv(condition)
 
     def plane(p: FloatArray) -> Homography:
