@@ -169,6 +169,19 @@ def small_run(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.fixture(scope="session")
+def tiny_capture(simulated: Callable[..., Path]) -> Path:
+    """160 frames of 64x96 px, a pan of 40 px, for runs of which the accuracy does not matter."""
+    return simulated(n_frames=160, frame_shape=[64, 96], path={"kind": "pan", "length_px": 40, "angle_deg": 10})
+
+
+@pytest.fixture(scope="session")
+def tiny_spec(tiny_capture: Path) -> dict[str, Any]:
+    """A spec of the tiny capture with one level of four groups."""
+    source = {"use": "packed-npy", "with": {"path": str(tiny_capture), "frame_rate_hz": 96800}}
+    return {"version": 1, "source": source, "resample": {"with": {"group_size": 40}}, "levels": 1}
+
+
+@pytest.fixture(scope="session")
 def clouds() -> Callable[..., np.ndarray]:
     """Return (n, H, W) binary frames of a cloudy scene, without edges, that moves by 0.2 px a frame along both axes."""
 

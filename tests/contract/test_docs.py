@@ -328,41 +328,44 @@ def test_generated_tables_are_up_to_date(page, make_reference):
     assert make_reference.updated(text) == text, "run: python docs/make_reference.py"
 
 
-def spec_reference() -> str:
-    pages = (REFERENCE / "spec.md", *(REFERENCE / "spec").glob("*.md"))
-    return "".join(page.read_text(encoding="utf-8") for page in pages)
+def reference(*names: str) -> str:
+    return "".join(page.read_text(encoding="utf-8") for name in names for page in sorted(REFERENCE.glob(name)))
 
 
-def test_spec_reference_has_table_for_every_component():
-    page = spec_reference()
-    wanted = [f"settings {name}" for name in ("levels", "graph", "render", "output", "run")]
-    own = [entry for entry in discover().rows if entry.origin.plugin == "photonpano"]
-    wanted += [f"{entry.kind} {entry.name}" for entry in own if entry.contribution.config.model_fields]
-    assert [name for name in wanted if f"<!-- generated: {name} -->" not in page] == []
-    assert [entry.name for entry in own if f"\n## `{entry.name}`\n" not in page] == []
+def generated(*names: str) -> list[str]:
+    return [f"<!-- generated: {name} -->" for name in names]
 
 
-def test_spec_reference_has_table_for_every_correction():
-    page = spec_reference()
-    wanted = ["corrections", *(f"correction {name}" for name, model in CORRECTIONS.items() if model.model_fields)]
-    assert [name for name in wanted if f"<!-- generated: {name} -->" not in page] == []
+OWN = [entry for entry in discover().rows if entry.origin.plugin == "photonpano"]
+FUNCTIONS = [name for name in photonpano.__all__ if inspect.isfunction(getattr(photonpano, name))]
+HOOKS = [name for name in vars(hookspecs) if name.startswith("photonpano_")]
+# Pages, and what must stand in them.
+LISTED: dict[str, tuple[tuple[str, ...], list[str]]] = {
+    "settings": (
+        ("spec.md", "spec/*.md"),
+        generated(*(f"settings {name}" for name in ("levels", "graph", "render", "output", "run"))),
+    ),
+    "components": (
+        ("spec.md", "spec/*.md"),
+        generated(*(f"{entry.kind} {entry.name}" for entry in OWN if entry.contribution.config.model_fields))
+        + [f"\n## `{entry.name}`\n" for entry in OWN],
+    ),
+    "corrections": (
+        ("spec.md", "spec/*.md"),
+        generated("corrections", *(f"correction {name}" for name, model in CORRECTIONS.items() if model.model_fields)),
+    ),
+    "commands": (("cli.md",), generated(*(f"command {name}" for name in commands()))),
+    "functions": (("python.md",), [f"| `{name}(" for name in FUNCTIONS if name != "discover"]),
+    "hooks": (("plugins.md",), [*(f"`{name}`\n" for name in HOOKS), *generated(*(f"hook {name}" for name in HOOKS))]),
+}
 
 
-def test_cli_reference_has_table_for_every_command():
-    page = (REFERENCE / "cli.md").read_text(encoding="utf-8")
-    assert [name for name in commands() if f"<!-- generated: command {name} -->" not in page] == []
-
-
-def test_python_page_lists_every_function():
-    page = (REFERENCE / "python.md").read_text(encoding="utf-8")
-    functions = [name for name in photonpano.__all__ if inspect.isfunction(getattr(photonpano, name))]
-    assert [name for name in functions if f"| `{name}(" not in page] == ["discover"]
-
-
-def test_plugin_reference_has_section_for_every_hook():
-    page = (REFERENCE / "plugins.md").read_text(encoding="utf-8")
-    hooks = [name for name in vars(hookspecs) if name.startswith("photonpano_")]
-    assert [name for name in hooks if f"`{name}`\n" not in page or f"<!-- generated: hook {name} -->" not in page] == []
+@pytest.mark.parametrize("what", LISTED)
+def test_reference_has_a_place_for_each(what):
+    pages, wanted = LISTED[what]
+    text = reference(*pages)
+    assert wanted
+    assert [each for each in wanted if each not in text] == []
 
 
 def test_run_folder_page_documents_every_file_and_key(small_run):

@@ -16,6 +16,7 @@ from photonpano.registry import discover
 from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
 from photonpano.specs import parse_spec
 from photonpano.testing import ExporterConformance, RefinerConformance, RendererConformance, ResamplerConformance
+from photonpano.testing.conformance import Conformance
 
 pytestmark = pytest.mark.usefixtures("without_report")
 
@@ -81,19 +82,19 @@ def test_observation_hook_has_documented_arguments_and_complete_example(hook: st
 
 
 @pytest.mark.parametrize("section", ["merge", "interpolate"])
-def test_stage_example_locates_all_exposures(section: str, small_spec: dict[str, Any], tmp_path: Path) -> None:
+def test_stage_example_locates_all_exposures(section: str, tiny_spec: dict[str, Any], tmp_path: Path) -> None:
     hook, name = {"merge": ("photonpano_mergers", "naive-sum"), "interpolate": ("photonpano_interpolators", "nearest")}[section]
     catalog = discover().including(example_of(hook))
-    plan = parse_spec(small_spec | {section: {"use": name}, "levels": 1}, output=tmp_path / "run", catalog=catalog)
+    plan = parse_spec(tiny_spec | {section: {"use": name}}, output=tmp_path / "run", catalog=catalog)
     record = run(plan).record
     assert {"stage": section, "use": name, "plugin": f"example_of_{hook}", "version": "unreleased"} in record["plugins"]
-    assert record["levels"][0]["located"] == 6
+    assert record["levels"][0]["located"] == 4
 
 
-def test_executor_example_has_the_same_results(small_spec: dict[str, Any], tmp_path: Path) -> None:
+def test_executor_example_has_the_same_results(tiny_spec: dict[str, Any], tmp_path: Path) -> None:
     catalog = discover().including(example_of("photonpano_executors"))
     for name, settings in (("threads", {}), ("one by one", {"executor": "one-by-one"})):
-        run(parse_spec(small_spec | {"run": settings, "levels": 1}, output=tmp_path / name, catalog=catalog))
+        run(parse_spec(tiny_spec | {"run": settings}, output=tmp_path / name, catalog=catalog))
     for file in ("trajectory.npz", "panorama.tiff"):
         assert (tmp_path / "one by one" / file).read_bytes() == (tmp_path / "threads" / file).read_bytes()
 
@@ -108,9 +109,9 @@ def test_merger_example_masks_invalid_pixels(memory_source: type) -> None:
     np.testing.assert_array_equal(exposure.weight, np.where(valid, 10, 0))
 
 
-def test_merger_example_at_half_scale_breaks_contract(small_spec: dict[str, Any], tmp_path: Path) -> None:
+def test_merger_example_at_half_scale_breaks_contract(tiny_spec: dict[str, Any], tmp_path: Path) -> None:
     catalog = discover().including(example_of("photonpano_mergers"))
-    spec = small_spec | {"merge": {"use": "naive-sum"}, "levels": [{"scale": 0.5}]}
+    spec = tiny_spec | {"merge": {"use": "naive-sum"}, "levels": [{"scale": 0.5}]}
     with pytest.raises(PluginError) as caught:
         run(parse_spec(spec, output=tmp_path / "run", catalog=catalog))
     assert str(caught.value) == (
@@ -125,32 +126,16 @@ def test_resampler_example_gives_two_groups() -> None:
     assert [str(group) for group in groups] == ["frames 0 to 49", "frames 50 to 99"]
 
 
-class TestHalves(ResamplerConformance):
-    """The example of a resampler keeps what resamplers promise, also for a capture of one frame."""
-
-    contribution = contributions_of(example_of("photonpano_resamplers"))[0]
-    hook_module = "photonpano_core.hooks"
-
-
-class TestJump(RefinerConformance):
-    """The example of a refiner keeps what refiners promise."""
-
-    contribution = contributions_of(example_of("photonpano_refiners"))[0]
-    hook_module = "photonpano_core.hooks"
+def kept(hook: str, kit: type[Conformance]) -> type[Conformance]:
+    """Return the tests that the example of a hook keeps what components of its kind promise."""
+    (contribution,) = contributions_of(example_of(hook))
+    return type(contribution.name, (kit,), {"contribution": contribution, "hook_module": "photonpano_core.hooks"})
 
 
-class TestNearestPixel(RendererConformance):
-    """The example of a renderer keeps what renderers promise."""
-
-    contribution = contributions_of(example_of("photonpano_renderers"))[0]
-    hook_module = "photonpano_core.hooks"
-
-
-class TestPgm(ExporterConformance):
-    """The example of an exporter keeps what exporters promise."""
-
-    contribution = contributions_of(example_of("photonpano_exporters"))[0]
-    hook_module = "photonpano_core.hooks"
+TestHalves = kept("photonpano_resamplers", ResamplerConformance)
+TestJump = kept("photonpano_refiners", RefinerConformance)
+TestNearestPixel = kept("photonpano_renderers", RendererConformance)
+TestPgm = kept("photonpano_exporters", ExporterConformance)
 
 
 def test_locator_example_returns_not_located() -> None:

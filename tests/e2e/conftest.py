@@ -35,10 +35,6 @@ class Outcome:
         return self.trajectory["located"]
 
     @property
-    def std_px(self) -> np.ndarray:
-        return self.trajectory["std_px"]
-
-    @property
     def canvas(self) -> np.ndarray:
         return self.trajectory["canvas"]
 

@@ -45,8 +45,11 @@ def test_run_reads_what_the_message_said_to_write(spec: Path, clouds: Callable[.
     panoramas = {}
     for name, stored, change in (
         ("right", np.packbits(frames, axis=2), []),
-        ("little", np.packbits(frames, axis=2, bitorder="little"), ["source.with.bit_order=little"]),
-        ("height", np.packbits(frames, axis=1), ["source.with.packed_along=height"]),
+        (
+            "both",
+            np.packbits(frames, axis=1, bitorder="little"),
+            ["source.with.bit_order=little", "source.with.packed_along=height"],
+        ),
         ("bits", frames.astype(bool), ["source={use: npy, with: {path: cube.npy, holds: bits}}"]),
     ):
         np.save("cube.npy", stored)

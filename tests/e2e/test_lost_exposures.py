@@ -17,33 +17,27 @@ from photonpano.specs import parse_spec
 pytestmark = pytest.mark.usefixtures("without_report")
 
 
+def spec_of(capture: Path) -> dict[str, Any]:
+    return {"version": 1, "source": {"use": "packed-npy", "with": {"path": str(capture)}}, "levels": 1}
+
+
 @pytest.fixture(scope="module")
 def run(outcome_of: Callable) -> Callable[..., Any]:
-    def run(capture: Path, *overrides: str) -> Any:
-        source = {"use": "packed-npy", "with": {"path": str(capture)}}
-        return outcome_of(parse_spec({"version": 1, "source": source, "levels": 1}, overrides=overrides))
-
-    return run
+    return lambda capture, *overrides: outcome_of(parse_spec(spec_of(capture), overrides=overrides))
 
 
-@pytest.fixture
-def run_into(tmp_path: Path) -> Callable[..., Any]:
-    def run_into(capture: Path, *overrides: str) -> Any:
-        source = {"use": "packed-npy", "with": {"path": str(capture)}}
-        spec = {"version": 1, "source": source, "levels": 1}
-        return run_plan(parse_spec(spec, overrides=overrides, output=tmp_path / "runs" / "run"))
-
-    return run_into
-
-
-def refusal(run: Callable, capture: Path, *overrides: str) -> list[str]:
-    """Return the lines of the error, with # for counts and for the reasons of the first locator."""
-    with pytest.raises(LocationError) as caught:
-        run(capture, *overrides)
-    lines = str(caught.value).splitlines()
+def lines_of(error: LocationError) -> list[str]:
+    """Return the lines of an error, with # for counts and for the reasons of the first locator."""
+    lines = str(error).splitlines()
     lines = [re.sub(r"direct: [^;]+;", "direct: #;", line) for line in lines]
     lines = [re.sub(r"\d+(?= (matches|and|keypoints))", "#", line) if line.startswith("  frames") else line for line in lines]
     return [re.sub(r"[\d.]+(?= times)", "#", line) for line in lines]
+
+
+def refusal(run: Callable, capture: Path, *overrides: str) -> list[str]:
+    with pytest.raises(LocationError) as caught:
+        run(capture, *overrides)
+    return lines_of(caught.value)
 
 
 def pair(moving: str, fixed: str) -> str:
@@ -79,9 +73,12 @@ def test_single_lost_exposure_is_interpolated_with_warning(run: Callable, with_a
     assert outcome.located[100:150].all()
 
 
-def test_long_span_without_texture_fails_with_its_frames(run: Callable, with_a_wall: Callable) -> None:
-    """The gap separates two parts; the smaller one is lost too."""
-    lines = refusal(run, with_a_wall(50, 150), "resample.with.group_size=25")
+def test_failed_run_leaves_a_report_until_a_run_succeeds(with_a_wall: Callable, tmp_path: Path) -> None:
+    """A long span without texture separates two parts, of which the smaller one is lost too; the largest can be rendered."""
+    spec, out = spec_of(with_a_wall(50, 150)) | {"resample": {"with": {"group_size": 25}}}, tmp_path / "runs" / "run"
+    with pytest.raises(LocationError) as caught:
+        run_plan(parse_spec(spec, output=out))
+    lines = lines_of(caught.value)
     assert re.fullmatch(
         r"level 1: \d+ of \d+ pairs of exposures could not be located, so that frames 0 to 149 cannot be tied to the rest",
         lines[0],
@@ -94,16 +91,20 @@ def test_long_span_without_texture_fails_with_its_frames(run: Callable, with_a_w
         "(try larger groups, such as resample.with.group_size=50), or the scene has no texture there.",
         "To go on with the largest part alone, set graph.disconnected to largest.",
     ]
+    report = caught.value.report
+    assert report is not None
+    assert report.name == "run.failed.html"
+    assert [file.name for file in report.parent.iterdir() if not file.name.startswith(".")] == [report.name]
 
-
-def test_disconnected_largest_renders_largest_part(run: Callable, with_a_wall: Callable) -> None:
-    outcome = run(with_a_wall(50, 150), "resample.with.group_size=25", "graph.disconnected=largest")
-    np.testing.assert_array_equal(np.flatnonzero(outcome.located), np.arange(150, 300))
-    warnings = outcome.record["warnings"]
+    record = run_plan(parse_spec(spec | {"graph": {"disconnected": "largest"}}, output=out)).record
+    assert not report.exists()
+    with np.load(out / "trajectory.npz") as trajectory:
+        np.testing.assert_array_equal(np.flatnonzero(trajectory["located"]), np.arange(150, 300))
+        np.testing.assert_allclose(trajectory["homographies"][150], np.eye(3), atol=1e-12)
+    warnings = record["warnings"]
     assert warnings[0] == "level 1: 6 of 12 exposures are not located (frames 0 to 24 and others)"
     assert all("is uncertain: its expected error exceeds" in warning for warning in warnings[1:-1])
     assert warnings[-1] == "150 of 300 frames lie outside the located exposures and are left out"
-    np.testing.assert_allclose(outcome.homographies[150], np.eye(3), atol=1e-12)
 
 
 def test_failure_distinguishes_dark_from_blurred(run: Callable, simulated: Callable) -> None:
@@ -139,26 +140,17 @@ def test_motion_blurred_exposures_are_not_located_by_chance(run: Callable, simul
         run(fast, "resample.with.group_size=100")
 
 
-def test_failed_run_leaves_a_report_until_a_run_succeeds(run_into: Callable, with_a_wall: Callable) -> None:
-    capture = with_a_wall(50, 150)
-    with pytest.raises(LocationError) as caught:
-        run_into(capture, "resample.with.group_size=25")
-    report = caught.value.report
-    assert report is not None
-    assert report.name == "run.failed.html"
-    assert [file.name for file in report.parent.iterdir() if not file.name.startswith(".")] == [report.name]
-    run_into(capture, "resample.with.group_size=25", "graph.disconnected=largest")
-    assert not report.exists()
-
-
 @pytest.mark.parametrize("obstacle", ["render_failure", "atomic_path"])
 def test_failure_of_the_report_does_not_hide_that_of_the_run(
-    run_into: Callable, with_a_wall: Callable, monkeypatch: pytest.MonkeyPatch, obstacle: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, obstacle: str
 ) -> None:
     def fail(*_: object) -> None:
         raise OutputError("the disk is full")
 
     monkeypatch.setattr(f"photonpano.pipeline.run_steps.{obstacle}", fail)
+    np.save(tmp_path / "cube.npy", np.random.default_rng(0).integers(0, 256, (80, 48, 8), dtype=np.uint8))
     with pytest.raises(LocationError) as caught:
-        run_into(with_a_wall(50, 150), "resample.with.group_size=25")
+        run_plan(
+            parse_spec(spec_of(tmp_path / "cube.npy"), overrides=("resample.with.group_size=20",), output=tmp_path / "run")
+        )
     assert caught.value.report is None

@@ -67,27 +67,15 @@ def logger(install: Callable[[str, str], None]) -> None:
 
 
 @pytest.fixture
-def run(small_spec: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+def run(tiny_spec: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
     monkeypatch.chdir(tmp_path)
     with (tmp_path / "scan.yaml").open("w") as file:
-        YAML().dump(small_spec | {"levels": 1}, file)
+        YAML().dump(tiny_spec, file)
     return lambda *arguments, **environment: CliRunner().invoke(app, ["run", "scan.yaml", *arguments], env=environment)
 
 
 def lines(name: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in Path(f"runs/{name}.progress.jsonl").read_text().splitlines()]
-
-
-@pytest.mark.usefixtures("logger")
-def test_observers_see_failed_run(run: Callable[..., Result]) -> None:
-    result = run("--set", "locate={use: direct, with: {min_agreement: 1}}")
-    assert result.exit_code == 1
-    first, *_, last = lines("scan")
-    assert (first["event"], last["event"]) == ("started", "failed")
-    message, _, report = result.stderr.removeprefix("error: ").rpartition("\nreport ")
-    assert report.strip().endswith("scan.failed.html")
-    assert last["error"] == f"LocationError: {message}"
-    assert not Path("runs/scan").exists()
 
 
 @pytest.mark.usefixtures("logger")

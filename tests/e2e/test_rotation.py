@@ -47,7 +47,9 @@ def spec_of(capture: Path, **sections: Any) -> dict[str, Any]:
 def result(capture: Path) -> RunResult:
     """A run that knows neither the focal length nor the lens."""
     sections = {"motion": {"model": "auto"}, "camera": {"distortion": {"k1": "find"}}}
-    return run(parse_spec(spec_of(capture, **sections), output=capture.parent / "run"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("photonpano.pipeline.run.render_report", lambda *_: "")
+        return run(parse_spec(spec_of(capture, **sections), output=capture.parent / "run"))
 
 
 def test_rotations_focal_length_and_lens_are_found(result: RunResult, capture: Path) -> None:

@@ -1,4 +1,4 @@
-"""Batches of small captures, in real processes."""
+"""Runs and batches in processes of their own: killed and interrupted."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-
-import pytest
 
 from photonpano import batch
 from photonpano.captures.writing import truth_path
 
-SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 25}}, "levels": 1, "refine": []}
+SCRIPT = Path(__file__).parents[1] / "benchmarks" / "kills.py"
+SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 40}}, "levels": 1, "refine": []}
 INTERRUPTED = """\
 import sys, time
 from pathlib import Path
@@ -43,42 +41,39 @@ class Hanging(SpecText):
 """
 
 
-@pytest.fixture(scope="module")
-def capture(simulated: Callable[..., Path]) -> Path:
-    """A capture of 200 frames of 64x96 px, with its truth."""
-    return simulated(n_frames=200, frame_shape=[64, 96])
-
-
 def copied(capture: Path, path: Path) -> Path:
     shutil.copy(capture, path)
     shutil.copy(truth_path(capture), truth_path(path))
     return path
 
 
-def test_batch_runs_what_is_left(capture: Path, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        copied(capture, tmp_path / f"{name}.npy")
+def statuses(folder: Path) -> list[str]:
+    with (folder / "summary.csv").open(encoding="utf-8") as file:
+        return [row["status"] for row in csv.DictReader(file)]
+
+
+def test_batch_runs_what_is_left(tiny_capture: Path, tmp_path: Path) -> None:
+    copied(tiny_capture, tmp_path / "a.npy")
     (tmp_path / "empty.npy").touch()
     first = batch(SPEC, [tmp_path / "*.npy"], tmp_path / "out", jobs=2)
-    assert [(row.name, row.status) for row in first.rows] == [("a", "done"), ("b", "done"), ("empty", "failed")]
-    assert first.failed == first.rows[2:]
-    results = [tmp_path / "out" / name / "trajectory.npz" for name in ("a", "b")]
-    assert results[0].read_bytes() == results[1].read_bytes()
-    assert {file.name for file in (tmp_path / "out").iterdir()} == {"a", "b", "summary.csv", "summary.html"}
-    copied(capture, tmp_path / "empty.npy")
+    assert [(row.name, row.status) for row in first.rows] == [("a", "done"), ("empty", "failed")]
+    assert first.failed == first.rows[1:]
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"a", "summary.csv", "summary.html"}
+    copied(tiny_capture, tmp_path / "empty.npy")
     again = batch(SPEC, [tmp_path / "*.npy"], tmp_path / "out")
-    assert [(row.status, row.was_finished) for row in again.rows] == [("done", True), ("done", True), ("done", False)]
-    assert [row.true_error_px for row in again.rows] == [first.rows[0].true_error_px] * 3
-    with (tmp_path / "out" / "summary.csv").open(encoding="utf-8") as file:
-        assert [row["status"] for row in csv.DictReader(file)] == ["done"] * 3
+    assert [(row.status, row.was_finished) for row in again.rows] == [("done", True), ("done", False)]
+    assert [row.true_error_px for row in again.rows] == [first.rows[0].true_error_px] * 2
+    results = [tmp_path / "out" / name / "trajectory.npz" for name in ("a", "empty")]
+    assert results[0].read_bytes() == results[1].read_bytes()
+    assert statuses(tmp_path / "out") == ["done"] * 2
 
 
-def test_interrupted_batch_keeps_what_is_finished(capture: Path, tmp_path: Path) -> None:
+def test_interrupted_batch_keeps_what_is_finished(tiny_capture: Path, tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
-        copied(capture, tmp_path / f"{name}.npy")
+        copied(tiny_capture, tmp_path / f"{name}.npy")
     (tmp_path / "hanging.py").write_text(HANGING, encoding="utf-8")
     (tmp_path / "scan.yaml").write_text(
-        "{version: 1, source: {use: auto}, resample: {with: {group_size: 25}}, levels: 1, refine: []}", encoding="utf-8"
+        "{version: 1, source: {use: auto}, resample: {with: {group_size: 40}}, levels: 1, refine: []}", encoding="utf-8"
     )
     program = INTERRUPTED.format(path=[str(tmp_path), *sys.path])
     command = [sys.executable, "-c", program, "batch", "scan.yaml", "a.npy", "b.npy", "c.npy", "-o", "out"]
@@ -93,6 +88,13 @@ def test_interrupted_batch_keeps_what_is_finished(capture: Path, tmp_path: Path)
         _, err = process.communicate(timeout=10)
     assert process.returncode == 130, err
     assert "[1/3] a: " in err
-    with (tmp_path / "out" / "summary.csv").open(encoding="utf-8") as file:
-        assert [row["status"] for row in csv.DictReader(file)] == ["done", "interrupted", "interrupted"]
+    assert statuses(tmp_path / "out") == ["done", "interrupted", "interrupted"]
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"a", "begun", "summary.csv", "summary.html"}
+
+
+def test_killed_runs_end_with_the_same_bytes() -> None:
+    """A few of the trials of tests/benchmarks/kills.py: runs in processes that are killed (SIGKILL), and resumed."""
+    command = [sys.executable, str(SCRIPT), "--moments", "1", "--writing", "1", "--seed", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 of 1 runs ended with the same bytes and left nothing behind" in done.stdout
