@@ -33,7 +33,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def capture(simulated: Callable[..., Path]) -> Path:
-    return simulated(n_frames=200, frame_shape=list(SHAPE), path={"kind": "pan", "length_px": 40})
+    return simulated(n_frames=240, frame_shape=list(SHAPE), path={"kind": "pan", "length_px": 40})
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def kill(monkeypatch: pytest.MonkeyPatch, plan: Plan, n_records: int) -> None:
 
 def test_run_killed_three_times_ends_with_the_same_bytes(plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch) -> None:
     gain = np.linspace(0.9, 1, SHAPE[0] * SHAPE[1], dtype=np.float32).reshape(SHAPE)
-    vignette = Vignette(gain, np.full_like(gain, 0.3), (FrameSpan(0, 200),))
+    vignette = Vignette(gain, np.full_like(gain, 0.3), (FrameSpan(0, 240),))
     monkeypatch.setattr("photonpano.pipeline.passes.vignette_of", lambda *_: vignette)
     unbroken, killed = run(plan_of("unbroken")), plan_of("killed")
     for n_records in (4, 11, 6):
