@@ -1,7 +1,5 @@
 """Values and progress as HTML."""
 
-from __future__ import annotations
-
 import base64
 import io
 import re

@@ -1,7 +1,5 @@
 """Commands as functions: what the tests of the command line do not show."""
 
-from __future__ import annotations
-
 import inspect
 from pathlib import Path
 
@@ -20,10 +18,6 @@ def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Plan:
     monkeypatch.chdir(tmp_path)
     np.save("cube.npy", np.packbits(np.random.default_rng(0).random((40, 8, 13)) < 0.3, axis=-1))
     return capture_plan("cube.npy", {"width": 13, "frame_rate_hz": 100})
-
-
-def test_every_public_name_is_importable() -> None:
-    assert [name for name in photonpano.__all__ if getattr(photonpano, name) is None] == []
 
 
 @pytest.mark.parametrize("name", ["preview", "dark", "evaluate", "convert", "simulate"])

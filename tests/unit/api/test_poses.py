@@ -1,8 +1,7 @@
 """Poses of a run, read back from the files of other programs."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -92,31 +91,36 @@ def test_tum_trajectory_has_seconds_and_rotations_to_the_world(folder: Path, tmp
     np.testing.assert_allclose(Rotation.from_quat(numbers[:, 4:]).as_matrix(), ROTATIONS[3::2], atol=1e-12)
 
 
-def test_export_of_homographies_is_refused(folder: Path, tmp_path: Path) -> None:
-    write(folder, turns=False)
-    with pytest.raises(InputError) as caught:
-        export(folder, "tum", tmp_path / "poses")
-    assert str(caught.value) == (
-        f"{folder} knows homographies, and no rotations of a camera; run its spec again with --set motion.model=rotation"
-    )
-    assert not (tmp_path / "poses").exists()
-
-
-def test_export_of_no_located_frame_is_refused(folder: Path, tmp_path: Path) -> None:
-    write(folder, located=np.zeros(N_FRAMES, bool))
-    with pytest.raises(InputError, match="the run located no frame, so that it has no poses"):
-        export(folder, "colmap", tmp_path / "poses")
-
-
-def test_tum_without_a_frame_rate_is_refused(folder: Path, tmp_path: Path) -> None:
+def without_rate(folder: Path) -> None:
     (folder / "run.json").write_text(json.dumps({"spec": {}, "source": {"frame_rate_hz": None}}))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda folder: write(folder, turns=False),
+            "{folder} knows homographies, and no rotations of a camera; run its spec again with --set motion.model=rotation",
+        ),
+        (lambda folder: write(folder, located=np.zeros(N_FRAMES, bool)), "the run located no frame, so that it has no poses"),
+        (
+            without_rate,
+            "{folder} knows no frame rate, which the times of the format tum need; set source.with.frame_rate_hz and run the "
+            "spec again",
+        ),
+    ],
+    ids=["homographies", "nothing located", "no frame rate"],
+)
+def test_run_without_poses_or_times_is_refused(
+    folder: Path, tmp_path: Path, change: Callable[[Path], object], message: str
+) -> None:
+    change(folder)
     with pytest.raises(InputError) as caught:
         export(folder, "tum", tmp_path / "poses")
-    assert str(caught.value) == (
-        f"{folder} knows no frame rate, which the times of the format tum need; set source.with.frame_rate_hz and run the spec "
-        "again"
-    )
-    export(folder, "colmap", tmp_path / "poses")
+    assert str(caught.value).endswith(message.format(folder=folder))
+    assert not (tmp_path / "poses").exists()
+    if change is without_rate:
+        export(folder, "colmap", tmp_path / "poses")
 
 
 def test_export_into_a_folder_with_files_is_refused(folder: Path, tmp_path: Path) -> None:

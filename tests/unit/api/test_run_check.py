@@ -1,18 +1,24 @@
-"""Check a finished run by its capture: the verdict is that of the run, and wrong input is named."""
+"""Finished runs are compared, checked, verified, and cleaned up after."""
 
-from __future__ import annotations
-
+import fcntl
 import json
+import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from photonpano import InputError, check_run
+from photonpano import InputError, OutputError, check_run, clean, compare, parse_spec, run, verify
+from photonpano.evaluation import RunTrajectory
+from photonpano.evaluation.comparison import motion_difference, on_canvas
+from photonpano.geometry import Canvas, translation
 from photonpano.pipeline.run import RunResult
+from photonpano.reading.gzipped import unpacked
 from photonpano.residuals.verdict import REPEATS
 
 
@@ -73,3 +79,202 @@ def test_check_run_keeps_what_only_the_run_can_find(finished: Path) -> None:
     found = [reason.what for reason in check_run(finished).verdict.reasons]
     assert found[-2:] == ["more than half of the frame stands still while the rest moves", REPEATS]
     assert other["what"] not in found
+
+
+@pytest.fixture
+def copied(small_run: RunResult, tmp_path: Path) -> Path:
+    shutil.copytree(small_run.directory, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_verify_accepts_a_finished_run(small_run: RunResult) -> None:
+    found = verify(small_run.directory)
+    assert (found.n_files, found.problems, found.capture) == (5, (), "the same frames")
+    assert found.n_bytes == sum(path.stat().st_size for path in small_run.directory.iterdir() if path.name != "run.json")
+
+
+def test_verify_finds_what_differs(copied: Path) -> None:
+    (copied / "report.html").unlink()
+    with (copied / "panorama.tiff").open("r+b") as file:
+        file.seek(-1, os.SEEK_END)
+        file.write(b"\x07")
+    target = (copied / "trajectory.npz").rename(copied.parent / "elsewhere.npz")
+    (copied / "trajectory.npz").symlink_to(target)
+    record = json.loads((copied / "run.json").read_text())
+    record["capture"]["frames_sha256"] = "0"
+    (copied / "run.json").write_text(json.dumps(record))
+    assert verify(copied).problems == (
+        "report.html is missing",
+        "panorama.tiff is not the file that the run wrote",
+        "trajectory.npz is not the file that the run wrote",
+        "the frames are others",
+    )
+
+
+def test_verify_says_what_it_cannot_compare(copied: Path) -> None:
+    record = json.loads((copied / "run.json").read_text())
+    record["spec"]["source"]["with"]["path"] = "/nowhere/cube.npy"
+    (copied / "run.json").write_text(json.dumps(record))
+    found = verify(copied)
+    assert (found.problems, found.capture) == ((), "not compared: there is no file /nowhere/cube.npy; check the path")
+    del record["files"]
+    (copied / "run.json").write_text(json.dumps(record))
+    assert verify(copied).problems == ("run.json lists no hashes, as in older versions",)
+
+
+def test_clean_removes_leftovers_only(tmp_path: Path) -> None:
+    import gzip
+
+    with gzip.open(tmp_path / "cube.npy.gz", "wb") as file:
+        np.save(file, np.zeros((4, 5, 6), np.uint8))
+    shutil.copy(tmp_path / "cube.npy.gz", tmp_path / "used.npy.gz")
+    (tmp_path / "cube.npy.gz.unpacked.npy").write_bytes(b"old")
+    (tmp_path / "lost.npy.gz.unpacked.npy").write_bytes(b"its archive is gone")
+    unpacked(tmp_path / "used.npy.gz")
+    left = [".scan.0123abcd.partial/panorama.tiff", ".cube.0123abcd.partial.npy", ".scan.lock", "run/.0123abcd.partial/a"]
+    kept = [".used.0123abcd.partial.npy", "cube.npy.part", ".mine.lock", ".partial", ".x.partial", "notes.partial", "run/.lock"]
+    for name in (*left, *kept):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("content")
+    (tmp_path / ".scan.lock").write_text(json.dumps({"host": "a", "pid": 1, "process_start": "", "since": ""}))
+    (tmp_path / ".link.0123abcd.partial").symlink_to(tmp_path / "notes.partial")
+    before = {path for path in tmp_path.rglob("*") if path.is_file() or path.is_symlink()}
+    expected = sorted(
+        tmp_path / name.removesuffix("/panorama.tiff").removesuffix("/a") for name in (*left, "cube.npy.gz.unpacked.npy")
+    )
+    with (tmp_path / ".used.0123abcd.partial.npy").open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert sorted(clean(tmp_path, dry_run=True)) == expected
+        assert {path for path in tmp_path.rglob("*") if path.is_file() or path.is_symlink()} == before
+        assert sorted(clean(tmp_path)) == expected
+    removed = before - {path for path in tmp_path.rglob("*") if path.is_file() or path.is_symlink()}
+    assert removed == {tmp_path / name for name in (*left, "cube.npy.gz.unpacked.npy")}
+    with pytest.raises(InputError) as caught:
+        clean(tmp_path / "nowhere")
+    assert str(caught.value) == f"there is no folder {tmp_path}/nowhere; check the path"
+
+
+def test_clean_finishes_a_run_that_was_killed_in_its_step(copied: Path) -> None:
+    pending = copied / ".photonpano-pending"
+    pending.mkdir()
+    for path in copied.glob("*.*"):
+        if path.is_file():
+            path.rename(pending / path.name)
+    clean(copied.parent)
+    assert not pending.exists()
+    assert verify(copied).problems == ()
+
+
+@pytest.fixture(scope="module")
+def once(small_spec: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the small capture with one level."""
+    folder = tmp_path_factory.mktemp("runs") / "one <level>"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
+        return run(parse_spec(small_spec | {"levels": 1}, output=folder)).directory
+
+
+def test_page_lays_runs_side_by_side(small_run: RunResult, once: Path, tmp_path: Path) -> None:
+    found = compare([small_run.directory, once], tmp_path / "page.html")
+    page = found.page.read_text(encoding="utf-8")
+    body = ElementTree.fromstring(page).find("body")
+    assert body is not None
+    text = " ".join(" ".join(body.itertext()).split())
+    assert found.runs == ("small", "one <level>")
+    assert found.mean_difference_px[0] is None
+    assert 0.001 < (found.mean_difference_px[1] or 0) < 1
+    assert page.count("data:image/jpeg") == 2
+    assert "levels 3 1" in text
+    assert "corner error (px)" in text  # the truth lies beside the capture
+    assert "2 runs of one capture: 300 binary frames" in text
+    assert not re.findall(r"""src=["'](?!data:)""", page)
+    links = [element.attrib["href"] for element in body.iter("a")]
+    assert links[0].endswith("small/report.html")
+    assert links[1].endswith("one%20%3Clevel%3E/report.html")
+
+
+def changed(folder: Path, copy: Path, **record: Any) -> Path:
+    """Copy a run, and change its record."""
+    shutil.copytree(folder, copy)
+    content = json.loads((copy / "run.json").read_text(encoding="utf-8"))
+    (copy / "run.json").write_text(json.dumps(content | record), encoding="utf-8")
+    return copy
+
+
+def test_runs_of_different_captures_are_refused_by_name(small_run: RunResult, tmp_path: Path) -> None:
+    capture = small_run.record["capture"]
+    files = [{**capture["files"][0], "path": "/data/bridge.npy"}]
+    other = changed(small_run.directory, tmp_path / "other", capture={**capture, "files": files, "frames_sha256": "0"})
+    with pytest.raises(InputError) as caught:
+        compare([small_run.directory, other], tmp_path / "page.html")
+    assert f"{other} is a run of bridge.npy (300 frames): these are different captures" in str(caught.value)
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_wrong_folders_are_refused(small_run: RunResult, tmp_path: Path) -> None:
+    folder = small_run.directory
+    page = tmp_path / "page.html"
+    with pytest.raises(InputError, match="at least two different run folders"):
+        compare([folder, folder / ".." / folder.name], page)
+    with pytest.raises(InputError, match="is not a folder"):
+        compare([folder, tmp_path / "nowhere"], page)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no run has finished in it"):
+        compare([folder, tmp_path / "empty"], page)
+    shutil.copytree(folder, tmp_path / "damaged")
+    (tmp_path / "damaged" / "panorama.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"is not the file that its run\.json lists"):
+        compare([folder, tmp_path / "damaged"], page)
+    assert not page.exists()
+
+
+def test_page_that_cannot_be_written_is_an_error(small_run: RunResult, once: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        compare([small_run.directory, once], tmp_path / "nowhere" / "page.html")
+
+
+def test_file_of_another_kind_is_not_replaced(small_run: RunResult, once: Path, tmp_path: Path) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.write_text("precious", encoding="utf-8")
+    with pytest.raises(OutputError, match=r"notes\.txt: the page is HTML; choose a name that ends in \.html"):
+        compare([small_run.directory, once], notes)
+    assert notes.read_text(encoding="utf-8") == "precious"
+
+
+def test_same_motions_are_said_to_be_the_same(small_run: RunResult, tmp_path: Path) -> None:
+    record = small_run.record
+    spec = {**record["spec"], "output": {**record["spec"]["output"], "keep": "exposures"}}
+    copy = changed(small_run.directory, tmp_path / "copy", spec=spec)
+    found = compare([small_run.directory, copy], tmp_path / "page.html")
+    page = found.page.read_text(encoding="utf-8")
+    assert found.mean_difference_px == (None, 0.0)
+    assert "All runs have the same motion." in page
+    assert re.findall(r'<td data-name="(?:small|copy)">(null|exposures)</td>', page) == ["null", "exposures"]
+
+
+def motion_of(homographies: np.ndarray, located: np.ndarray) -> RunTrajectory:
+    return RunTrajectory(homographies, np.eye(3), (40, 60), located, np.zeros(len(homographies)))
+
+
+def test_motion_difference_ignores_the_plane_and_finds_the_frame() -> None:
+    path = np.array([translation(2.0 * k, np.sin(k)) for k in range(30)])
+    plane = translation(5, -7) @ np.array([[1.02, 0.01, 0], [0.0, 0.99, 0], [1e-5, 0, 1]])
+    other = plane @ path
+    other[7] = plane @ path[7] @ translation(0.5, 0)
+    located = np.ones(30, dtype=bool)
+    located[20] = False
+    found = motion_difference(motion_of(path, np.ones(30, dtype=bool)), motion_of(other, located))
+    assert found is not None
+    assert found.corners_px[7] == pytest.approx(0.5, abs=0.1)
+    assert np.isnan(found.corners_px[20])
+    assert np.nanmax(np.delete(found.corners_px, 7)) < 0.1
+    assert motion_difference(motion_of(path, located), motion_of(path, ~located)) is None
+
+
+def test_panorama_is_moved_onto_the_common_canvas_with_one_white() -> None:
+    picture = np.random.default_rng(0).integers(1, 255, (30, 50), np.uint8)
+    canvas, common = Canvas(30, 50, translation(3, 4)), Canvas(20, 30, translation(-7, 0))
+    moved = on_canvas(picture, canvas, np.eye(3), common, None)
+    np.testing.assert_array_equal(moved, picture[4:24, 10:40])
+    darker = on_canvas(picture, canvas, np.eye(3), common, (1.0, 2.0))
+    assert (darker < moved)[moved > 20].all()

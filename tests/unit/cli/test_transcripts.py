@@ -6,8 +6,6 @@ current folder. `% NAME` calls a function of `SET_UPS`, `> FILE` writes the line
 `## ` begins a comment. With `TRANSCRIPTS=write` in the environment, what differs is written anew.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,9 +1,9 @@
-from __future__ import annotations
+"""Homographies: products, steps, and which are plausible."""
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from photonpano import geometry, photometry
@@ -11,15 +11,19 @@ from photonpano.geometry import (
     corner_displacements,
     corners,
     from_parameters,
+    generators,
     inverse,
     jacobian,
     normalised,
     parameters,
     rescaled,
     rescaling,
+    slopes,
     step_motions,
     transform_points,
     translation,
+    unit_coordinates,
+    why_implausible,
 )
 
 small = st.floats(-0.2, 0.2)
@@ -106,10 +110,6 @@ def test_rescaled_is_the_same_motion_of_rescaled_points(homography: np.ndarray, 
     )
 
 
-def test_rescaled_doubles_translation_at_scale_2() -> None:
-    np.testing.assert_allclose(rescaled(translation(3, -1), 2), translation(6, -2), atol=1e-12)
-
-
 def test_parameters_are_ordered_as_in_the_paper() -> None:
     p = np.arange(1, 9) / 10
     expected = [[1 + p[0], p[2], p[4]], [p[1], 1 + p[3], p[5]], [p[6], p[7], 1]]
@@ -150,3 +150,119 @@ def test_corners_are_pixel_centres_clockwise() -> None:
 def test_corner_displacements_are_distances() -> None:
     stack = np.stack([np.eye(3), translation(3, 4)])
     np.testing.assert_allclose(corner_displacements(stack, np.eye(3), (3, 5)), [[0] * 4, [5] * 4])
+
+
+FRAME = (254, 496)
+HOMOGRAPHY = np.array([[1.02, 0.03, 11.0], [-0.02, 0.98, -4.0], [2e-5, -3e-5, 1.0]])
+
+
+def test_unit_coordinates_span_the_longer_side():
+    edges = np.array([[-0.5, 126.5], [495.5, 126.5], [247.5, 126.5]])
+    assert transform_points(unit_coordinates(FRAME), edges) == pytest.approx(np.array([[-1, 0], [1, 0], [0, 0]]))
+
+
+def test_generators_are_derivatives_of_pixel_homographies():
+    unit = unit_coordinates(FRAME)
+    step = 1e-6 * np.arange(1, 9)
+    changed = np.linalg.inv(unit) @ from_parameters(step) @ unit
+    assert np.eye(3) + np.tensordot(step, generators(FRAME), 1) == pytest.approx(changed, rel=1e-12, abs=1e-12)
+
+
+def test_slopes_agree_with_finite_differences():
+    points = corners(FRAME)
+    rows = np.concatenate([points, np.ones((4, 1))], axis=1).T
+    found = slopes(HOMOGRAPHY @ rows, HOMOGRAPHY @ generators(FRAME) @ rows)
+    for parameter in range(8):
+        step = np.zeros(8)
+        step[parameter] = 1e-6
+        moved = (np.eye(3) + sign * np.tensordot(step, generators(FRAME), 1) for sign in (1, -1))
+        ahead, behind = (transform_points(HOMOGRAPHY @ each, points) for each in moved)
+        assert found[:, parameter] == pytest.approx(((ahead - behind) / 2e-6).ravel(), rel=1e-6, abs=1e-4)
+
+
+def test_slopes_of_stack_equal_slopes_of_each():
+    rows = np.concatenate([corners(FRAME), np.ones((4, 1))], axis=1).T
+    both = np.stack([HOMOGRAPHY, np.eye(3)])
+    found = slopes(both @ rows, both[:, None] @ generators(FRAME) @ rows)
+    assert found.shape == (2, 8, 8)
+    for homography, of_it in zip(both, found, strict=True):
+        assert of_it == pytest.approx(slopes(homography @ rows, homography @ generators(FRAME) @ rows))
+
+
+SMALL = (101, 201)
+
+
+def about_centre(matrix: np.ndarray) -> np.ndarray:
+    """Return a map that acts about the centre of the image."""
+    return normalised(translation(100, 50) @ matrix @ translation(-100, -50))
+
+
+def turned(degrees: float) -> np.ndarray:
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    "homography",
+    [np.eye(3), translation(170, 0), translation(-90, 40), about_centre(turned(40)), about_centre(np.diag([1.3, 1.3, 1.0]))],
+    ids=["identity", "shift", "diagonal shift", "roll", "zoom"],
+)
+def test_why_implausible_accepts_camera_motion(homography: np.ndarray) -> None:
+    assert why_implausible(homography, SMALL) is None
+
+
+TURNED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0025, 0.0, 1.0]])
+TILTED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.005, 1.0]])
+
+REASONS = [
+    (np.full((3, 3), np.nan), "the homography is not finite"),
+    (np.array([[1.0, 0, 0], [0, 1, 0], [-0.01, 0, 1]]), "the homography sends part of the image behind the camera"),
+    (about_centre(np.diag([-1.0, 1.0, 1.0])), "the homography mirrors or folds the image"),
+    (np.diag([0.0, 1.0, 1.0]), "the homography mirrors or folds the image"),
+    (
+        about_centre(np.diag([2.0, 2.0, 1.0])),
+        "the homography changes the area of the image by a factor of 4 (at most 2 is plausible)",
+    ),
+    (
+        about_centre(rescaling(0.6)),
+        "the homography changes the area of the image by a factor of 0.36 (at most 2 is plausible)",
+    ),
+    (
+        about_centre(TURNED),
+        "the homography makes opposite sides of the image differ by a factor of 1.7 (at most 1.5 is plausible)",
+    ),
+    (
+        about_centre(TILTED),
+        "the homography makes opposite sides of the image differ by a factor of 1.7 (at most 1.5 is plausible)",
+    ),
+    (translation(190, 0), "the images overlap by 5% (at least 10% is needed)"),
+    (translation(1000, 0), "the images overlap by 0% (at least 10% is needed)"),
+]
+
+
+@pytest.mark.parametrize(("homography", "reason"), REASONS)
+def test_why_implausible_gives_reason(homography: np.ndarray, reason: str) -> None:
+    assert why_implausible(homography, SMALL) == reason
+
+
+@given(
+    st.builds(
+        lambda *p: about_centre(from_parameters(p)),
+        *[st.floats(-0.15, 0.15)] * 4,
+        st.floats(-150, 150),
+        st.floats(-80, 80),
+        *[st.floats(-5e-4, 5e-4)] * 2,
+    )
+)
+def test_why_implausible_overlap_agrees_with_warped_mask(homography: np.ndarray) -> None:
+    assume(why_implausible(homography, SMALL, min_overlap=0) is None)
+    height, width = SMALL
+    quad = cv2.perspectiveTransform(corners(SMALL)[None], homography)[0]
+    mask = np.zeros((16 * (height - 1), 16 * (width - 1)), np.uint8)  # sixteen times as fine
+    cv2.fillConvexPoly(mask, np.rint(16 * quad - 0.5).astype(np.int32), 1)
+    share = float(mask.mean())
+    assume(share > 0.03)
+    assert why_implausible(homography, SMALL, min_overlap=share - 0.02) is None
+    reason = why_implausible(homography, SMALL, min_overlap=share + 0.02)
+    assert reason is not None
+    assert reason.startswith("the images overlap by ")

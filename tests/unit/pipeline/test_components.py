@@ -1,6 +1,6 @@
-from __future__ import annotations
+"""Components are built from a plan; forecasts, and what renderers on planes refuse."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,16 +17,19 @@ from photonpano import (
     RendererContribution,
     Requirement,
     ResamplerContribution,
-    Response,
     SourceContext,
     SourceContribution,
     StageContext,
     StreamInfo,
 )
+from photonpano.capture import seen_through
+from photonpano.geometry import Camera, Canvas, FrameTrajectory, canvas_around, covered_by, rotation_matrices
 from photonpano.lighting import in_light
 from photonpano.photometry import BinaryResponse
-from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
-from photonpano.pipeline.rendering import build_renderer
+from photonpano.pipeline.components import build_levels, build_renderer, build_source, foreseen_groups, scale_of
+from photonpano.pipeline.forecast import TRIAL_GROUPS, forecast
+from photonpano.pipeline.renderers import AttributedRenderer
+from photonpano.protocols import Renderer
 from photonpano.registry import Catalog, Origin
 from photonpano.registry.catalog import make_entry
 from photonpano.specs import Plan, parse_spec
@@ -78,6 +81,8 @@ def test_components_receive_their_config_and_context() -> None:
     assert source.source.given.context == SourceContext(seed=7, threads=3)
     (level,) = build_levels(made, source, [])
     assert level.locators[0].component.context == StageContext(source.info, source.response, seed=7, threads=3)
+    for stage in (level.resampler, level.merger, level.interpolator):
+        assert stage.context.response == source.response
     assert level.locators[0].origin == "locator 'toy' of toys 1.0"
     assert level.origins == {
         "resampler": "resampler 'toy' of toys 1.0",
@@ -204,15 +209,6 @@ def test_missing_library_is_named_with_its_install_line() -> None:
     )
 
 
-def test_response_reaches_every_stage() -> None:
-    made = plan()
-    source = build_source(made)
-    (level,) = build_levels(made, source, [])
-    stages: list[Any] = [level.resampler, level.merger, level.locators[0].component, level.interpolator]
-    responses: set[Response] = {stage.context.response for stage in stages}
-    assert responses == {source.response}
-
-
 @pytest.mark.parametrize(
     ("levels", "shape", "scales"),
     [
@@ -228,3 +224,78 @@ def test_auto_scale_halves_the_first_two_levels_if_a_later_one_refines_them(
 ) -> None:
     plan = parse_spec({"version": 1, "source": {"use": "simulator"}, "levels": levels})
     assert [scale_of(plan, number, shape) for number in range(1, len(scales) + 1)] == scales
+
+
+def test_forecast_predicts_time_memory_and_canvas(small_spec: dict[str, Any]) -> None:
+    plan = parse_spec(small_spec | {"resample": {"with": {"group_size": 20}}, "levels": 2})
+    with build_source(plan) as source:
+        found = forecast(plan, source)
+        n_frames = source.info.n_frames
+    assert len(found.tried) == 20 * TRIAL_GROUPS < n_frames
+    assert abs(found.tried.centre - (n_frames - 1) / 2) <= 1
+    assert set(found.seconds) == {"level 1", "level 2", "panorama"}
+    assert min(found.seconds.values()) > 0
+    assert found.memory_bytes > 30 * 2**20
+    # The camera pans by 60 px over the capture, and trembles.
+    assert 190 < found.canvas[1] < 290
+    assert 128 <= found.canvas[0] < 220
+
+
+@pytest.mark.parametrize(("extent", "shape"), [("reference", (256, 320)), ([-10, 5, 20, 25], (40, 60))])
+def test_forecast_of_a_part_has_the_size_of_the_part(small_spec: dict[str, Any], extent: Any, shape: tuple[int, int]) -> None:
+    render = {"extent": extent, "scale": 2}
+    plan = parse_spec(small_spec | {"resample": {"with": {"group_size": 10}}, "levels": 1, "render": render})
+    with build_source(plan) as source:
+        assert forecast(plan, source).canvas == shape
+
+
+def test_forecast_of_a_turn_knows_that_a_sphere_ends() -> None:
+    """The trial turns by 90 degrees of 500; all around are 377 px, and a box of degrees is left out of account."""
+    scene = {"kind": "street", "width": 400, "height": 200}
+    turn = {"scene": scene, "path": {"kind": "turn", "degrees": 500}, "frame_shape": [48, 80], "focal_length_px": 60}
+    spec = {
+        "version": 1,
+        "source": {"use": "simulator", "with": turn | {"n_frames": 1000, "flux": 2.0}},
+        "motion": {"model": "rotation"},
+        "camera": {"focal_px": 60},
+        "resample": {"with": {"group_size": 15}},
+        "levels": 1,
+        "render": {"projection": "spherical", "extent": [0, -10, 20, 10]},
+    }
+    plan = parse_spec(spec)
+    with build_source(plan) as source:
+        height, width = forecast(plan, source).canvas
+    assert width == 377
+    assert 40 <= height < 60
+
+
+SHAPE = (40, 60)
+CAMERA = Camera.of(50.0, SHAPE)
+LENS = Camera.of(50.0, SHAPE, [-0.1, 0, 0, 0])
+PLANE = Canvas(*SHAPE, np.eye(3))
+SPHERE = canvas_around(covered_by(np.eye(3)[None], CAMERA, SHAPE), CAMERA, 1.0, "spherical")
+
+
+@pytest.mark.parametrize(
+    ("canvas", "camera", "degrees", "reason"),
+    [
+        (
+            SPHERE,
+            CAMERA,
+            0,
+            "renders on a plane only, and this panorama is spherical; write render.use: merge, or render.projection: planar",
+        ),
+        (PLANE, LENS, 0, "does not render through a lens that distorts; write render.use: merge"),
+        (PLANE, CAMERA, 120, "does not leave out frames that reach behind the plane; write render.use: merge"),
+    ],
+    ids=["sphere", "lens", "behind"],
+)
+def test_renderer_on_planes_is_not_called_for_other_canvases(
+    canvas: Canvas, camera: Camera, degrees: float, reason: str
+) -> None:
+    turn = FrameTrajectory(CAMERA.homographies(rotation_matrices([[0, 0, 0], [0, np.radians(degrees), 0]])))
+    source = seen_through(MemorySource(np.zeros((2, *SHAPE), np.uint8)), camera)
+    renderer = AttributedRenderer(cast("Renderer", None), "renderer 'flat' of a plugin", 40, any_canvas=False)
+    with pytest.raises(InputError) as caught:
+        renderer.render(source, turn, FrameSpan(0, 2), canvas, 0.25, lambda _: None)
+    assert str(caught.value) == f"renderer 'flat' of a plugin {reason}"

@@ -1,15 +1,27 @@
-"""The pictures of a video: their noise is that of the photons, and the outline lies where the frame is."""
+"""The pictures of a video, and the metadata by which viewers open a spherical panorama."""
 
-from __future__ import annotations
+import re
 
+import cv2
 import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.geometry import Camera, Canvas, FrameTrajectory, canvas_of_box, rotation_matrices, translation
+from photonpano.geometry import (
+    Camera,
+    Canvas,
+    FrameTrajectory,
+    canvas_around,
+    canvas_of_box,
+    covered_by,
+    rotation_matrices,
+    translation,
+)
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.film import Film, outline_on
+from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
 from photonpano.testing import MemorySource
+from photonpano.testing.scenes import detected
 
 SHAPE = (24, 32)
 
@@ -27,7 +39,7 @@ def still() -> Film:
     rng = np.random.default_rng(5)
     at = rng.integers(-3, 4, (2000, 2)).repeat(2, axis=0)[:2000]
     motion = motion_of(np.array([translation(*each) for each in at.astype(float)]))
-    frames = (rng.random((2000, *SHAPE)) < -np.expm1(-0.3)).astype(np.uint8)
+    frames = detected(np.full((2000, *SHAPE), 0.3), rng)
     return Film(MemorySource(frames), motion, canvas_of_box((4, 4, 28, 20), 1.0), 0.25, None, 0.6, "none")
 
 
@@ -70,3 +82,44 @@ def test_outline_goes_on_at_the_other_end_of_a_sphere() -> None:
     assert columns.min() == 0
     assert columns.max() == 79
     assert not ((columns > 12) & (columns < 67)).any()
+
+
+FRAME = (40, 60)
+CAMERA = Camera.of(50.0, FRAME)
+
+
+def spherical(first: float, last: float) -> Canvas:
+    yaws = np.radians(np.arange(first, last + 1, 5))
+    turns = rotation_matrices(np.stack([0 * yaws, yaws, 0 * yaws], axis=-1))
+    return canvas_around(covered_by(turns, CAMERA, FRAME), CAMERA, 1.0, "spherical")
+
+
+def numbers(packet: str) -> dict[str, int]:
+    return {name: int(value) for name, value in re.findall(r"<GPano:(\w+Pixels)>(\d+)<", packet)}
+
+
+def test_full_turn_has_the_width_of_the_sphere() -> None:
+    canvas = spherical(0, 360)
+    found = numbers(photo_sphere(canvas, canvas.shape) or "")
+    assert found["FullPanoWidthPixels"] == found["CroppedAreaImageWidthPixels"] == canvas.width == 316
+    assert found["FullPanoHeightPixels"] == 158
+    assert found["CroppedAreaLeftPixels"] == 0
+    # The horizon, b = 0, is the middle of the sphere.
+    assert found["CroppedAreaTopPixels"] + canvas.transform[1, 2] == pytest.approx(158 / 2 - 0.5, abs=0.51)
+    found = numbers(photo_sphere(canvas, (canvas.height // 2, canvas.width // 2)) or "")
+    assert (found["FullPanoWidthPixels"], found["FullPanoHeightPixels"]) == (158, 79), "numbers of the pixels of the picture"
+
+
+def test_part_of_a_turn_lies_where_it_looks_and_a_plane_has_no_metadata() -> None:
+    canvas = spherical(0, 60)
+    found = numbers(photo_sphere(canvas, canvas.shape) or "")
+    assert found["CroppedAreaLeftPixels"] + canvas.transform[0, 2] == pytest.approx(314 / 2 - 0.5, abs=0.51)
+    assert photo_sphere(Canvas(40, 60, np.eye(3)), FRAME) is None
+
+
+def test_pixels_of_png_stay_as_they_are() -> None:
+    image = np.random.default_rng(0).integers(0, 255, FRAME, np.uint8)
+    png = cv2.imencode(".png", image)[1].tobytes()
+    marked = with_xmp(png, "<x:xmpmeta/>")
+    assert np.array_equal(cv2.imdecode(np.frombuffer(marked, np.uint8), cv2.IMREAD_UNCHANGED), image)
+    assert marked.replace(marked[33 : 33 + len(marked) - len(png)], b"") == png

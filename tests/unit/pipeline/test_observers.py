@@ -1,7 +1,5 @@
 """Observers are told all, change nothing, and do no harm."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -12,6 +10,7 @@ import pytest
 
 from photonpano import LocationError, hookimpl
 from photonpano.context import Context
+from photonpano.errors import described
 from photonpano.geometry import Canvas
 from photonpano.motion.loop import estimate_motion
 from photonpano.pipeline.observers import Observers, frozen
@@ -79,10 +78,10 @@ def test_failed_run_raises_its_error_and_reports_it(
 
 
 def test_observers_receive_four_stages_of_each_level(
-    told: list[Any], log: ModuleType, memory_source: type, make_level: Callable, pan: Callable
+    told: list[Any], log: ModuleType, memory_source: type, make_level: Callable
 ) -> None:
     source = memory_source(np.zeros((120, 40, 60)))
-    levels = [make_level(pan(0.3)), make_level(pan(0.3), number=2)]
+    levels = [make_level(), make_level(number=2)]
     results = estimate_motion(source, levels, GraphSettings(), 60, Context(2, on_level=watching(log).level_finished))
     assert [(level, stage) for level, stage, _, _ in told] == [
         (level, stage) for level in (1, 2) for stage in ("resample", "merge", "locate", "interpolate")
@@ -111,10 +110,16 @@ def test_stage_summary_holds_none_where_std_is_infinite(told: list[Any], log: Mo
     assert told[-1] == (1, "interpolate", 0.0, {"change_px": None, "std_px": None})
 
 
-@pytest.mark.parametrize("error", [ValueError("no space"), SystemExit(3)], ids=repr)
+class Odd(BaseException):
+    """An exception that `except Exception` does not catch."""
+
+
+@pytest.mark.parametrize("error", [ValueError("no space"), SystemExit(3), KeyboardInterrupt(), Odd("stop")], ids=repr)
 def test_exception_of_observer_is_logged_with_its_name_and_others_are_called(
-    told: list[Any], log: ModuleType, caplog: pytest.LogCaptureFixture, error: BaseException
+    told: list[Any], log: ModuleType, caplog: pytest.LogCaptureFixture, heeded: None, error: BaseException
 ) -> None:
+    """With SIGINT handled as by the program, an exception of a plugin is told from an interrupt."""
+
     def fail(directory: Path) -> None:
         raise error
 
@@ -124,7 +129,7 @@ def test_exception_of_observer_is_logged_with_its_name_and_others_are_called(
         finished({})
     assert len(told) == 3
     assert caplog.messages == [
-        f"photonpano_{hook} of clumsy unreleased (given in Python) raised {type(error).__name__}: {error}; the run goes on"
+        f"photonpano_{hook} of clumsy unreleased (given in Python) raised {described(error)}; the run goes on"
         for hook in ("run_started", "stage_finished", "run_finished")
     ]
     assert all(record.exc_info and record.exc_info[1] is error for record in caplog.records)

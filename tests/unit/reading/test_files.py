@@ -1,14 +1,28 @@
-from __future__ import annotations
+"""Files and arrays that hold captures."""
 
+import signal
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import BaseModel
 
 from photonpano import FrameSpan, InputError
-from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_in, read_json
+from photonpano.reading import (
+    FrameFile,
+    FrameLayout,
+    PackedFileSource,
+    files_in,
+    first_look,
+    frames_are_last,
+    look_first,
+    packed_frames_are_last,
+    read_json,
+    unpacked_content,
+)
 
 
 def test_files_in_returns_natural_order(tmp_path: Path) -> None:
@@ -82,3 +96,160 @@ def test_read_json_refuses_what_does_not_fit_the_model(tmp_path: Path, content: 
     assert str(caught.value).startswith(f"{path}{message}")
     path.write_bytes(b'{"height": 3, "width": 4}')
     assert read_json(path, Size).height == 3
+
+
+def summed(frames: np.ndarray, n: int) -> np.ndarray:
+    return frames[: len(frames) // n * n].reshape(-1, n, *frames.shape[1:]).sum(axis=1, dtype=np.uint8)
+
+
+def last(frames: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(np.moveaxis(frames, 0, -1))
+
+
+@pytest.mark.parametrize("dtype", [bool, np.uint8, np.int64, ">u2"])
+def test_zeros_and_ones_are_bits(clouds: Callable[..., np.ndarray], dtype: Any) -> None:
+    assert unpacked_content([clouds(0.003, n_frames=40).astype(dtype)])[:3] == ("bits", 0, 1)
+
+
+def test_zeros_and_255_are_bits(clouds: Callable[..., np.ndarray]) -> None:
+    assert unpacked_content([clouds(n_frames=40) * np.uint8(255)])[:3] == ("bits", 0, 255)
+
+
+@pytest.mark.parametrize("flux", [2.0, 0.3, 0.01])
+@pytest.mark.parametrize("n", [4, 64, 255])
+def test_counts_of_any_height_are_sums(clouds: Callable[..., np.ndarray], n: int, flux: float) -> None:
+    sums = summed(clouds(flux, n_frames=510), n)
+    found = unpacked_content([sums])
+    assert found == ("sums", sums.min(), sums.max(), sums.size)
+
+
+def test_sums_with_hot_pixels_are_sums(clouds: Callable[..., np.ndarray]) -> None:
+    frames = clouds(0.05, n_frames=510)
+    frames[:, np.random.default_rng(0).random(frames.shape[1:]) < 0.03] = 1
+    assert unpacked_content([summed(frames, 255)]).holds == "sums"
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize("order", ["big", "little"])
+@pytest.mark.parametrize("flux", [3.0, 0.3, 0.003])
+def test_packed_pixels_are_neither(clouds: Callable[..., np.ndarray], axis: int, order: Any, flux: float) -> None:
+    assert unpacked_content([np.packbits(clouds(flux, n_frames=64), axis=axis, bitorder=order)]) is None
+
+
+@pytest.mark.parametrize("side", [1, 2, 4, 8])
+def test_packed_chequers_are_no_numbers(side: int) -> None:
+    y, x = np.mgrid[:64, :96]
+    chequers = np.repeat(((x // side + y // side) % 2).astype(np.uint8)[None], 16, axis=0)
+    assert unpacked_content([np.packbits(chequers, axis=2)]) is None
+
+
+@pytest.mark.parametrize("value", [0, 1, 255])
+def test_single_value_tells_nothing(value: int) -> None:
+    frames = np.zeros((20, 8, 8), np.uint8)
+    frames[:, 3, 4] = value  # as of one hot pixel
+    assert unpacked_content([frames]) is None
+
+
+def test_last_axis_is_that_of_the_frames_where_values_are_most_alike(clouds: Callable[..., np.ndarray]) -> None:
+    frames = clouds(n_frames=512)
+    for content in (frames, summed(frames, 2)):
+        assert not frames_are_last([content], content.shape)
+        moved = last(content)
+        assert frames_are_last([moved], moved.shape)
+
+
+def test_last_axis_of_packed_frames_is_found(clouds: Callable[..., np.ndarray]) -> None:
+    frames = clouds(n_frames=1024)
+    packed = np.packbits(frames, axis=2)
+    for holds in ("pixels", "frames"):
+        assert not packed_frames_are_last([packed], packed.shape, holds)
+    for stored, holds in ((last(packed), "pixels"), (np.packbits(last(frames), axis=-1), "frames")):
+        assert packed_frames_are_last([stored], stored.shape, holds)
+
+
+def test_last_axis_of_fast_packed_frames_is_found_by_the_axis_that_is_packed(clouds: Callable[..., np.ndarray]) -> None:
+    stored = last(np.packbits(clouds(n_frames=1024)[::5, :, :32], axis=2))  # 1 px a frame
+    assert packed_frames_are_last([stored], stored.shape, "pixels")
+
+
+def test_wide_short_noise_has_its_frames_first() -> None:
+    alarms = [
+        frames_are_last([np.random.default_rng(seed).integers(0, 2, (24, 32, 128), np.uint8)], (24, 32, 128))
+        for seed in range(100)
+    ]
+    assert not any(alarms)
+
+
+LOOKS = """\
+import os
+from pathlib import Path
+
+def loop(path):
+    while True:
+        pass
+
+def crash(path):
+    if path.endswith("2"):
+        os.abort()
+
+def take_memory(path):
+    bytearray(3 * 2**30)
+
+def fail(path):
+    raise ValueError("for the reader to say")
+
+def note(path):
+    with Path(path + ".seen").open("a") as file:
+        file.write("x")
+"""
+
+
+@pytest.fixture
+def look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """Look at two files, and return what is wrong with them."""
+    (tmp_path / "looks_of_test.py").write_text(LOOKS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(first_look, "CPU_S", 0.5)
+    paths = [tmp_path / name for name in ("1", "2")]
+    for path in paths:
+        path.write_bytes(b"content")
+
+    def look(name: str) -> str:
+        try:
+            look_first(paths, f"looks_of_test:{name}")
+        except InputError as error:
+            return str(error)
+        return ""
+
+    return look
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("loop", "DIR/1 cannot be read to an end: it is damaged; copy or record it again"),
+        ("crash", "DIR/2 makes its reader crash (SIGABRT): it is damaged; copy or record it again"),
+        ("take_memory", "DIR/1 takes more than 2 GiB of memory to read: it is damaged; copy or record it again"),
+        ("fail", ""),
+    ],
+)
+def test_look_names_the_file_that_cannot_be_read(tmp_path: Path, look: Callable[..., str], name: str, message: str) -> None:
+    assert look(name) == message.replace("DIR", str(tmp_path))
+
+
+def test_file_is_looked_at_once_unless_it_changes(tmp_path: Path, look: Callable[..., str]) -> None:
+    assert look("note") == look("note") == ""
+    assert (tmp_path / "1.seen").read_text() == "x"
+    (tmp_path / "1").write_bytes(b"other content")
+    look("note")
+    assert (tmp_path / "1.seen").read_text() == "xx"
+
+
+def test_reader_goes_on_if_no_process_can_be_started(look: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_look.sys, "executable", "/nowhere/python")
+    assert look("crash") == ""
+
+
+def test_verdict_tells_a_limit_from_a_crash() -> None:
+    assert first_look._verdict(-signal.SIGPROF, 0) == first_look._verdict(-signal.SIGKILL, 0) == "cannot be read to an end"
+    assert first_look._verdict(3, 0) == "makes its reader crash (exit code 3)"

@@ -1,7 +1,5 @@
 """Captures at URLs: over HTTP, and in an object store."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import os

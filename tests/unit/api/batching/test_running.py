@@ -1,12 +1,17 @@
-"""One job, in this process."""
+"""Jobs of a batch: one in this process, and those in processes of their own, however they end."""
 
-from __future__ import annotations
-
+import importlib
 import logging
+import os
 import pickle
-from collections.abc import Callable
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,9 +19,47 @@ import pytest
 
 from photonpano import BatchRow, Location, LocationError, Url
 from photonpano.api.batching import running
+from photonpano.api.batching.processes import rows_of
 from photonpano.api.batching.running import run_job
 from photonpano.api.batching.sweeps import Job, SpecText, capture_override
 from photonpano.pipeline.run import RunResult
+
+MODULE = """\
+import itertools, os, signal, time
+from dataclasses import dataclass, field
+from pathlib import Path
+from photonpano.api.batching.sweeps import Job
+from photonpano.api.batching.sweeps import SpecText
+from photonpano.atomic import atomic_path
+from photonpano.record.batch_row import BatchRow
+
+@dataclass(frozen=True)
+class Odd(SpecText):
+    ending: str = ""
+
+    def plan(self, overrides, output, catalog=None):
+        if self.ending:
+            Path(f"{output}.pid").write_text(f"{os.getpid()} {os.getppid()}")
+            print("printed by a library", flush=True)
+            with atomic_path(Path(f"{output}.file")):
+                exec(self.ending)
+        return super().plan(overrides, output, catalog)
+
+def job(ending, folder, spec=""):
+    name = f"job-{abs(hash(ending))}"
+    row = BatchRow(name, folder / "absent.npy", {}, folder / name)
+    return Job(row, Odd(spec or "version: 1", folder, None, ending), (), 1)
+"""
+
+
+@pytest.fixture
+def odd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """A module that processes import: `odd.job(ending, folder)` is a job that runs a line of Python."""
+    (tmp_path / "odd_jobs.py").write_text(MODULE, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield importlib.import_module("odd_jobs")
+    del sys.modules["odd_jobs"]
+
 
 SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 25}}, "levels": 1, "refine": []}
 
@@ -51,7 +94,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
     return found
 
 
-def test_run_is_scored_and_not_repeated(job_of: Callable[[Location], Job], scan: Path, without_report: None) -> None:
+def test_run_is_scored_and_not_repeated(job_of: Callable[[Location], Job], scan: Path) -> None:
     job = pickle.loads(pickle.dumps(job_of(scan)))
     row = run_job(job)
     assert (row.status, row.was_finished, row.n_frames) == ("done", False, 200), row.reason
@@ -66,7 +109,7 @@ def test_run_is_scored_and_not_repeated(job_of: Callable[[Location], Job], scan:
 
 
 def test_capture_at_a_url_is_run_without_a_score(
-    job_of: Callable[[Location], Job], scan: Path, file_server: Callable[..., Any], without_report: None
+    job_of: Callable[[Location], Job], scan: Path, file_server: Callable[..., Any]
 ) -> None:
     with file_server(scan.parent) as server:
         job = job_of(Url(f"{server.address}/{scan.name}?key=secret"))
@@ -103,7 +146,7 @@ def test_capture_that_cannot_be_used_says_why(
     assert not row.directory.exists()
 
 
-def test_run_that_is_not_located_has_a_page(job_of: Callable[[Location], Job], tmp_path: Path, without_report: None) -> None:
+def test_run_that_is_not_located_has_a_page(job_of: Callable[[Location], Job], tmp_path: Path) -> None:
     noise = np.random.default_rng(0).random((200, 64, 96)) < 0.01
     np.save(tmp_path / "cube.npy", np.packbits(noise, axis=-1))
     row = run_job(job_of(tmp_path / "cube.npy"))
@@ -149,3 +192,70 @@ def test_poses_have_doubts_and_errors_of_positions(
     assert (row.verdict, row.reason) == ("doubtful", "the path is straight")
     assert (row.expected_position_error, row.true_position_error) == (0.01, 0.02)
     assert (row.expected_error_px, row.true_error_px, row.thumbnail) == (None, None, None)
+
+
+BATCH = """\
+import sys
+from pathlib import Path
+import odd_jobs
+from photonpano.api.batching.processes import rows_of
+jobs = [odd_jobs.job(ending, Path.cwd()) for ending in sys.argv[1:]]
+for changed in rows_of(jobs, 1):
+    print(changed, flush=True)
+"""
+HOLDING_INTERPRETER = "sum(itertools.repeat(0))"
+
+
+def wait_for(condition: Callable[[], bool], seconds: float) -> bool:
+    last = time.monotonic() + seconds
+    while time.monotonic() < last and not condition():
+        time.sleep(0.02)
+    return condition()
+
+
+def lives(process: int) -> bool:
+    """Return whether a process lives; one that has ended and waits for its parent does not."""
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def processes(folder: Path) -> list[int]:
+    """Return the processes of the runs that have begun, and what they were forked from."""
+    return [int(word) for file in folder.glob("*.pid") for word in file.read_text().split()]
+
+
+def test_each_way_to_end_is_a_row(odd: ModuleType, tmp_path: Path) -> None:
+    ways = {
+        "os.kill(os.getpid(), signal.SIGKILL)": r"the run was killed \(SIGKILL\), as the system does when memory runs out; .*",
+        "os.abort()": r"the run crashed \(SIGABRT\): printed by a library; a library or a plugin is to blame, .*",
+        "os._exit(3)": r"the run ended with the exit code 3: printed by a library; .*",
+        "raise KeyboardInterrupt": r"the run ended with the exit code 1: KeyboardInterrupt; .*",
+        "raise ValueError('odd')": r"ValueError: odd \(a defect of photonpano or of a plugin\)",
+        "raise MemoryError": r"there is not enough memory; lower run\.memory, or the number of jobs",
+        "": r"1:1: source\.use: required: .*",
+        "os.kill(os.getppid(), signal.SIGKILL); time.sleep(60)": r"the run ended with the exit code 255: .*",
+    }
+    changes = list(rows_of([odd.job(way, tmp_path) for way in ways], 1))
+    ended = {index: row for changed in changes for index, row in changed if row.status != "running"}
+    assert [row.status for row in ended.values()] == ["failed"] * len(ways)
+    for index, reason in enumerate(ways.values()):
+        assert re.fullmatch(reason, ended[index].reason.splitlines()[0]), ended[index].reason
+    assert [len(changed) for changed in changes] == [1, *[2] * (len(ways) - 1), 1]
+    assert wait_for(lambda: not any(map(lives, processes(tmp_path))), 5)
+
+
+def test_killed_batch_leaves_no_process(odd: ModuleType, tmp_path: Path) -> None:
+    script = [sys.executable, "-c", BATCH, HOLDING_INTERPRETER]
+    with subprocess.Popen(script, cwd=tmp_path, stdout=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": path()}) as batch:
+        assert wait_for(lambda: len(processes(tmp_path)) == 2, 60)
+        time.sleep(0.1)
+        assert all(map(lives, processes(tmp_path)))
+        batch.send_signal(signal.SIGKILL)
+    assert wait_for(lambda: not any(map(lives, processes(tmp_path))), 5)
+
+
+def path() -> str:
+    return os.pathsep.join(["", *filter(None, sys.path)])

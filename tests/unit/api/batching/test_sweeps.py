@@ -1,16 +1,121 @@
-from __future__ import annotations
+"""The captures, the settings and the summary of a batch."""
 
+import csv
+import io
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import SpecError
+from photonpano import BatchRow, InputError, OutputError, SpecError, discover
 from photonpano.api.batch import Batch, prepare_batch
+from photonpano.api.batching.captures import find_captures
+from photonpano.api.batching.summary import require_own, write_summary
 from photonpano.api.batching.sweeps import combinations, folder_name
+
+Find = Callable[..., dict[str, Path]]
+
+
+@pytest.fixture
+def find(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Find:
+    """Find captures from a folder in which there are some; a folder with a file `is-capture` in it is one."""
+    monkeypatch.chdir(tmp_path)
+    for name in (
+        "day/b.npy",
+        "day/a.npy",
+        "day/a.truth.npz",
+        "day/notes.txt",
+        "night/c.npy",
+        "bins/is-capture",
+        "bins/0.bin",
+        "run/run.json",
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "empty").mkdir()
+
+    def find(*given: str | Path, lists: tuple[str, ...] = ()) -> dict[str, Path]:
+        return find_captures(given, lists, discover(), lambda path: (path / "is-capture").exists())
+
+    return find
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        (["day/a.npy", "night/c.npy"], {"a": "day/a.npy", "c": "night/c.npy"}),
+        (["[br][iu]n*"], {"bins": "bins"}),
+        (["day/*.np?"], {"a": "day/a.npy", "b": "day/b.npy"}),
+        (["**/*.npy"], {"a": "day/a.npy", "b": "day/b.npy", "c": "night/c.npy"}),
+        (["day"], {"a": "day/a.npy", "b": "day/b.npy"}),
+        (["bins"], {"bins": "bins"}),
+        (["."], {"bins": "bins"}),
+        (["night/c.npy", "day/../night/c.npy", "night/*"], {"c": "night/c.npy"}),
+        (["absent.npy"], {"absent": "absent.npy"}),
+        (["day/b.npy", "old/b.c.npy.gz"], {"b": "day/b.npy", "b.c": "old/b.c.npy.gz"}),
+        (["s3://day/b.npy", "s3://day/b.npy", "s3://night"], {"b": "s3://day/b.npy", "night": "s3://night"}),
+        (["https://me:secret@host/c.npy.gz?key=secret"], {"c": "https://host/c.npy.gz"}),
+    ],
+    ids=lambda value: " ".join(value),
+)
+def test_captures_are_named_after_their_files(find: Find, given: list[str], named: dict[str, str]) -> None:
+    assert {name: str(path) for name, path in find(*given).items()} == named
+    assert list(find(*given)) == list(named)
+
+
+def test_folders_by_dots_hidden_files_and_names_like_patterns_are_found(find: Find) -> None:
+    Path("bins/frames").mkdir()
+    Path("day/.c.npy").touch()
+    assert list(find("bins/frames/..")) == ["bins"]
+    assert list(find("day/*.npy")) == ["a", "b"], "hidden files match no pattern"
+    Path("night/[ab].npy").touch()
+    assert list(find("night/[ab].npy")) == ["[ab]"]
+    Path("day").rename("day [1]")
+    Path("day [1]/list.txt").write_text("*.npy\n", encoding="utf-8")
+    assert list(find(lists=("day [1]/list.txt",))) == ["a", "b"]
+
+
+def test_list_counts_from_its_folder_and_one_on_standard_input_from_the_current_one(
+    find: Find, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("day/list.txt").write_text("# of Monday\n\n  a.npy  \n../night/*.npy\n", encoding="utf-8-sig")
+    assert find(lists=("day/list.txt",)) == {"a": Path("day/a.npy"), "c": Path("day/../night/c.npy")}
+    monkeypatch.setattr("sys.stdin", io.StringIO("day/a.npy\n"))
+    assert find(lists=("-",)) == {"a": Path("day/a.npy")}
+
+
+def test_all_problems_come_at_once(find: Find) -> None:
+    Path("bad.txt").write_text("day/a.npy\nday/*.h5\n", encoding="utf-8")
+    Path("none.txt").write_text("# nothing\n", encoding="utf-8")
+    Path("data.txt").write_bytes(b"\x93NUMPY\0")
+    Path("latin.txt").write_bytes("n\xe4chtlich.npy".encode("latin-1"))
+    Path("night/a.npy").touch()
+    with pytest.raises(InputError) as caught:
+        find(
+            *("*.mat", "empty", "night", "a\0b", "caf\udce9", "s3://day/*.npy"),
+            lists=("bad.txt", "none.txt", "data.txt", "latin.txt", "absent.txt"),
+        )
+    assert str(caught.value).splitlines() == [
+        "nothing matches *.mat; check the pattern",
+        "empty is no capture that the spec can read, and there is none in it; name the files",
+        "'a\\x00b' contains the character NUL, which no path can; correct the path",
+        "s3://day/*.npy is a pattern, and only files of this computer are matched; name each URL, as in a list",
+        "bad.txt:2: nothing matches day/*.h5; check the pattern",
+        "none.txt: the list names no capture; write one a line",
+        "data.txt: not a list of captures, which is text; name captures as arguments",
+        "latin.txt: the list is not UTF-8 text; save it as UTF-8, one capture a line",
+        "absent.txt: the list of captures cannot be read: No such file or directory",
+        "'caf\\udce9' is no text of UTF-8, which results cannot record; rename it",
+        "two captures are called a, and would get one run folder: night/a.npy and day/a.npy; rename one of them, "
+        "or run them in two batches",
+    ]
+    with pytest.raises(InputError, match="no capture is given: name files, folders, or patterns in quotes"):
+        find()
+
 
 SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 25}}}
 
@@ -116,3 +221,115 @@ def test_names_of_folders_are_safe_and_differ() -> None:
     assert all("/" not in name and " " not in name and len(name) < 200 for name in names)
     assert folder_name("cube", {"run.seed": 1, "levels.0.scale": 0.5}) == "cube,run.seed=1,levels.0.scale=0.5"
     assert folder_name("a b", {}) == "a b"
+
+
+PICTURE = "data:image/jpeg;base64,/9j/"
+DONE = {
+    "status": "done",
+    "verdict": "trusted",
+    "expected_error_px": 0.1,
+    "true_error_px": 0.05,
+    "psnr_db": 26.5,
+    "n_frames": 2000,
+    "seconds": 1.5,
+    "peak_memory_bytes": 2**28,
+    "thumbnail": PICTURE,
+}
+
+
+def row(name: str, folder: Path, settings: dict[str, Any] | None = None, **found: Any) -> BatchRow:
+    report = folder / name / "report.html" if found.get("status") == "done" else None
+    return BatchRow(name, Path(f"captures/{name}.npy"), settings or {}, folder / name, **{"report": report} | found)
+
+
+def summary(folder: Path, rows: list[BatchRow], keys: tuple[str, ...] = ()) -> tuple[list[dict[str, str]], str]:
+    write_summary(folder, rows, "version: 1\n", ["run.seed=1"], keys)
+    with (folder / "summary.csv").open(encoding="utf-8", newline="") as file:
+        table = list(csv.DictReader(file))
+    return table, (folder / "summary.html").read_text(encoding="utf-8")
+
+
+def test_every_status_is_a_row(tmp_path: Path) -> None:
+    rows = [
+        row("good", tmp_path, **DONE),
+        row("odd #1", tmp_path, **DONE | {"verdict": "doubtful", "reason": "frames are blurred\nwarning: hot"}),
+        row("bad", tmp_path, status="failed", reason='a "<b>" is cut short,\ncopy it again'),
+        row("dark", tmp_path, status="failed", reason="no pair", report=tmp_path / "dark.failed.html"),
+        row("now", tmp_path, status="running"),
+        row("next", tmp_path),
+        row("never", tmp_path, status="interrupted"),
+    ]
+    table, page = summary(tmp_path, rows)
+    assert [(each["name"], each["status"], each["verdict"]) for each in table] == [
+        ("good", "done", "trusted"),
+        ("odd #1", "done", "doubtful"),
+        ("bad", "failed", ""),
+        ("dark", "failed", ""),
+        ("now", "running", ""),
+        ("next", "waiting", ""),
+        ("never", "interrupted", ""),
+    ]
+    assert table[0] | {"run": "good", "true_error_px": "0.05", "peak_memory_bytes": str(2**28)} == table[0]
+    assert table[2]["reason"] == 'a "<b>" is cut short,\ncopy it again'
+    statuses = re.findall(r'class="status \w*">([^<]+)<', page)
+    assert statuses == ["1 trusted", "1 doubtful", "2 failed", "1 running", "1 waiting", "1 interrupted"]
+    assert "a &#34;&lt;b&gt;&#34; is cut short,<br/>copy it again" in page
+    assert 'href="odd%20%231/report.html"' in page
+    assert page.count('<a href="dark.failed.html">dark</a>') == 2
+    assert page.count('<th scope="row">bad</th>') == 2
+    assert page.count(PICTURE) == 2
+    assert "<script" not in page
+    links = set(re.findall(r'(?:src|href|url\()="?([^")\s]+)', page))
+    assert links == {PICTURE, "good/report.html", "odd%20%231/report.html", "dark.failed.html"}, "no other file is needed"
+    assert "<code>run.seed=1</code>" in page
+
+
+def test_poses_have_errors_of_positions(tmp_path: Path) -> None:
+    found = {"expected_error_px": None, "true_error_px": None, "psnr_db": None, "thumbnail": None}
+    rows = [row("room", tmp_path, **DONE | found | {"expected_position_error": 0.0123, "true_position_error": 0.02})]
+    table, page = summary(tmp_path, rows)
+    assert (table[0]["expected_position_error"], table[0]["expected_error_px"]) == ("0.0123", "")
+    assert "1.23 %" in page
+    assert "PSNR" not in page
+    assert "in per cent of the length of the path" in page
+
+
+@pytest.mark.parametrize(("n_captures", "thin", "legend"), [(2, 0, ["scan-0", "scan-1"]), (6, 2 * 6, ["median"])])
+def test_sweep_is_drawn_over_its_values(tmp_path: Path, n_captures: int, thin: int, legend: list[str]) -> None:
+    key = "resample.with.group_size"
+    rows = [
+        row(f"scan-{number}", tmp_path, {key: size}, **DONE | {"true_error_px": size / 100})
+        for number in range(n_captures)
+        for size in (50, 25)
+    ]
+    rows.append(replace(rows[0], status="failed", true_error_px=None, expected_error_px=None, reason="x"))
+    table, page = summary(tmp_path, rows, (key,))
+    assert [each[key] for each in table[:2]] == ["50", "25"]
+    figure = re.search(r"<svg.*?</svg>", page, re.DOTALL)[0]
+    assert figure.count("stroke: var(--muted); stroke-opacity: 0.5") == thin
+    assert [name for name in ("scan-0", "scan-1", "median") if f">{name}</text>" in figure] == legend
+    assert "true error (px)" in figure
+
+
+def test_values_that_are_no_numbers_are_named_and_a_sweep_without_results_has_no_figure(tmp_path: Path) -> None:
+    key = "locate.use"
+    rows = [row("scan", tmp_path, {key: name}, **DONE) for name in ("direct", "opencv-sift")]
+    page = summary(tmp_path, rows, (key,))[1]
+    assert ">direct</text>" in page
+    assert ">opencv-sift</text>" in page
+    assert "<svg" not in summary(tmp_path, [row("scan", tmp_path, {"run.seed": 1})], ("run.seed",))[1]
+
+
+def test_summary_of_something_else_is_not_replaced(tmp_path: Path) -> None:
+    require_own(tmp_path)
+    summary(tmp_path, [row("good", tmp_path, **DONE)])
+    require_own(tmp_path)
+    (tmp_path / "summary.csv").write_text("month,sum\n", encoding="utf-8")
+    with pytest.raises(OutputError, match=r"summary\.csv is no summary of a batch, and would be replaced"):
+        require_own(tmp_path)
+
+
+def test_name_that_is_not_unicode_is_written(tmp_path: Path) -> None:
+    table, page = summary(tmp_path, [row("caf\udce9", tmp_path, **DONE)])
+    assert table[0]["name"] == "caf\\udce9"
+    assert "caf\\udce9" in page

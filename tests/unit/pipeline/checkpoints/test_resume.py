@@ -1,7 +1,5 @@
 """Whole runs that are interrupted, and go on with the same bytes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -29,9 +27,8 @@ class Killed(BaseException):
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw no report, and write every result at once, so that a run can be killed after each."""
-    monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "")
-    monkeypatch.setattr("photonpano.pipeline.checkpoints.store.FLUSH_S", 0.0)
+    """Write every result at once, so that a run can be killed after each."""
+    monkeypatch.setattr("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -112,26 +109,21 @@ def test_resumed_run_repeats_nothing_that_was_kept(plan_of: Callable[..., Plan],
     run(killed, resume=True)
 
 
-def test_last_level_with_other_settings_starts_from_the_first(
+def test_last_level_with_other_settings_starts_from_the_first_and_a_finished_run_is_returned(
     plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run(plan_of("scan"), keep_work=True)
+    first = run(plan_of("scan"), keep_work=True)
     other = {"levels": [{}, {"resample": {"with": {"group_size": 30}}}], "render": {"scale": 0.5}}
     anew = run(plan_of("anew", **other))
-    monkeypatch.setattr("photonpano.motion.registration.starting_motion", lambda *_: pytest.fail("level 1 was found before"))
-    again = run(plan_of("scan", **other), from_level=2)
+    with monkeypatch.context() as patch:
+        patch.setattr("photonpano.motion.registration.starting_motion", lambda *_: pytest.fail("level 1 was found before"))
+        again = run(plan_of("scan", **other), from_level=2)
     assert bytes_of(again) == bytes_of(anew)
     assert path_of(again.directory).is_dir()
-
-
-def test_resume_of_finished_run_returns_its_results(plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch) -> None:
-    first = run(plan_of("scan"))
-    written = bytes_of(first)
     monkeypatch.setattr("photonpano.pipeline.state.estimate_motion", lambda *_, **__: pytest.fail("it was finished"))
-    again = run(plan_of("scan"), resume=True)
-    assert again.was_finished
-    assert not first.was_finished
-    assert again.verdict == first.verdict
-    assert bytes_of(again) == written
+    resumed = run(plan_of("scan", **other), resume=True)
+    assert (first.was_finished, again.was_finished, resumed.was_finished) == (False, False, True)
+    assert resumed.verdict == again.verdict
+    assert bytes_of(resumed) == bytes_of(anew)
     with pytest.raises(pytest.fail.Exception, match="it was finished"):
-        run(plan_of("scan", render={"scale": 0.5}), resume=True)
+        run(plan_of("anew", render={"scale": 2.0}), resume=True)

@@ -1,15 +1,14 @@
 """Runs that follow a capture: same results as without, and errors with a way on."""
 
-from __future__ import annotations
-
 import json
 import logging
+import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,35 @@ import pytest
 
 from photonpano import InputError, OutputError, RunResult, SpecError, parse_spec, run
 from photonpano.report import LiveFigures
+
+
+@pytest.fixture(scope="session")
+def moving_frames(simulated: Callable[..., Path]) -> np.ndarray:
+    """(300, 64, 12) packed frames of a camera that pans by 30 px."""
+    return np.load(simulated(n_frames=300, frame_shape=[64, 96], path={"kind": "pan", "length_px": 30}, flux=0.5))
+
+
+@pytest.fixture
+def pipe_on_stdin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Let a thread write to what a run takes for standard input, and then close it."""
+    threads: list[threading.Thread] = []
+    reading, writing = os.pipe()
+    monkeypatch.setattr("photonpano.pipeline.following.follow._standard_input", lambda: reading)
+
+    def begin(data: bytes, pieces: int = 1, seconds: float = 0.0) -> None:
+        def write() -> None:
+            size = -(-len(data) // pieces) or 1
+            for start in range(0, len(data), size):
+                os.write(writing, data[start : start + size])
+                time.sleep(seconds / pieces)
+            os.close(writing)
+
+        threads.append(threading.Thread(target=write))
+        threads[0].start()
+
+    yield begin
+    threads[0].join()
+    os.close(reading)
 
 
 def spec(source: str = "packed-raw", **keys: Any) -> dict[str, Any]:
@@ -36,7 +64,6 @@ def spec(source: str = "packed-raw", **keys: Any) -> dict[str, Any]:
 RESULTS = ("panorama.tiff", "coverage.tiff", "trajectory.npz", "panorama.png")
 PIPED = spec(path="-", height=64, width=96)
 POSES = {"pose": {"use": "colmap-averages"}, "resample": None, "levels": None, "refine": None}
-pytestmark = pytest.mark.usefixtures("without_report")
 
 
 def follow(document: dict[str, Any], output: Path, **options: Any) -> RunResult:

@@ -1,7 +1,5 @@
 """The parts of a run that follows a capture."""
 
-from __future__ import annotations
-
 import errno
 import os
 import threading

@@ -1,0 +1,387 @@
+"""Run folders: written whole or not at all, and never in place of what is not theirs."""
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import resource
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from photonpano import FrameSpan, OutputError, Panorama
+from photonpano.geometry import Canvas, translation
+from photonpano.merging.panorama import RenderedPanorama, Tile
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.pipeline.run_folder import RunFolder, run_folder
+from photonpano.record.contents import changed_files, finish_run_folder
+from photonpano.testing import KnownMotion
+
+FLUX = np.random.default_rng(0).random((60, 90), np.float32)
+FLUX[:, :5] = np.nan
+PANORAMA = Panorama(FLUX, np.where(np.isnan(FLUX), np.float32(0), np.float32(7)), translation(3, 4))
+CANVAS = Canvas(60, 90, PANORAMA.canvas)
+PICTURE = np.arange(60 * 90, dtype=np.uint8).reshape(60, 90)
+FILES = {"panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"}
+MOTION = FrameMotion(
+    KnownMotion(lambda _: np.eye(3)),
+    FrameSpan(0, 500),
+    np.random.default_rng(0).random((500, 3, 3)),
+    np.ones(500, bool),
+    np.ones(500),
+    250,
+    (48, 64),
+)
+RENDERED = RenderedPanorama(CANVAS, PANORAMA, 1, PICTURE, 1.0, 0.9, 2.0)
+RECORD: Any = {"photonpano": "0", "spec": {}, "warnings": ["a line"] * 2000}
+NOTE = {"host": socket.gethostname(), "pid": 7, "process_start": "1", "since": "2026-01-01T00:00:00+00:00"}  # of a lock
+
+
+WRITERS: Mapping[str, Callable[[RunFolder], object]] = {
+    "panorama": lambda folder: folder.write_tile(Tile(0, 0, CANVAS), PANORAMA, CANVAS),
+    "results": lambda folder: folder.write_results(RENDERED, MOTION),
+    "record": lambda folder: folder.commit(RECORD),
+}
+
+
+def write_images(folder: RunFolder) -> None:
+    WRITERS["panorama"](folder)
+    WRITERS["results"](folder)
+
+
+def write_all(folder: RunFolder) -> None:
+    """Write a run as `run` does: the results, and then the report."""
+    write_images(folder)
+    folder.commit(RECORD)
+    folder.reopen()
+    folder.write_report("<html>µ</html>" * 2000)
+    folder.commit(RECORD)
+
+
+def run_into(directory: Path, **options: Any) -> None:
+    with run_folder(directory, **options) as folder:
+        write_all(folder)
+
+
+def files_in(directory: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+def old_run(folder: Path) -> Path:
+    """Write a run folder of an earlier run, and a note of its owner."""
+    run_into(folder / "runs")
+    (folder / "runs" / "run.json").write_text(json.dumps(RECORD | {"seed": "old"}))
+    (folder / "runs" / "notes").mkdir()
+    (folder / "runs" / "notes" / "a.txt").write_text("a note")
+    return folder / "runs"
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    return old_run(tmp_path)
+
+
+@pytest.fixture(params=["exchange", "pending"])
+def system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A system that exchanges folders in one step, and one that cannot."""
+    if request.param == "pending":
+        monkeypatch.setattr("photonpano.folders._exchange", lambda *_: False)
+    return str(request.param)
+
+
+def test_run_folder_holds_the_written_files(tmp_path: Path) -> None:
+    run_into(tmp_path / "runs" / "scan")
+    directory = tmp_path / "runs" / "scan"
+    assert set(files_in(directory)) == FILES
+    np.testing.assert_array_equal(tifffile.imread(directory / "panorama.tiff"), FLUX)
+    np.testing.assert_array_equal(tifffile.imread(directory / "coverage.tiff"), PANORAMA.weight)
+    np.testing.assert_array_equal(cv2.imread(str(directory / "panorama.png"), cv2.IMREAD_UNCHANGED), PICTURE)
+    with np.load(directory / "trajectory.npz") as archive:
+        names = "homographies canvas projection horizon frame_shape reference located std_px"
+        assert set(archive.files) == set(names.split())
+        assert tuple(archive["frame_shape"]) == (48, 64)
+    record = json.loads((directory / "run.json").read_text())
+    assert record["warnings"] == ["a line"] * 2000
+    assert set(record["files"]) == FILES - {"run.json"}
+    assert record["files"]["panorama.png"] == {
+        "bytes": (directory / "panorama.png").stat().st_size,
+        "sha256": hashlib.sha256((directory / "panorama.png").read_bytes()).hexdigest(),
+    }
+    assert changed_files(directory) == []
+    assert (directory / "report.html").read_text(encoding="utf-8").startswith("<html>µ</html>")
+    assert list((tmp_path / "runs").iterdir()) == [directory]
+
+
+def test_run_folder_changes_in_one_step_and_keeps_other_files(old: Path, system: str) -> None:
+    before = files_in(old)
+    with run_folder(old, overwrite=True) as folder:
+        write_images(folder)
+        assert files_in(old) == before
+        folder.commit(RECORD)
+        after = files_in(old)
+        assert set(after) == (FILES - {"report.html"}) | {"notes/a.txt"}
+        assert after["notes/a.txt"] == b"a note"
+        assert "seed" not in json.loads(after["run.json"])
+    assert files_in(old) == after
+    assert list(old.parent.iterdir()) == [old]
+
+
+def test_run_folder_that_is_the_current_one_or_behind_a_link_stays_the_same(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = old.parent / "latest"
+    link.symlink_to(old)
+    run_into(link, overwrite=True)
+    assert link.is_symlink()
+    assert "seed" not in json.loads((old / "run.json").read_text())
+    (old / "run.json").write_text(json.dumps(RECORD | {"seed": "old"}))
+    monkeypatch.chdir(old)
+    run_into(Path(), overwrite=True)
+    assert "seed" not in json.loads((old / "run.json").read_text())
+    assert changed_files(Path()) == []
+    assert set(files_in(Path.cwd())) == {*FILES, "notes/a.txt"}
+
+
+def test_run_folder_keeps_files_of_other_programs_that_come_meanwhile(tmp_path: Path, system: str) -> None:
+    directory = tmp_path / "runs" / "scan"
+    with run_folder(directory) as folder:
+        directory.mkdir()
+        (directory / "notes.txt").write_text("a note")
+        write_all(folder)
+    assert set(files_in(directory)) == {*FILES, "notes.txt"}
+
+
+def refusal(directory: Path, **options: Any) -> str:
+    """Return why a folder is refused, before anything is written."""
+    with pytest.raises(OutputError) as caught, run_folder(directory, **options):
+        raise AssertionError("the block must not run")
+    return str(caught.value)
+
+
+def test_run_folder_refuses_a_file_in_the_way(tmp_path: Path) -> None:
+    """As root, permissions stop nobody; a file does."""
+    way = tmp_path / "runs"
+    way.write_text("a file")
+    for directory, reason in ((way, "File exists"), (way / "scan", "Not a directory")):
+        assert refusal(directory) == (
+            f"{directory}: the run folder cannot be written to ({reason}); choose another one with --output"
+        )
+    assert way.read_text() == "a file"
+
+
+def test_run_folder_refuses_files_that_no_run_wrote(old: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    for name in ("report.html", "run.json", "a.png", "b.png", "c.png"):
+        (mine / name).write_text("mine")
+    for directory, names in ((old, "notes"), (mine, "a.png, b.png, c.png and 2 more")):
+        before = files_in(directory)
+        assert refusal(directory) == (
+            f"{directory} holds files that no run has written: {names}; choose another folder with --output, "
+            "or write the results among them with --overwrite"
+        )
+        assert files_in(directory) == before
+
+
+def test_run_folder_refuses_what_must_not_be_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home" / "me"))
+    (tmp_path / "home" / "me").mkdir(parents=True)
+    capture = tmp_path / "captures" / "night" / "cube.npy"
+    for directory in (Path("/"), tmp_path / "home", tmp_path / "home" / "me", tmp_path / "captures", capture):
+        reason = "is the folder of a user or of the system"
+        if directory in (tmp_path / "captures", capture):
+            reason = f"cannot be the run folder, since {capture} lies in it"
+        found = refusal(directory, overwrite=True, inputs=[capture])
+        assert found == f"{directory} {reason}; choose another one with --output"
+
+
+def test_second_run_into_a_folder_is_refused_with_the_first(tmp_path: Path) -> None:
+    directory = tmp_path / "scan"
+    with run_folder(directory):
+        holder = json.loads((tmp_path / ".scan.lock").read_text())
+        refused = refusal(directory)
+    assert (holder["pid"], holder["host"]) == (os.getpid(), socket.gethostname())
+    assert refused == (
+        f"the run folder {directory} is in use: process {os.getpid()} on {socket.gethostname()} has been writing it since "
+        f"{holder['since']}; wait for it, or choose another folder with --output"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_refusal_waits_for_the_note_of_a_lock_that_was_just_taken(tmp_path: Path) -> None:
+    lock = tmp_path / ".scan.lock"
+    writes = threading.Timer(0.1, lock.write_text, [json.dumps(NOTE)])
+    with lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        writes.start()
+        with pytest.raises(OutputError, match=f"process 7 on {socket.gethostname()} has been writing it since 2026-01-01"):
+            run_into(tmp_path / "scan")
+        writes.join()
+
+
+def test_run_folder_refuses_a_run_of_another_capture(tmp_path: Path) -> None:
+    captures = [tmp_path / "a.npy", tmp_path / "b.npy"]
+    for path in captures:
+        path.touch()
+    with run_folder(tmp_path / "scan", inputs=captures[:1]) as folder:
+        folder.commit(RECORD | {"capture": {"files": [{"path": str(captures[0])}]}})
+    assert refusal(tmp_path / "scan", inputs=captures[1:]) == (
+        f"{tmp_path}/scan holds a run of another capture, {captures[0]}; choose another folder with --output, or replace that "
+        "run with --overwrite"
+    )
+    captures[0].rename(tmp_path / "moved.npy")  # as when all of a project moves
+    run_into(tmp_path / "scan", inputs=captures[1:])
+
+
+def write_and_fail(directory: Path, error: BaseException) -> None:
+    with run_folder(directory, overwrite=True) as folder:
+        write_images(folder)
+        raise error
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_run_folder_keeps_old_files_and_makes_no_new_folders_when_the_block_raises(
+    old: Path, error: type[BaseException]
+) -> None:
+    before = files_in(old.parent)
+    for directory in (old, old.parent / "today" / "scan"):
+        with pytest.raises(error):
+            write_and_fail(directory, error())
+    assert files_in(old.parent) == before
+    assert list(old.parent.iterdir()) == [old]
+
+
+@contextmanager
+def files_of_at_most(n_bytes: int) -> Iterator[None]:
+    """Let the system cut short what is written, as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("result", WRITERS)
+def test_run_folder_keeps_old_files_when_the_disk_is_full(old: Path, result: str) -> None:
+    before = files_in(old.parent)
+    with pytest.raises(OutputError) as caught, run_folder(old, overwrite=True) as folder, files_of_at_most(4096):
+        WRITERS[result](folder)
+    assert str(caught.value) == (
+        f"{old}: the results could not be written (File too large); what was there before is unchanged. "
+        "Make room, or choose another folder with --output"
+    )
+    assert files_in(old.parent) == before
+
+
+@pytest.mark.parametrize("number", range(18))
+def test_run_folder_is_old_or_new_when_any_step_fails_once(
+    old: Path, system: str, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, steps = files_in(old), []
+
+    def failing(name: str) -> Callable[..., Any]:
+        step = getattr(os, name)
+
+        def maybe(*args: Any, **options: Any) -> Any:
+            steps.append(name)
+            if len(steps) - 1 == number:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            return step(*args, **options)
+
+        return maybe
+
+    with suppress(OutputError), run_folder(old, overwrite=True) as folder:
+        write_images(folder)
+        with monkeypatch.context() as patch:
+            for name in ("rename", "replace", "fsync", "link"):
+                patch.setattr(os, name, failing(name))
+            folder.commit(RECORD)
+    finish_run_folder(old)
+    after = files_in(old)
+    if after != before:
+        assert changed_files(old) == []
+        assert "seed" not in json.loads(after["run.json"])
+        assert set(after) == (FILES - {"report.html"}) | {"notes/a.txt"}
+    run_into(old, overwrite=True)
+    assert list(old.parent.iterdir()) == [old]
+    assert set(files_in(old)) == {*FILES, "notes/a.txt"}
+
+
+_STOPS = """
+import os, signal, sys
+from pathlib import Path
+from photonpano import folders
+from photonpano.pipeline.run_folder import run_folder
+
+def stop(*args):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def write(directory, where):
+    with run_folder(directory, overwrite=True) as folder:
+        (folder.staging / "panorama.tiff").write_bytes(b"new")
+        if where == "before":
+            stop()
+        if where == "exchanged":
+            folders._remove_old = stop
+        else:
+            folders._exchange = lambda one, other: False
+            folders._put_in_place = stop
+        folder.commit({"photonpano": "0", "spec": {}})
+
+for directory in sys.argv[1:]:
+    process = os.fork()
+    if process == 0:
+        write(Path(directory), Path(directory).parent.name)
+    assert os.waitpid(process, 0)[1] == signal.SIGKILL
+"""
+
+
+def test_run_folder_recovers_from_a_killed_run(tmp_path: Path) -> None:
+    """A run is killed before it changes the folder, after the folders were exchanged, or while files are moved one by one."""
+    places = [tmp_path / where for where in ("before", "exchanged", "pending")]
+    for place in places:
+        place.mkdir()
+    olds = [old_run(place) for place in places]
+    before = files_in(olds[0])
+    subprocess.run([sys.executable, "-c", _STOPS, *olds], check=True)
+    assert [len(list(place.iterdir())) > 1 for place in places[:2]] == [True, True]
+    for old in olds:
+        finish_run_folder(old)
+        if old.parent.name == "before":
+            assert files_in(old) == before
+        else:
+            assert changed_files(old) == []
+            assert set(files_in(old)) == {"panorama.tiff", "run.json", "notes/a.txt"}
+        run_into(old, overwrite=True)
+        assert list(old.parent.iterdir()) == [old]
+        assert set(files_in(old)) == {*FILES, "notes/a.txt"}
+
+
+def test_lock_of_a_dead_process_is_taken_over_and_without_locks_of_the_system_the_note_decides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock, note = tmp_path / ".scan.lock", NOTE | {"pid": 2**22 + 1}
+    lock.write_text(json.dumps(note))
+    run_into(tmp_path / "scan")
+    assert list(tmp_path.iterdir()) == [tmp_path / "scan"]
+    monkeypatch.setattr("fcntl.flock", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))))
+    lock.write_text(json.dumps(note))
+    run_into(tmp_path / "scan")
+    assert not lock.exists()
+    lock.write_text(json.dumps(note | {"host": "elsewhere"}))
+    with pytest.raises(OutputError) as caught:
+        run_into(tmp_path / "scan")
+    assert str(caught.value) == (
+        f"the run folder {tmp_path}/scan is in use: process {note['pid']} on elsewhere has been writing it since "
+        f"{note['since']}; wait for it, or choose another folder with --output; if that process is gone, remove {lock}"
+    )
