@@ -13,7 +13,7 @@ from pathlib import Path
 from photonpano import batch
 from photonpano.captures.writing import truth_path
 
-SCRIPT = Path(__file__).parents[1] / "benchmarks" / "kills.py"
+SCRIPT = Path(__file__).parents[1] / "benchmarks" / "crashes.py"
 SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 40}}, "levels": 1, "refine": []}
 INTERRUPTED = """\
 import sys, time
@@ -93,8 +93,8 @@ def test_interrupted_batch_keeps_what_is_finished(tiny_capture: Path, tmp_path: 
 
 
 def test_killed_runs_end_with_the_same_bytes() -> None:
-    """A few of the trials of tests/benchmarks/kills.py: runs in processes that are killed (SIGKILL), and resumed."""
-    command = [sys.executable, str(SCRIPT), "--moments", "1", "--writing", "1", "--seed", "1"]
+    """A few of the trials of tests/benchmarks/crashes.py: runs in processes that are killed (SIGKILL), and resumed."""
+    command = [sys.executable, str(SCRIPT), "resumes", "--number", "1", "--writing", "1", "--seed", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "1 of 1 runs ended with the same bytes and left nothing behind" in done.stdout

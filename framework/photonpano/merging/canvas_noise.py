@@ -33,6 +33,7 @@ class CanvasNoise:
     response: Response
     slope: Factor = 1.0  # one number, or a map of the canvas, coarser by `reduction`: (h, w), or (h, w, 3) in colour
     offset: Factor = 0.0  # as `slope`
+    share: Factor = 1.0  # weight of a frame, on average, as `slope`: what the weight of the canvas is divided by to get frames
     reduction: float = 1.0  # pixels of the canvas per pixel of the maps, along each side
     averaging: Averaging | None = None  # how far interpolation lowers the noise; None without motion
 
@@ -45,8 +46,8 @@ class CanvasNoise:
             return replace(cls._corrected(capture, trajectory, span, canvas), averaging=averaging)
         # The grey source equalises the colours, which are rendered without it.
         colours = [cls._corrected(each, trajectory, span, canvas) for each in list(capture.colours().values())[:_RGB]]
-        slope, offset = (_stacked([getattr(each, name) for each in colours]) for name in ("slope", "offset"))
-        return cls(capture.response, slope, offset, max(each.reduction for each in colours), averaging)
+        factors = (_stacked([getattr(each, name) for each in colours]) for name in ("slope", "offset", "share"))
+        return cls(capture.response, *factors, max(each.reduction for each in colours), averaging)
 
     @classmethod
     def _corrected(cls, capture: Capture, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
@@ -56,28 +57,25 @@ class CanvasNoise:
         none = np.zeros(capture.info.frame_shape, np.uint32)
         offset = np.asarray(capture.corrected(none, 1), np.float32)
         slope = np.asarray(capture.corrected(none + 1, 1) - offset, np.float32)
-        valid = capture.valid
-        if capture.weight is not None:
-            # A count of weight w adds w to the weight and w^2 times its variance: in frames of weight 1, w times its variance.
-            slope, offset = slope * capture.weight, offset * capture.weight
-        means = float(slope[valid].mean()), float(offset[valid].mean())
-        if max(np.ptp(slope[valid]), np.ptp(offset[valid])) < _EVEN:
+        factors, valid = (slope, offset, capture.weights()), capture.valid
+        means = [float(each[valid].mean()) for each in factors]
+        if max(np.ptp(each[valid]) for each in factors) < _EVEN:
             return cls(capture.response, *means)
         reduction = max(1.0, max(canvas.shape) / _LARGEST_PX)
         height, width = (int(np.ceil(side / reduction)) for side in canvas.shape)
         instants = np.unique(np.linspace(span.start, span.stop - 1, min(len(span), _INSTANTS)).round())
         coarse = replace(canvas, height=height, width=width, transform=rescaling(1 / reduction) @ canvas.transform)
-        sums, share = laid(coarse, capture.camera, trajectory.at(instants), (slope, offset), valid)
-        on_slope, on_offset = (
+        sums, share = laid(coarse, capture.camera, trajectory.at(instants), factors, valid)
+        on_canvas = (
             np.asarray(np.where(share > 0, total / np.maximum(share, np.float32(1e-6)), mean), np.float32)
             for total, mean in zip(sums, means, strict=True)
         )
-        return cls(capture.response, on_slope, on_offset, reduction)
+        return cls(capture.response, *on_canvas, reduction)
 
     def std(self, flux: FluxImage, weight: FluxImage, top: int = 0, left: int = 0) -> FluxImage:
         """Return the standard deviation of the flux, (h, w) or (h, w, 3), of a part of the canvas from `top`, `left` on."""
-        slope, offset = (self._part(each, flux, top, left) for each in (self.slope, self.offset))
-        std = flux_std(flux, weight, self.response, slope, offset)
+        slope, offset, share = (self._part(each, flux, top, left) for each in (self.slope, self.offset, self.share))
+        std = flux_std(flux, np.asarray(weight / share, np.float32), self.response, slope, offset)
         if self.averaging is None:
             return std
         factor = self.averaging.std_factor((flux.shape[0], flux.shape[1]), top, left)
@@ -88,8 +86,9 @@ class CanvasNoise:
         return saturated(flux, weight, self.response)
 
     def measurable(self, frames: float) -> FluxRange | None:
-        """Return the range of flux that a number of frames measures, with corrections as they are on average."""
-        return measurable_range(frames, self.response, float(np.mean(self.slope)), float(np.mean(self.offset)))
+        """Return the range of flux that a weight in frames measures, with corrections as they are on average."""
+        means = float(np.mean(self.slope)), float(np.mean(self.offset))
+        return measurable_range(frames / float(np.mean(self.share)), self.response, *means)
 
     def _part(self, factor: Factor, flux: FluxImage, top: int, left: int) -> Factor:
         if not isinstance(factor, np.ndarray):

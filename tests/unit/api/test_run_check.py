@@ -18,7 +18,7 @@ from photonpano.evaluation import RunTrajectory
 from photonpano.evaluation.comparison import motion_difference, on_canvas
 from photonpano.geometry import Canvas, translation
 from photonpano.pipeline.run import RunResult
-from photonpano.reading.gzipped import unpacked
+from photonpano.reading.npy import unpacked
 from photonpano.residuals.verdict import REPEATS
 
 

@@ -199,3 +199,10 @@ def test_level_horizon_of_tilted_reference_frame() -> None:
 def test_camera_that_hardly_turns_stays_level() -> None:
     horizon = level_horizon(turned(np.arange(0.0, 2, 0.1)))
     assert np.allclose(horizon, np.eye(3), atol=1e-6)
+
+
+def test_arc_that_reaches_over_the_end_of_the_circle_covers_its_beginning() -> None:
+    """A frame that looks up covers a wide arc, which ends beyond that of the frame beside it."""
+    wide = turned(np.zeros(1), 60)
+    covered = covered_by(np.concatenate([wide, turned(np.array([40.0]))]), CAMERA, SHAPE)
+    assert np.allclose(covered.a, covered_by(wide, CAMERA, SHAPE).a)

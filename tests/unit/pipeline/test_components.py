@@ -26,9 +26,9 @@ from photonpano.capture import seen_through
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, canvas_around, covered_by, rotation_matrices
 from photonpano.lighting import in_light
 from photonpano.photometry import BinaryResponse
-from photonpano.pipeline.components import build_levels, build_renderer, build_source, foreseen_groups, scale_of
+from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
 from photonpano.pipeline.forecast import TRIAL_GROUPS, forecast
-from photonpano.pipeline.renderers import AttributedRenderer
+from photonpano.pipeline.rendering import AttributedRenderer, build_renderer
 from photonpano.protocols import Renderer
 from photonpano.registry import Catalog, Origin
 from photonpano.registry.catalog import make_entry

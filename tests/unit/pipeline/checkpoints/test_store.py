@@ -18,9 +18,8 @@ from photonpano import FrameSpan, Group, Located, NotLocated, Panorama
 from photonpano.motion.diagnosis import Contrast
 from photonpano.motion.registration import Registered
 from photonpano.motion.tracking import Place
-from photonpano.pipeline.checkpoints.kept import Kept, finished
 from photonpano.pipeline.checkpoints.records import digest, packed, unpacked
-from photonpano.pipeline.checkpoints.store import Store
+from photonpano.pipeline.checkpoints.store import Kept, Store, finished
 from photonpano.values import Decision, Edge
 
 RNG = np.random.default_rng(0)
