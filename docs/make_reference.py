@@ -19,12 +19,13 @@ import typer
 from pydantic import BaseModel
 
 import photonpano
-from photonpano import discover, hookspecs
-from photonpano.cli.app import app, commands
-from photonpano.cli.verbosity import PARAMETERS
+from photonpano import discover
+from photonpano.api.cli.app import app, commands
+from photonpano.api.cli.verbosity import PARAMETERS
 from photonpano.corrections import CORRECTIONS
-from photonpano.registry import KINDS
-from photonpano.registry.description import config_rows
+from photonpano.plugins import hookspecs
+from photonpano.plugins.registry import KINDS
+from photonpano.plugins.registry.description import config_rows
 from photonpano.specs.resolution import SETTINGS
 from photonpano.specs.settings import LevelSettings
 

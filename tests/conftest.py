@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from photonpano import FrameSpan, Group, VirtualExposure, interrupts
+from photonpano import FrameSpan, Group, VirtualExposure
+from photonpano.execution import interrupts
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run import RunResult
@@ -123,7 +124,7 @@ def seen_from(street: np.ndarray, photograph: Callable) -> Callable[..., Virtual
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """Write a small capture and its truth: 300 frames of 128x160 px of a street, on a pan of 60 px with tremor."""
-    from photonpano.captures.writing import write_packed
+    from photonpano.capture.writing import write_packed
     from photonpano.pipeline.components import build_source
     from photonpano.specs import parse_spec
 

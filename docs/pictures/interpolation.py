@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photonpano import StageContext, StreamInfo, discover
 from photonpano import geometry as g
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.photometry import BinaryResponse
 
 INTERPOLATORS = {

@@ -15,7 +15,7 @@ from paper.figures.light import fine_images, fine_pictures
 from paper.figures.others import draw_found, true_centres
 
 from photonpano import FrameSpan, evaluate_poses, load_panorama, open_source, parse_spec
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.photometry import BinaryResponse, Tone, picture_of
 from photonpano_simulator.config import NightScene
 from photonpano_simulator.scenes import scene_flux

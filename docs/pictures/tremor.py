@@ -10,7 +10,7 @@ import picture_parts as draw
 from harness import Compared, Study, groups, packed, rendered, simulator
 
 from photonpano import video
-from photonpano.context import Context
+from photonpano.execution.context import Context
 from photonpano.geometry import Canvas
 from photonpano.report.residual_figures import spectrum_over_noise
 from photonpano.residuals.measure import measure

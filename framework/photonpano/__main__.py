@@ -1,5 +1,5 @@
 """`python -m photonpano`: the command line, where its script is not on the path."""
 
-from photonpano.cli import main
+from photonpano.api.cli import main
 
 main()

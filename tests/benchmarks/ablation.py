@@ -18,7 +18,7 @@ import numpy as np
 from harness import IMAGES, Study, command, packed, passing, scores_of, seen, simulator, table, write_tables
 
 from photonpano import PhotonpanoError
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.evaluation import exposure_bound_px, load_truth
 from photonpano.photometry import BinaryResponse
 

@@ -48,7 +48,7 @@ from harness import (
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, open_source, parse_spec
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.corrections.colour_filter import with_colours
 from photonpano.evaluation import covered, image_score, true_panorama, white_flux
 from photonpano.geometry import Canvas, FrameTrajectory, canvas_of, inverse, normalised

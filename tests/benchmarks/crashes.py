@@ -37,7 +37,7 @@ import numpy as np
 from harness import command, in_child, passing, simulator
 
 from photonpano import load_spec, parse_spec, run, simulate
-from photonpano.cli import main as program
+from photonpano.api.cli import main as program
 from photonpano.record import contents
 
 SPEC = """version: 1

@@ -17,7 +17,7 @@ from scipy.io import savemat
 
 from photonpano import FrameSpan, InputError, SourceContext, discover, evaluate, load_spec, run, simulate
 from photonpano.pipeline.components import build_source, open_source
-from photonpano.registry import Catalog
+from photonpano.plugins.registry import Catalog
 from photonpano.specs import parse_spec
 
 MOST_READ = 2**26  # pixels of a damaged capture that are summed at most

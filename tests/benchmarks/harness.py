@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from photonpano import FrameSpan, Panorama, Plan, Source, evaluate, load_panorama, open_source, parse_spec, run
-from photonpano.captures.writing import truth_path, write_packed
-from photonpano.context import Context
+from photonpano.capture.writing import truth_path, write_packed
 from photonpano.evaluation import (
     Evaluation,
     RunTrajectory,
@@ -37,6 +36,7 @@ from photonpano.evaluation import (
     true_panorama,
     white_flux,
 )
+from photonpano.execution.context import Context
 from photonpano.geometry import Canvas, FrameTrajectory, apply, normalised
 from photonpano.merging.panorama import plan_canvas, render
 from photonpano.reading import Closing

@@ -19,16 +19,16 @@ import numpy as np
 from harness import Compared, Study, chosen, command, packed, passing, record_of, rendered, scores_of, simulator, table
 
 from photonpano import LocationError, parse_spec
-from photonpano.captures.obstacles import timeline_of
-from photonpano.captures.writing import truth_path
-from photonpano.context import Context
+from photonpano.capture.writing import truth_path
 from photonpano.corrections import divided_by
+from photonpano.corrections.lighting import LIGHT_DECISION, find_light, in_light, in_light_of
 from photonpano.evaluation.images import covered, image_score, true_panorama, white_flux
-from photonpano.lighting import LIGHT_DECISION, find_light, in_light, in_light_of
+from photonpano.execution.context import Context
 from photonpano.motion.loop import estimate_motion
 from photonpano.photometry import linear_to_srgb
 from photonpano.pipeline.components import build_levels, open_source
 from photonpano.pipeline.estimate import estimate
+from photonpano.pipeline.obstacles import timeline_of
 from photonpano.pipeline.passes import vignette_of
 from photonpano.values import Decision, FloatArray, Light
 

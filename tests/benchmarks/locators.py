@@ -33,9 +33,9 @@ from photonpano import (
     open_source,
     parse_spec,
 )
+from photonpano.contracts.protocols import KnowsTruth
 from photonpano.geometry import FrameTrajectory, apply, corner_displacements, corners, inverse, normalised
-from photonpano.protocols import KnowsTruth
-from photonpano.registry import Catalog
+from photonpano.plugins.registry import Catalog
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.mergers.photon_mle import PhotonMleMerger
 

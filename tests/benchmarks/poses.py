@@ -21,7 +21,7 @@ import numpy as np
 from harness import Study, chosen, command, in_child, packed, simulator, table, write_tables
 
 from photonpano import CameraGuess, PhotonpanoError, evaluate_poses, parse_spec, simulate
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.evaluation import PoseScore, pose_errors
 from photonpano.evaluation.poses import load_true_poses
 from photonpano_colmap.configs import ColmapAveragesConfig

@@ -32,8 +32,8 @@ from scheduling import Costs, Kind, Measured, prediction
 from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulated
 
 from photonpano import ExecutorContext, FrameSpan, Source, discover, parse_spec, run
-from photonpano.context import Quiet
 from photonpano.execution import CaptureElsewhere, LocalExecutor
+from photonpano.execution.context import Quiet
 from photonpano.execution.remote import packed as packed_for_worker
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging import chunks_of

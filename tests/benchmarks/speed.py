@@ -36,10 +36,10 @@ from harness import (
 )
 
 from photonpano import FrameSpan, SourceContext
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
+from photonpano.contracts.protocols import Source
 from photonpano.evaluation import load_truth
 from photonpano.geometry import FrameTrajectory, inverse
-from photonpano.protocols import Source
 from photonpano_core.configs import MidpointConfig, PhotonMleConfig
 from photonpano_core.mergers.photon_mle import PhotonMleMerger
 from photonpano_core.resamplers import MidpointResampler

@@ -39,9 +39,9 @@ from harness import (
 from numpy.typing import NDArray
 
 from photonpano import open_source, parse_spec
-from photonpano.captures.writing import truth_path
-from photonpano.context import Context
+from photonpano.capture.writing import truth_path
 from photonpano.evaluation import covered, load_truth
+from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging.panorama import plan_canvas, render
 from photonpano.pipeline.rendering import build_renderer

@@ -34,7 +34,7 @@ from harness import table as table_of
 from trust_captures import CUT_ROWS, FULL, ROWS, SMALL, TINY, Row, Size, bases
 
 from photonpano import PhotonpanoError, SpecError
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.evaluation import Truth, corner_errors, load_truth
 from photonpano.geometry import inverse
 

@@ -23,11 +23,12 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 import photonpano
-from photonpano import discover, hookspecs, parse_spec
-from photonpano.captures.writing import truth_path
-from photonpano.cli import progress as cli_progress
-from photonpano.cli.app import app, commands
+from photonpano import discover, parse_spec
+from photonpano.api.cli import progress as cli_progress
+from photonpano.api.cli.app import app, commands
+from photonpano.capture.writing import truth_path
 from photonpano.corrections import CORRECTIONS
+from photonpano.plugins import hookspecs
 from photonpano.residuals import verdict
 
 ROOT = Path(__file__).parents[2]

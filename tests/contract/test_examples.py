@@ -17,8 +17,8 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from photonpano import capture_plan, convert, open_source, parse_spec
-from photonpano.captures.writing import truth_path
-from photonpano.cli.app import app
+from photonpano.api.cli.app import app
+from photonpano.capture.writing import truth_path
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "pipelines"
 SMALL = {"source.with.n_frames": 240, "source.with.frame_shape": "[128, 160]", "source.with.path.length_px": 40}

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, PluginError, hookspecs, registry, run
-from photonpano.registry import discover
-from photonpano.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
+from photonpano import FrameSpan, Group, PluginError, run
+from photonpano.plugins import hookspecs, registry
+from photonpano.plugins.registry import discover
+from photonpano.plugins.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
 from photonpano.specs import parse_spec
 from photonpano.testing import ExporterConformance, RefinerConformance, RendererConformance, ResamplerConformance
 from photonpano.testing.conformance import Conformance

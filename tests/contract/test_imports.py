@@ -25,13 +25,13 @@ HOOKS = sorted(f"{path.parent.name}.hooks" for path in (ROOT / "plugins").glob("
 # One after the other in one process: what any of them imports is there at the end.
 DISCOVERY = f"""
 import {", ".join(HOOKS)}
-import photonpano.geometry, photonpano.photometry, photonpano.cli
-from photonpano.registry import discover; discover()
+import photonpano.geometry, photonpano.photometry, photonpano.api.cli
+from photonpano.plugins.registry import discover; discover()
 from photonpano import capture_plan, load_spec, parse_spec
 """
 ALL_COMMANDS = f"""
 import sys
-from photonpano.cli import main
+from photonpano.api.cli import main
 for arguments in {COMMANDS!r}:
     sys.argv[1:] = arguments.split()
     try:
@@ -95,7 +95,7 @@ def test_help_is_quick() -> None:
 
     def seconds() -> float:
         before = spent()
-        command = [sys.executable, "-c", "from photonpano.cli import main; main()", "--help"]
+        command = [sys.executable, "-c", "from photonpano.api.cli import main; main()", "--help"]
         subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
         return spent() - before
 

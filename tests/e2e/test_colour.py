@@ -12,7 +12,7 @@ import pytest
 import tifffile
 
 from photonpano import InputError, SpecError, evaluate, parse_spec, preview, run
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.pipeline.run import RunResult
 
 

@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 import photonpano
 from photonpano import FrameSpan, SpecError, evaluate, run
-from photonpano.captures.writing import truth_path, write_packed
-from photonpano.cli.app import app
-from photonpano.context import Context
+from photonpano.api.cli.app import app
+from photonpano.capture.writing import truth_path, write_packed
 from photonpano.evaluation import Evaluation
+from photonpano.execution.context import Context
 from photonpano.merging.canvas_plan import plan_canvas
 from photonpano.merging.panorama import render
 from photonpano.pipeline.components import build_source

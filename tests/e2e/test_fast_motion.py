@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.evaluation import corner_errors
 from photonpano.specs import parse_spec
 

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from photonpano import evaluate, open_source, run
-from photonpano.cli.app import app
+from photonpano.api.cli.app import app
 from photonpano.evaluation import Evaluation
 from photonpano.specs import parse_spec
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from photonpano.cli.app import app
+from photonpano.api.cli.app import app
 
 pytestmark = pytest.mark.usefixtures("without_report")
 

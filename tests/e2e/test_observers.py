@@ -16,7 +16,7 @@ from click.testing import Result
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from photonpano.cli.app import app
+from photonpano.api.cli.app import app
 
 pytestmark = pytest.mark.usefixtures("without_report")
 

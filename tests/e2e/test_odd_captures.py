@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 import typer
 
-from photonpano.cli.errors import reported
+from photonpano.api.cli.errors import reported
 from photonpano.geometry import translation
 from photonpano.pipeline.run import run
-from photonpano.registry import Catalog, discover
+from photonpano.plugins.registry import Catalog, discover
 from photonpano.specs import parse_spec
 from photonpano.testing import KnownMotion, Scene
 from photonpano.testing.captures import recorded

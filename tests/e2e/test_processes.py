@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from photonpano import batch
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "crashes.py"
 SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 40}}, "levels": 1, "refine": []}
@@ -22,14 +22,14 @@ sys.path[:] = {path}
 import photonpano.api.batch
 import hanging
 photonpano.api.batch.SpecText = hanging.Hanging
-from photonpano.cli import main
+from photonpano.api.cli import main
 main()
 """
 HANGING = """\
 import time
 from pathlib import Path
 from photonpano.api.batching.sweeps import SpecText
-from photonpano.folders import staging_of
+from photonpano.files.folders import staging_of
 
 class Hanging(SpecText):
     def plan(self, overrides, output, catalog=None):

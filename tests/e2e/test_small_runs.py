@@ -13,7 +13,7 @@ import pytest
 import tifffile
 
 import photonpano
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.evaluation import Evaluation, corner_errors
 from photonpano.geometry import rescaling
 from photonpano.photometry import tone_mapped

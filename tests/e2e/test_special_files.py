@@ -14,8 +14,8 @@ import pytest
 from typer.testing import CliRunner
 
 from photonpano import InputError, SourceContext, SpecError, discover, evaluate, load_spec, parse_spec
-from photonpano.cli.app import app
-from photonpano.paths import given_path, refusal
+from photonpano.api.cli.app import app
+from photonpano.files.paths import given_path, refusal
 from photonpano.pipeline.run import RunResult
 from photonpano.reading import read_arrays, read_start
 

@@ -16,7 +16,7 @@ from subprocess import CompletedProcess
 import pytest
 from typer.testing import CliRunner
 
-from photonpano.cli.app import app
+from photonpano.api.cli.app import app
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "third_party_plugin"
@@ -24,7 +24,7 @@ EXAMPLE = ROOT / "examples" / "third_party_plugin"
 COMMANDS = """
 import sys
 import photonpano_example
-from photonpano.cli import main
+from photonpano.api.cli import main
 print(photonpano_example.__file__)
 for arguments in {commands!r}:
     sys.argv[1:] = arguments

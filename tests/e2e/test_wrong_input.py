@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from photonpano.cli.app import app
+from photonpano.api.cli.app import app
 
 SPEC = """\
 version: 1

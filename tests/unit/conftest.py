@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, Located, NotLocated, Source, Trajectory, VirtualExposure
+from photonpano.execution.threads import one_thread_inside
 from photonpano.geometry import inverse, normalised, rescaled, translation
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import KnownMotion
-from photonpano.threads import one_thread_inside
 
 FRAMES = 10  # of a group
 STEADY = KnownMotion(lambda frame: translation(0.3 * frame, 0))

@@ -24,9 +24,9 @@ from photonpano import (
     load_panorama,
     load_trajectory,
 )
-from photonpano.captures.writing import truth_path
-from photonpano.context import usual
+from photonpano.capture.writing import truth_path
 from photonpano.evaluation.poses import pose_errors
+from photonpano.execution.context import usual
 from photonpano.notebooks import NotebookBars, facts, in_notebook, picture
 
 

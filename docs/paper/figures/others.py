@@ -29,11 +29,11 @@ from paper.figures.study import (
 )
 
 from photonpano import FrameSpan, Panorama, PhotonpanoError, evaluate_poses, load_panorama, open_source, parse_spec
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.evaluation import align_positions
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging.panorama import plan_canvas
-from photonpano.poses import centres
+from photonpano.record.poses import centres
 
 APERTURES = {"f/8": 1 / 8, "f/5.6": 1 / 4, "f/4": 1 / 2, "f/2.8": 1.0}  # and their light, relative to the spec
 SHOWN = ("f/5.6", "f/2.8")  # the paper's apertures

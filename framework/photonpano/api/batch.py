@@ -26,16 +26,16 @@ from photonpano.api.batching.sweeps import (
     read_changes,
 )
 from photonpano.api.command import SPEC, DoubtfulError, WrongArgumentError, command
-from photonpano.context import Progress, usual
 from photonpano.errors import InputError, OutputError, PhotonpanoError, Problem, SpecError
-from photonpano.locks import locked
+from photonpano.execution.context import Progress, usual
+from photonpano.execution.threads import thread_count
+from photonpano.files.locks import locked
+from photonpano.files.paths import Location
 from photonpano.notebooks import facts, from_here, table
-from photonpano.paths import Location
+from photonpano.plugins.registry import discover
 from photonpano.record.batch_row import BatchRow
-from photonpano.registry import discover
 from photonpano.specs.loading import read_spec
 from photonpano.text import columns, counted
-from photonpano.threads import thread_count
 
 _NO_FILE = "this source reads no file or folder, as the captures of a batch are; name another, such as auto"
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from photonpano.api.command import command, require_trust, verdict_line, warn
 from photonpano.api.opened_run import opened_run
-from photonpano.context import Context, Progress, usual
+from photonpano.execution.context import Context, Progress, usual
+from photonpano.execution.threads import one_thread_inside, thread_count
+from photonpano.plugins.registry import Catalog
 from photonpano.record.schema import RunRecord
-from photonpano.registry import Catalog
 from photonpano.residuals.refinement import MotionFit
 from photonpano.residuals.verdict import NO_TURN, REPEATS, Reason, Verdict, contradictions, judge
-from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import Decision
 
 

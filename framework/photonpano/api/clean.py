@@ -11,10 +11,10 @@ from pathlib import Path
 import typer
 
 from photonpano.api.command import command
-from photonpano.atomic import remove
 from photonpano.errors import InputError
-from photonpano.folders import PENDING
-from photonpano.locks import claim, is_lock
+from photonpano.files.atomic import remove
+from photonpano.files.folders import PENDING
+from photonpano.files.locks import claim, is_lock
 from photonpano.record.contents import finish_run_folder
 from photonpano.text import counted
 

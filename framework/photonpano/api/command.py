@@ -1,7 +1,7 @@
 """Declare commands of the program: a function, the lines that it prints, and how its parameters are given.
 
 A module of `api` that uses `command` is a command of its name; the first line of the module is its line in `photonpano --help`.
-The signature and the docstring of the function give the rest: see `photonpano.cli.signatures`.
+The signature and the docstring of the function give the rest: see `photonpano.api.cli.signatures`.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def component_names(*kinds: str) -> Callable[[str], list[str]]:
     """Return a function that completes the name of a component of these kinds; of any kind if none is given."""
 
     def complete(incomplete: str) -> list[str]:
-        from photonpano.registry import discover
+        from photonpano.plugins.registry import discover
 
         rows = discover().rows
         return sorted({each.name for each in rows if each.name.startswith(incomplete) and (not kinds or each.kind in kinds)})

@@ -12,12 +12,12 @@ import typer
 from numpy.typing import NDArray
 
 from photonpano.api.command import command
-from photonpano.atomic import atomic_path
-from photonpano.captures.writing import truth_path
+from photonpano.capture.writing import truth_path
 from photonpano.errors import InputError, OutputError
 from photonpano.evaluation import evaluate, load_run_trajectory
 from photonpano.evaluation.comparison import motion_difference, on_canvas, reduced
 from photonpano.evaluation.inputs import RunTrajectory
+from photonpano.files.atomic import atomic_path
 from photonpano.record.contents import require_one_run
 from photonpano.record.run_json import read_record
 from photonpano.record.schema import PanoramaRecord, RunRecord

@@ -14,19 +14,19 @@ import typer
 from rich.filesize import decimal
 
 from photonpano.api.command import command, warn
-from photonpano.atomic import part_path
-from photonpano.captures.writing import write_folder, write_packed
-from photonpano.context import Progress, usual
-from photonpano.contributions import SourceContribution
+from photonpano.capture.writing import write_folder, write_packed
+from photonpano.contracts.protocols import Source
 from photonpano.errors import OutputError
+from photonpano.execution.context import Progress, usual
+from photonpano.execution.threads import thread_count
+from photonpano.files.atomic import part_path
 from photonpano.notebooks import facts
 from photonpano.pipeline.components import build_source
-from photonpano.protocols import Source
-from photonpano.registry import Catalog, discover
-from photonpano.registry.description import flow
+from photonpano.plugins.contributions import SourceContribution
+from photonpano.plugins.registry import Catalog, discover
+from photonpano.plugins.registry.description import flow
 from photonpano.specs import Plan
 from photonpano.text import columns, counted
-from photonpano.threads import thread_count
 from photonpano.values import StreamInfo
 
 

@@ -11,13 +11,13 @@ import numpy as np
 import typer
 
 from photonpano.api.command import command, warn
-from photonpano.atomic import atomic_path
-from photonpano.context import Progress, usual
 from photonpano.corrections import hot_in_the_dark, measure_dark, write_dark
 from photonpano.corrections.hot_pixels import THRESHOLD
 from photonpano.errors import InputError, OutputError
+from photonpano.execution.context import Progress, usual
+from photonpano.files.atomic import atomic_path
 from photonpano.pipeline.components import build_source
-from photonpano.registry.description import flow
+from photonpano.plugins.registry.description import flow
 from photonpano.specs import Plan
 from photonpano.specs.corrections import written_corrections
 from photonpano.text import columns

@@ -11,17 +11,17 @@ import typer
 
 from photonpano.api.command import command, json_lines, warn
 from photonpano.api.opened_run import opened_run
-from photonpano.context import Context, Progress, usual
+from photonpano.contracts.protocols import Trajectory
 from photonpano.evaluation import Evaluation, ImageScore, PoseScore, RotationScore, evaluate_poses, has_poses
 from photonpano.evaluation import evaluate as evaluate_folder
+from photonpano.execution.context import Context, Progress, usual
+from photonpano.execution.threads import thread_count
 from photonpano.geometry import Canvas
 from photonpano.merging.colour import composed
 from photonpano.merging.panorama import render
 from photonpano.pipeline.rendering import build_renderer
-from photonpano.protocols import Trajectory
-from photonpano.registry import Catalog
+from photonpano.plugins.registry import Catalog
 from photonpano.text import columns
-from photonpano.threads import thread_count
 from photonpano.values import Panorama
 
 _FEW = 0.1  # if fewer positions lie within 3 expected errors, the truth is probably of another capture

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from photonpano.api.command import command
+from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, PhotonpanoError
 from photonpano.motion.pairs import pairs_of
 from photonpano.pipeline.components import foreseen_groups, open_source, scale_of
-from photonpano.protocols import Source
-from photonpano.registry import KINDS, Catalog, discover
-from photonpano.registry.description import flow
+from photonpano.plugins.registry import KINDS, Catalog, discover
+from photonpano.plugins.registry.description import flow
 from photonpano.specs import Plan
 from photonpano.specs.written import joined
 from photonpano.text import byte_size, counted, duration

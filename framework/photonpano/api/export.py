@@ -9,11 +9,11 @@ import numpy as np
 import typer
 
 from photonpano.api.command import command
-from photonpano.atomic import atomic_folder
 from photonpano.errors import InputError
 from photonpano.evaluation import RunPoses, RunTrajectory, has_poses, load_run_poses, load_run_trajectory
-from photonpano.poses import POSE_FORMATS, PoseFormat, Poses, centres
+from photonpano.files.atomic import atomic_folder
 from photonpano.record.contents import require_one_run
+from photonpano.record.poses import POSE_FORMATS, PoseFormat, Poses, centres
 from photonpano.record.run_json import read_record
 
 

@@ -8,19 +8,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 from photonpano.api.command import command, json_lines, warn
-from photonpano.captures.obstacles import order_warning
-from photonpano.captures.summary import require_photons, saturated_share, summarise
+from photonpano.contracts.protocols import Source
 from photonpano.corrections import HotPixels, without_still_pixels
 from photonpano.errors import InputError
+from photonpano.execution.threads import one_thread_inside, thread_count
+from photonpano.files.paths import Url
 from photonpano.notebooks import facts
-from photonpano.paths import Url
 from photonpano.pipeline.components import build_source, foreseen_decisions
-from photonpano.protocols import Source
-from photonpano.registry import Catalog
-from photonpano.registry.description import flow
+from photonpano.pipeline.obstacles import order_warning
+from photonpano.pipeline.summary import require_photons, saturated_share, summarise
+from photonpano.plugins.registry import Catalog
+from photonpano.plugins.registry.description import flow
 from photonpano.specs import Plan, parse_spec
 from photonpano.text import columns, duration
-from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import CaptureSummary, StreamInfo
 
 HOT_SHARE = 0.001  # fraction of hot pixels above which a mask is recommended

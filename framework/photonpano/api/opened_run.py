@@ -10,21 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from photonpano.capture import seen_through
+from photonpano.contracts.protocols import Source
 from photonpano.corrections import Vignette, divided_by, read_vignette
+from photonpano.corrections.lighting import in_light_of
 from photonpano.errors import InputError, SpecError
 from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.evaluation import load_panorama as read_panorama
 from photonpano.geometry import FrameTrajectory
-from photonpano.lighting import in_light_of
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import through_lens
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.state import model_of
-from photonpano.protocols import Source
+from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import require_one_run, require_same_frames
 from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
-from photonpano.registry import Catalog
 from photonpano.specs import Plan, parse_spec
 from photonpano.values import FrameSpan, Panorama, StreamInfo
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import typer
 
 from photonpano.api.command import command
-from photonpano.captures.picture_files import counted, require_writable, write_pictures
-from photonpano.captures.preview import Style, pictures, preview_spans, white_flux
-from photonpano.context import Progress, usual
+from photonpano.execution.context import Progress, usual
+from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.pipeline.components import build_source
+from photonpano.record.picture_files import counted, require_writable, write_pictures
+from photonpano.report.preview import Style, pictures, preview_spans, white_flux
 from photonpano.specs import Plan
-from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import StreamInfo
 
 

@@ -12,18 +12,18 @@ import typer
 
 from photonpano.api.command import command
 from photonpano.api.opened_run import OpenedRun, opened_run
-from photonpano.captures.fingerprint import capture_files, fingerprint
-from photonpano.context import Context, Progress, usual
 from photonpano.errors import InputError
+from photonpano.execution.context import Context, Progress, usual
+from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_folder import run_folder as writing_run_folder
+from photonpano.plugins.registry import Catalog
 from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
+from photonpano.record.fingerprint import capture_files, fingerprint
 from photonpano.record.run_json import decision_records, panorama_record
 from photonpano.record.schema import RunRecord
-from photonpano.registry import Catalog
 from photonpano.report.notebook import run_html
-from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import Decision
 
 # Sections of a spec that may differ from those of the run. That of the source tells where the capture is now.

@@ -19,7 +19,7 @@ from photonpano.api.command import (
     verdict_line,
     warn,
 )
-from photonpano.context import Progress
+from photonpano.execution.context import Progress
 from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
 from photonpano.pipeline.estimate import START
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run

@@ -8,8 +8,8 @@ from pathlib import Path
 import typer
 
 from photonpano.api.command import command
-from photonpano.atomic import atomic_path
-from photonpano.registry import discover
+from photonpano.files.atomic import atomic_path
+from photonpano.plugins.registry import discover
 from photonpano.specs import json_schema
 
 

@@ -9,14 +9,14 @@ import typer
 
 from photonpano.api.command import command
 from photonpano.api.convert import WrittenCapture, lines_of_capture, write_capture, writer_of
-from photonpano.atomic import atomic_folder
-from photonpano.captures.picture_files import counted, write_pngs
-from photonpano.captures.preview import require_sharp_views, sharp_pictures
-from photonpano.context import Progress, usual
+from photonpano.execution.context import Progress, usual
+from photonpano.execution.threads import one_thread_inside, thread_count
+from photonpano.files.atomic import atomic_folder
 from photonpano.pipeline.components import build_source
-from photonpano.registry import discover
+from photonpano.plugins.registry import discover
+from photonpano.record.picture_files import counted, write_pngs
+from photonpano.report.preview import require_sharp_views, sharp_pictures
 from photonpano.specs import Plan
-from photonpano.threads import one_thread_inside, thread_count
 
 
 @command(

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photonpano.api.command import command
-from photonpano.captures.fingerprint import CaptureRecord, changes, fingerprint
 from photonpano.errors import InputError, SpecError
 from photonpano.pipeline.components import open_source
+from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import changed_files, finish_run_folder, recorded_contents
+from photonpano.record.fingerprint import CaptureRecord, changes, fingerprint
 from photonpano.record.run_json import read_record
-from photonpano.registry import Catalog
 from photonpano.specs import parse_spec
 from photonpano.text import byte_size, counted
 

@@ -14,9 +14,9 @@ import typer
 from photonpano.api.command import command
 from photonpano.api.opened_run import OpenedRun, opened_run
 from photonpano.api.render import require_harmless, require_same_plane
-from photonpano.captures.picture_files import counted, require_writable, write_pictures
-from photonpano.context import Progress, usual
 from photonpano.errors import InputError
+from photonpano.execution.context import Progress, usual
+from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
@@ -24,9 +24,9 @@ from photonpano.merging.light import bytes_of_light
 from photonpano.motion.frame_motion import view_of
 from photonpano.pipeline.film import Film, merged
 from photonpano.pipeline.rendering import naming_key_of_canvas
-from photonpano.registry import Catalog
+from photonpano.plugins.registry import Catalog
+from photonpano.record.picture_files import counted, require_writable, write_pictures
 from photonpano.text import byte_size
-from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
 View = Literal["panorama", "smooth"]

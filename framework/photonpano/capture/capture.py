@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from photonpano.capture.pixels import Gather
 from photonpano.capture.plugin_source import PluginSource
-from photonpano.protocols import Closing
+from photonpano.contracts.protocols import Closing
 from photonpano.values import BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, StreamInfo
 
 if TYPE_CHECKING:
     from photonpano.capture.plugin_source import PluginSource
+    from photonpano.contracts.protocols import Source
     from photonpano.geometry import Camera
-    from photonpano.protocols import Source
     from photonpano.values import FloatArray, FrameSpan, Light, Response
 
 _PER_FRAME = ("homographies", "rotations", "camera_from_world", "light", "taken")  # arrays of a truth, one entry a frame

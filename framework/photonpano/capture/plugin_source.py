@@ -12,10 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.contracts.rules import BrokenContract, attributing
-from photonpano.contracts.sources import IMAGE, INFO, RANGE, READ, RESPONSE, TRUTH, VALID, Asked
-from photonpano.errors import PluginError
-from photonpano.protocols import (
+from photonpano.contracts.protocols import (
     ColouredSource,
     KnowsSharpViews,
     KnowsTruth,
@@ -26,6 +23,9 @@ from photonpano.protocols import (
     Source,
     WeightedSource,
 )
+from photonpano.contracts.rules import BrokenContract, attributing
+from photonpano.contracts.sources import IMAGE, INFO, RANGE, READ, RESPONSE, TRUTH, VALID, Asked
+from photonpano.errors import PluginError
 from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Light, Response, StreamInfo
 
 if TYPE_CHECKING:

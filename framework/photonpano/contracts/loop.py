@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from photonpano.contracts.information import is_inverse_covariance
+from photonpano.contracts.protocols import Trajectory
 from photonpano.contracts.rules import (
     STRICT_IMAGES,
     Contract,
@@ -26,7 +27,6 @@ from photonpano.contracts.rules import (
     text,
 )
 from photonpano.geometry import corner_displacements, corners, transform_points
-from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray, Group, Homography, Located, NotLocated, Response, VirtualExposure
 
 # A pair that moves the corners by less is nearly the identity; an image that moves by this much between exposures moves.

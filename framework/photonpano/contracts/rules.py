@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 import numpy as np
 
 from photonpano.errors import PhotonpanoError, PluginError, described
-from photonpano.interrupts import is_interrupt
+from photonpano.execution.interrupts import is_interrupt
 
 T = TypeVar("T")
 # What is required, as a sentence for users, and a check of a value against facts, such as the number of frames of the capture.

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from photonpano.capture import MISSING, Capture, Gather, Index, LinearCorrection, capture_of, numbered
+from photonpano.contracts.protocols import Source
 from photonpano.corrections.colour_filter import ColourFilter, with_colours
 from photonpano.corrections.pixels import Correction, Decide, Pixels
 from photonpano.errors import InputError
-from photonpano.protocols import Source
 from photonpano.values import BoolArray, Decision, FluxImage
 
 _TOUCHING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))

@@ -10,10 +10,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from photonpano.capture import Capture, Colours, LinearCorrection, capture_of
-from photonpano.contributions import SpecPath
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
 from photonpano.photometry.similarity import sums_of_blocks
+from photonpano.plugins.contributions import SpecPath
 from photonpano.reading import COLOURS, bayer_array, read_filter_array
 from photonpano.text import listed
 from photonpano.values import Bayer, Decision
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano.capture import Capture
+    from photonpano.contracts.protocols import Source
     from photonpano.corrections.pixels import Decide, Pixels
-    from photonpano.protocols import Source
     from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Response
 
 Colour = Literal["red", "green", "blue", "clear"]

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from photonpano.capture import capture_of
-from photonpano.contributions import SpecPath
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
+from photonpano.plugins.contributions import SpecPath
 from photonpano.reading import read_arrays
 
 if TYPE_CHECKING:
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from photonpano.capture import Capture
+    from photonpano.contracts.protocols import Source
     from photonpano.corrections.pixels import Decide, Pixels
-    from photonpano.protocols import Source
     from photonpano.values import FluxImage
 
 DARK_FILE = "a file from `photonpano dark`, or a .npy file of rates, of the size of the frames at this place of the list"

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from photonpano.contracts.protocols import Source, Trajectory
     from photonpano.corrections.pixels import Decide, Pixels
-    from photonpano.protocols import Source, Trajectory
     from photonpano.values import FloatArray, FluxImage
 
 VIGNETTE_DECISION, FLAT_FIELD_DECISION = "vignette_gain", "flat_field"  # names of the decisions in a record

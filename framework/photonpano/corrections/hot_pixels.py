@@ -8,10 +8,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from pydantic import Field
 
-from photonpano.contributions import SpecPath
 from photonpano.corrections.dark import DARK_FILE, read_dark
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
+from photonpano.plugins.contributions import SpecPath
 from photonpano.reading import look_first, read_array, read_picture
 from photonpano.robust import robust_std
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture import MISSING, Capture, Index, numbered
-from photonpano.contributions import Config
 from photonpano.errors import InputError
+from photonpano.plugins.contributions import Config
 from photonpano.values import BoolArray, FluxImage
 
 Decide: TypeAlias = Callable[[str, float, str], None]  # records a decision: what was chosen, its value, and the reason

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from photonpano.contracts.protocols import Source
     from photonpano.corrections.pixels import Decide, Pixels
-    from photonpano.protocols import Source
     from photonpano.values import BoolArray, FluxImage
 
 _SPANS, _SPAN_FRAMES = 32, 128  # 32 spans of at most 128 frames are summed all over the capture

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from photonpano.errors import InputError
 from photonpano.geometry import Camera, nearest_rotations, rotation_vectors
 from photonpano.notebooks import facts
-from photonpano.poses import centres
 from photonpano.reading import read_arrays
 from photonpano.record.contents import require_one_run
+from photonpano.record.poses import centres
 from photonpano.values import BoolArray, FloatArray
 
 POSES = "poses.npz"

@@ -8,13 +8,13 @@ from typing import Protocol
 
 import numpy as np
 
+from photonpano.contracts.protocols import Trajectory
 from photonpano.errors import InputError
 from photonpano.evaluation.images import ImageScore, covered, image_score, known, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
 from photonpano.evaluation.trajectory import RotationScore, TrajectoryScore, corner_errors, rotation_errors, turned_alignment
 from photonpano.geometry import Canvas, FrameTrajectory, inverse, scaled_ahead
 from photonpano.notebooks import facts
-from photonpano.protocols import Trajectory
 from photonpano.record.contents import require_one_run
 from photonpano.values import Panorama
 

@@ -12,7 +12,7 @@ from threading import Event
 from typing import Any, Protocol, TypeVar, cast
 
 from photonpano.errors import PluginError
-from photonpano.interrupts import interrupted
+from photonpano.execution.interrupts import interrupted
 
 _CAPTURE = "capture"
 _POLL_S = 0.2  # from one check for an interrupt to the next, in threads that wait

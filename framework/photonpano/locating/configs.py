@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
-from photonpano.contributions import Config
+from photonpano.plugins.contributions import Config
 
 # A standard deviation in px, or `auto`: according to the noise of an exposure.
 BlurPx: TypeAlias = Annotated[float, Field(ge=0, le=16)] | Literal["auto"]

@@ -10,13 +10,13 @@ from itertools import pairwise
 import numpy as np
 
 from photonpano.capture import Capture, capture_of
+from photonpano.contracts.protocols import Source
+from photonpano.execution.threads import InOrder
 from photonpano.geometry import Canvas
 from photonpano.merging.chunks import Chunk
 from photonpano.merging.footprints import Footprint, footprints_of
 from photonpano.merging.light import LightTerms, LitFrames
 from photonpano.merging.warping import Grid, Texture, add_warped, average_squares
-from photonpano.protocols import Source
-from photonpano.threads import InOrder
 from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
 
 _RUN = 64  # chunks that are summed on a part of the grid of their own. It does not depend on the threads, for sums are rounded

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
+from photonpano.contracts.protocols import Trajectory
 from photonpano.geometry import Camera, Canvas
 from photonpano.merging.footprints import Lens, footprints_of
 from photonpano.merging.warping import Grid, image_row
-from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
 _INSTANTS = 512  # largest number of instants at which the places of frames on the canvas are looked at

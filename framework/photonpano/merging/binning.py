@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from photonpano.capture import capture_of
+from photonpano.contracts.protocols import Source
 from photonpano.merging.accumulate import weights_of
-from photonpano.protocols import Source
 from photonpano.values import FluxImage, FrameSpan
 
 # Pixels are binned until the shorter side has about 64 of them, which lowers the noise and keeps shifts measurable.

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from photonpano.capture import Capture, capture_of
+from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.geometry import Camera, Canvas, rescaling
 from photonpano.merging.averaging import Averaging
 from photonpano.merging.footprints import footprints_of
 from photonpano.merging.warping import Grid, Texture, add_warped, average_squares
 from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
-from photonpano.protocols import Source, Trajectory
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Response
 
 _INSTANTS = 64  # largest number of instants at which the corrections of the sensor are warped onto the canvas

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from photonpano.contracts.protocols import Trajectory
 from photonpano.errors import CanvasTooLargeError, ExtentError, LocationError, ProjectionError
 from photonpano.geometry import (
     Camera,
@@ -21,7 +22,6 @@ from photonpano.geometry import (
     outline_of,
     transform_points,
 )
-from photonpano.protocols import Trajectory
 from photonpano.values import FloatArray, FrameSpan
 
 BYTES_PER_PIXEL = 40  # peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests

@@ -11,8 +11,8 @@ from threading import Lock
 
 import numpy as np
 
+from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.geometry import BLOCK_FRAMES, steps_px
-from photonpano.protocols import Source, Trajectory
 from photonpano.values import Counts, FrameSpan, Homography
 
 

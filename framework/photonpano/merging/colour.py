@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture import capture_of
+from photonpano.contracts.protocols import Source
 from photonpano.photometry import frame_variance
-from photonpano.protocols import Source
 from photonpano.values import BoolArray, FloatArray, FluxImage, Panorama, Response
 
 # The colours of a panorama, in the order of its third axis; the images of a filter array may have a fourth one, clear.

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture import capture_of
+from photonpano.contracts.protocols import Source
 from photonpano.geometry import Canvas, inverse
-from photonpano.protocols import Source
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Response
 
 _ROUNDS = 8  # steps that solve for the flux of bright pixels in frames of different gains. Each at least halves the error

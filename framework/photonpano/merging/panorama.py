@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.context import Context
+from photonpano.contracts.protocols import Renderer, Source, Trajectory
 from photonpano.errors import ExtentError
+from photonpano.execution.context import Context
+from photonpano.execution.threads import InOrder
 from photonpano.geometry import Canvas, Extent, rescaling
 from photonpano.merging.accumulate import accumulate
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
@@ -21,8 +23,6 @@ from photonpano.merging.chunks import chunks_of
 from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
 from photonpano.merging.light import bytes_of_light
 from photonpano.photometry import Tone, WhiteBalance, balanced, debiased, picture_of
-from photonpano.protocols import Renderer, Source, Trajectory
-from photonpano.threads import InOrder
 from photonpano.values import FluxImage, FrameSpan, Panorama
 
 if TYPE_CHECKING:

@@ -10,14 +10,14 @@ from typing import Any, TypeAlias
 
 from photonpano.contracts.information import why_undetermined
 from photonpano.contracts.loop import require_no_standstill, require_valid
+from photonpano.contracts.protocols import KeepsHypotheses
+from photonpano.execution.threads import Guard, Stopwatch
 from photonpano.geometry import why_implausible
 from photonpano.motion.closures import exposure_similarity
 from photonpano.motion.diagnosis import Contrast, contrast_of
 from photonpano.motion.level import FrameHomography, NamedLocator, VirtualExposures
 from photonpano.motion.pairs import shared_share
 from photonpano.motion.tracking import Place, StartingMotion, Track
-from photonpano.protocols import KeepsHypotheses
-from photonpano.threads import Guard, Stopwatch
 from photonpano.values import Decision, Edge, Homography, Located, NotLocated, VirtualExposure
 
 # Least weight of a pair. Shared photons carry no new information: their noise agrees with the motion known so far.

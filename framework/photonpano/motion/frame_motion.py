@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion
 from photonpano.geometry import (
     BLOCK_FRAMES,
     Camera,
@@ -20,7 +21,6 @@ from photonpano.geometry import (
 )
 from photonpano.merging.canvas_plan import View
 from photonpano.motion.loop import LevelResult
-from photonpano.protocols import Source, Trajectory, camera_of, camera_of_motion
 from photonpano.values import BoolArray, FloatArray, FrameSpan, Homography, StreamInfo
 
 _REACH = 3.0  # instants up to this many standard deviations away count

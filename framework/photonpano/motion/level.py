@@ -10,11 +10,11 @@ from typing import Any, NewType
 import numpy as np
 
 from photonpano.contracts.loop import EXPOSURE, Asked
+from photonpano.contracts.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler, Source, Trajectory
 from photonpano.contracts.rules import attributing
+from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import Camera, rescaled
 from photonpano.motion.timeline import Timeline
-from photonpano.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler, Source, Trajectory
-from photonpano.threads import Stopwatch
 from photonpano.values import Decision, DecisionValue, FloatArray, Group, Located, VirtualExposure
 
 # In pixels of frames, as in the motion graph and in trajectories.

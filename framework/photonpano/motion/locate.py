@@ -8,9 +8,11 @@ from functools import partial
 
 import numpy as np
 
-from photonpano.context import Context
 from photonpano.contracts.loop import why_still
+from photonpano.contracts.protocols import camera_of
 from photonpano.errors import PluginError
+from photonpano.execution.context import Context
+from photonpano.execution.threads import thread_pool
 from photonpano.geometry import corner_displacements, inverse
 from photonpano.motion.closures import closure_candidates
 from photonpano.motion.diagnosis import require_tied, solving
@@ -20,9 +22,7 @@ from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
 from photonpano.motion.tracking import starting_motion
-from photonpano.protocols import camera_of
 from photonpano.text import listed
-from photonpano.threads import thread_pool
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated
 
 # A fallback contradicts the first locator beyond this fraction of the shorter side of a frame.

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 
 from photonpano.capture import seen_through
-from photonpano.context import Context
 from photonpano.contracts.loop import KNOTS, AttributedTrajectory, knot_errors, require_groups
+from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
+from photonpano.execution.context import Context
+from photonpano.execution.threads import Stopwatch
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
 from photonpano.motion.level import Level, VirtualExposures, merge
@@ -17,8 +19,6 @@ from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
 from photonpano.motion.timeline import Timeline
 from photonpano.motion.uncertainty import Uncertainty
-from photonpano.protocols import Source, Trajectory, camera_of_motion
-from photonpano.threads import Stopwatch
 from photonpano.values import FloatArray, Group
 
 

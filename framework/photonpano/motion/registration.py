@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 from threading import Lock
 from typing import TypeVar
 
-from photonpano.context import Context, Log
+from photonpano.contracts.protocols import KeepsHypotheses
+from photonpano.execution.context import Context, Log
+from photonpano.execution.threads import batched, in_order, lagging
 from photonpano.geometry import inverse
 from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.diagnosis import Contrast
@@ -16,8 +18,6 @@ from photonpano.motion.exposure_tasks import Descriptions, ExposureTasks, Notes,
 from photonpano.motion.level import FrameHomography, VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of
 from photonpano.motion.tracking import Place, StartingMotion, starting_motion
-from photonpano.protocols import KeepsHypotheses
-from photonpano.threads import batched, in_order, lagging
 from photonpano.values import Decision, Edge, FloatArray, Located, NotLocated
 
 ResultT = TypeVar("ResultT")

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from photonpano.contracts.protocols import InterpolatesTurns, Interpolator, Trajectory
 from photonpano.geometry import Camera, inverse, nearest_rotations, rotation_matrices, rotation_vectors, scaled_ahead
 from photonpano.motion.rotation_graph import Rotations
-from photonpano.protocols import InterpolatesTurns, Interpolator, Trajectory
 from photonpano.values import FloatArray
 
 # Angle between the knots of the coarse path. Up to this angle, rotation vectors add up well enough for splines.

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photonpano.contracts.protocols import Trajectory
 from photonpano.geometry import corners, inverse, transform_points
-from photonpano.protocols import Trajectory
 from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, Group
 
 # Names of decisions in a record.

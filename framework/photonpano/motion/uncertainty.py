@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from photonpano.contracts.protocols import Trajectory, camera_of_motion
 from photonpano.geometry import Camera, align_planes, align_rotations, corner_displacements, inverse
 from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.rotations import RotationTrajectory
 from photonpano.motion.timeline import Timeline
-from photonpano.protocols import Trajectory, camera_of_motion
 from photonpano.values import FloatArray
 
 _COMPARED = 1000  # number of frames at which two levels are compared

@@ -12,24 +12,24 @@ from typing import Any
 
 from photonpano.capture import Capture, capture_of, part_of
 from photonpano.contracts.loop import require_groups
+from photonpano.contracts.protocols import PoseEstimator, Resampler, Source, light_of
 from photonpano.contracts.rules import attributing, shown
-from photonpano.contributions import (
+from photonpano.corrections import corrected_source, without_still_pixels
+from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
+from photonpano.execution.interrupts import is_interrupt
+from photonpano.execution.threads import in_order, thread_count
+from photonpano.motion.level import Level, NamedLocator, Recorder
+from photonpano.plugins.contributions import (
     ExecutorContext,
     PartOfCapture,
     SourceContext,
     StageContext,
     install_command,
 )
-from photonpano.corrections import corrected_source, without_still_pixels
-from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
-from photonpano.interrupts import is_interrupt
-from photonpano.motion.level import Level, NamedLocator, Recorder
-from photonpano.protocols import PoseEstimator, Resampler, Source, light_of
-from photonpano.registry import KINDS
+from photonpano.plugins.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
-from photonpano.threads import in_order, thread_count
 from photonpano.values import CaptureSummary, Decision, FrameSpan, Group, StreamInfo
 
 HALVED_LEVELS = 2  # with `scale: auto`, the first two levels are located at half size
@@ -113,7 +113,7 @@ def _part(plan: Plan, capture: Capture) -> Capture:
 
 def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:
     """Build the components of all levels; those with the same config are shared. `decisions` receives their choices."""
-    from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
+    from photonpano.pipeline.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     light = light_of(source)
     period = 1 / light.frequency if light is not None and light.frequency else None
@@ -149,7 +149,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
 
 def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) -> PoseEstimator:
     """Build the pose estimator of a plan that has one; `decisions` receives its choices."""
-    from photonpano.captures.summary import summarise  # imports OpenCV, which is not needed to check a spec
+    from photonpano.pipeline.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     assert plan.pose is not None
     capture = _Once(lambda: summarise(source, thread_count(plan.run.threads)))

@@ -7,14 +7,14 @@ from functools import partial
 
 import numpy as np
 
-from photonpano.captures.obstacles import timeline_of
-from photonpano.context import Context
+from photonpano.contracts.protocols import Source
+from photonpano.execution.context import Context
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.obstacles import timeline_of
 from photonpano.pipeline.state import State, model_of
-from photonpano.protocols import Source
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision
 

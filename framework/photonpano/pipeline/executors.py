@@ -13,15 +13,15 @@ from typing import Any
 from uuid import uuid4
 
 from photonpano.capture import PluginSource, capture_of
-from photonpano.contributions import ExecutorContext
+from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, PhotonpanoError
 from photonpano.execution import CaptureElsewhere, Executor, LocalExecutor, differences
+from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.pipeline.components import build_source, built
-from photonpano.protocols import Source
+from photonpano.plugins.contributions import ExecutorContext
 from photonpano.record.environment import library_versions, plugin_records
 from photonpano.specs.loading import parse_spec
 from photonpano.specs.plan import Plan
-from photonpano.threads import one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
 

@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 
 from photonpano.capture import capture_of
-from photonpano.captures.picture_files import Picture
+from photonpano.contracts.protocols import Source, camera_of
+from photonpano.execution.threads import in_order
 from photonpano.geometry import Camera, Canvas, outline_of
 from photonpano.merging.colour import composed, in_colours
 from photonpano.merging.panorama import MergeRenderer
 from photonpano.motion.frame_motion import FrameMotion, smooth_view
 from photonpano.photometry import WhiteBalance, balanced, grey_world, linear_to_srgb
-from photonpano.protocols import Source, camera_of
-from photonpano.threads import in_order
+from photonpano.record.picture_files import Picture
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
 
 # The white balance "grey-world" is averaged over this many pictures of the video, so that it does not flicker.

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from photonpano.capture import part_of
-from photonpano.context import Context
+from photonpano.contracts.protocols import Source, camera_of_motion
+from photonpano.execution.context import Context
+from photonpano.execution.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.canvas_plan import View, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
@@ -18,10 +20,8 @@ from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.rendering import build_renderer
 from photonpano.pipeline.state import State, model_of
-from photonpano.protocols import Source, camera_of_motion
 from photonpano.record.environment import peak_memory_bytes
 from photonpano.specs.plan import Plan
-from photonpano.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.values import FrameSpan
 
 TRIAL_GROUPS = 12  # length of the trial in the middle of the capture, in groups of the first level

@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from photonpano.context import Context
+from photonpano.execution.context import Context
+from photonpano.execution.threads import in_order
 from photonpano.motion.loop import LevelResult
 from photonpano.photometry import tone_mapped
-from photonpano.threads import in_order
 
 FOLDER = "exposures"
 

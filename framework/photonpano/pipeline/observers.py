@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from photonpano.errors import described, public_name
+from photonpano.execution.interrupts import is_interrupt
 from photonpano.geometry import Canvas
-from photonpano.interrupts import is_interrupt
 from photonpano.motion.loop import LevelResult
-from photonpano.registry import Observer
+from photonpano.plugins.registry import Observer
 from photonpano.values import PoseEstimate
 
 logger = logging.getLogger(__name__)

@@ -9,13 +9,20 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from photonpano.contributions import MergerContribution
+from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
+from photonpano.corrections.lighting import (
+    corrected_light,
+    decision_of,
+    find_light,
+    in_light,
+    measure_light,
+    measure_pixel_gain,
+)
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.lighting import corrected_light, decision_of, find_light, in_light, measure_light, measure_pixel_gain
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.state import State
-from photonpano.protocols import Source, Trajectory, camera_of_motion, light_of
+from photonpano.plugins.contributions import MergerContribution
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import MotionFit
 from photonpano.specs.plan import Plan

@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from photonpano.captures.obstacles import naming_obstacles
 from photonpano.contracts.results import POSES
 from photonpano.contracts.rules import attributing
 from photonpano.errors import OutputError
@@ -16,8 +15,9 @@ from photonpano.geometry import Camera
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.estimate import require_centre
+from photonpano.pipeline.obstacles import naming_obstacles
 from photonpano.pipeline.run_steps import BegunRun
-from photonpano.poses import Poses, centres, colmap, in_standard_world, nerfstudio, ply, tum
+from photonpano.record.poses import Poses, centres, colmap, in_standard_world, nerfstudio, ply, tum
 from photonpano.record.run_json import poses_record
 from photonpano.record.run_warnings import poses_warnings
 from photonpano.record.schema import RunRecord

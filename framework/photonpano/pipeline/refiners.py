@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from photonpano.contracts.protocols import Source
 from photonpano.contracts.results import REFINED
 from photonpano.contracts.rules import attributing
 from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, nearest_rotations
@@ -16,7 +17,6 @@ from photonpano.motion.level import Recorder
 from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.passes import Proposal, tried
 from photonpano.pipeline.state import State
-from photonpano.protocols import Source
 from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Refined

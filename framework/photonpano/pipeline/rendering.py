@@ -12,14 +12,15 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from photonpano.context import Context
+from photonpano.contracts.protocols import Exporter, Renderer, Source, Trajectory, camera_of, light_of
 from photonpano.contracts.results import FILES, require_panorama
 from photonpano.contracts.rules import BrokenContract, attributing
-from photonpano.contributions import ExporterContribution, RendererContribution
 from photonpano.corrections import Vignette, write_vignette
+from photonpano.corrections.lighting import write_light
 from photonpano.errors import ExtentError, InputError, OutputError, ProjectionError
+from photonpano.execution.context import Context
+from photonpano.execution.threads import InOrder
 from photonpano.geometry import Canvas
-from photonpano.lighting import write_light
 from photonpano.merging import MergeRenderer
 from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.merging.footprints import by_homographies
@@ -28,9 +29,8 @@ from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.motion.level import Recorder
 from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.run_folder import RunFolder
-from photonpano.protocols import Exporter, Renderer, Source, Trajectory, camera_of, light_of
+from photonpano.plugins.contributions import ExporterContribution, RendererContribution
 from photonpano.specs.plan import Plan
-from photonpano.threads import InOrder
 from photonpano.values import Decision, FrameSpan, Homography, Panorama, PanoramaRows
 
 logger = logging.getLogger(__name__)

@@ -5,19 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from photonpano.captures.obstacles import naming_obstacles
-from photonpano.context import Progress, usual
+from photonpano.contracts.protocols import light_of
 from photonpano.errors import InputError
+from photonpano.execution.context import Progress, usual
 from photonpano.pipeline.checkpoints.work_folder import Continuation
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
 from photonpano.pipeline.following.follow import followed
 from photonpano.pipeline.kept_exposures import write_exposures
+from photonpano.pipeline.obstacles import naming_obstacles
 from photonpano.pipeline.pose_run import find_poses
 from photonpano.pipeline.refiners import build_refiners, refine
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_steps import BegunRun, begun_run
-from photonpano.protocols import light_of
 from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import LiveFigures, OpenCapture, render_report

@@ -18,7 +18,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from photonpano.errors import OutputError
-from photonpano.folders import (
+from photonpano.files.folders import (
     finish_replacement,
     link_or_copy,
     lock_path,
@@ -27,8 +27,8 @@ from photonpano.folders import (
     replace_folder,
     staging_of,
 )
+from photonpano.files.locks import locked
 from photonpano.geometry import Canvas
-from photonpano.locks import locked
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp

@@ -10,28 +10,28 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 
-from photonpano.atomic import atomic_path
 from photonpano.capture import capture_of
-from photonpano.captures.fingerprint import CaptureRecord, capture_files, fingerprint
-from photonpano.captures.obstacles import order_warning
-from photonpano.captures.summary import require_photons
 from photonpano.compiling import notify_on_first_compile
-from photonpano.context import Context, Progress
+from photonpano.contracts.protocols import Source
 from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError, PhotonpanoError, PluginError
+from photonpano.execution.context import Context, Progress
+from photonpano.execution.threads import one_thread_inside
+from photonpano.files.atomic import atomic_path
 from photonpano.motion.loop import LevelResult
 from photonpano.pipeline.checkpoints.fingerprint import finished_run, run_fingerprint
 from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, work_folder
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.observers import Observers
+from photonpano.pipeline.obstacles import order_warning
 from photonpano.pipeline.run_folder import RunFolder, run_folder
-from photonpano.protocols import Source
+from photonpano.pipeline.summary import require_photons
 from photonpano.record.environment import peak_memory_bytes
+from photonpano.record.fingerprint import CaptureRecord, capture_files, fingerprint
 from photonpano.record.run_json import level_record, started_record, verdict_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_failure
 from photonpano.residuals.verdict import Verdict
 from photonpano.specs.plan import Plan
-from photonpano.threads import one_thread_inside
 from photonpano.values import Decision
 
 logger = logging.getLogger(__name__)

@@ -8,14 +8,14 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 from photonpano.capture import seen_through
-from photonpano.context import Context
+from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.corrections import Vignette
+from photonpano.execution.context import Context
 from photonpano.motion.frame_motion import FrameMotion, motion_of_frames
 from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.timeline import Timeline
-from photonpano.protocols import Source, Trajectory, camera_of_motion
 from photonpano.residuals.refinement import MotionFit
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Light

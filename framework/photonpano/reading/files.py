@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from photonpano.errors import InputError, PhotonpanoError
-from photonpano.paths import Location, Url, refusal
-from photonpano.paths import as_written as as_written
+from photonpano.files.paths import Location, Url, refusal
+from photonpano.files.paths import as_written as as_written
 from photonpano.reading.remote import read_range, remote_files_in
 from photonpano.reading.remote import size_of as remote_size
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.paths import Location, Url
+from photonpano.files.paths import Location, Url
 from photonpano.reading.files import OpenFiles, is_gzip, size_of
 from photonpano.reading.npy import NpyHeader, local, unpacked_start
 from photonpano.reading.pixel_order import MIN_SCORE, other_order, score, units_of

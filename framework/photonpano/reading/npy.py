@@ -16,10 +16,10 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from photonpano.atomic import atomic_path, require_space
 from photonpano.errors import InputError
-from photonpano.locks import hold
-from photonpano.paths import Location, Url
+from photonpano.files.atomic import atomic_path, require_space
+from photonpano.files.locks import hold
+from photonpano.files.paths import Location, Url
 from photonpano.reading.files import is_gzip, read_start, reading, size_of
 from photonpano.reading.remote import read_range
 

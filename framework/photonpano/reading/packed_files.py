@@ -14,7 +14,7 @@ from threading import Lock, local
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.paths import Location, Url
+from photonpano.files.paths import Location, Url
 from photonpano.reading.files import OpenFiles
 from photonpano.reading.sources import BinarySource, FrameLayout
 from photonpano.values import FrameSpan

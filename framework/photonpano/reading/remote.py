@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from photonpano.errors import InputError, PhotonpanoError
-from photonpano.paths import Url
+from photonpano.files.paths import Url
 from photonpano.text import install_line
 
 # The library that fsspec needs for each scheme, and what installs both.

@@ -11,8 +11,8 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.contracts.protocols import Closing as Closing
 from photonpano.photometry import BinaryResponse, BitOrder, packed_counts, reversed_bits
-from photonpano.protocols import Closing as Closing
 from photonpano.reading.files import OpenFiles
 from photonpano.values import Counts, Frames, FrameSpan, StreamInfo
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from photonpano.paths import Location
+from photonpano.files.paths import Location
 from photonpano.text import byte_size, count, duration, pixels
 
 Status = Literal["waiting", "running", "done", "failed", "interrupted"]

@@ -11,11 +11,11 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from photonpano.captures.fingerprint import frames_sha256
+from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, OutputError
-from photonpano.folders import PENDING, finish_replacement, lock_path
-from photonpano.locks import locked
-from photonpano.protocols import Source
+from photonpano.files.folders import PENDING, finish_replacement, lock_path
+from photonpano.files.locks import locked
+from photonpano.record.fingerprint import frames_sha256
 from photonpano.record.schema import FileContent
 
 logger = logging.getLogger(__name__)

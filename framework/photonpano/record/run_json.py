@@ -12,12 +12,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from photonpano.captures.fingerprint import CaptureRecord
 from photonpano.errors import InputError
 from photonpano.geometry import Camera
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.loop import LevelResult
 from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
+from photonpano.record.fingerprint import CaptureRecord
 from photonpano.record.run_warnings import level_warnings, motion_warnings, refinement_warnings
 from photonpano.record.schema import (
     CameraRecord,

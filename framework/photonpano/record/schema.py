@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NotRequired, TypedDict
 
-from photonpano.captures.fingerprint import CaptureRecord
+from photonpano.record.fingerprint import CaptureRecord
 
 
 class SourceRecord(TypedDict):

@@ -13,8 +13,8 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.plugins.registry.description import flow
 from photonpano.record.schema import RunRecord
-from photonpano.registry.description import flow
 from photonpano.report.drawing import (
     INK,
     SERIES,

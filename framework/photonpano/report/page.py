@@ -13,10 +13,10 @@ from urllib.parse import quote
 
 import numpy as np
 
+from photonpano.contracts.protocols import Source
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
-from photonpano.protocols import Source
 from photonpano.record.contents import RECORD
 from photonpano.record.schema import FailureRecord, FileContent, LevelRecord, RunRecord
 from photonpano.report import figures, residual_figures

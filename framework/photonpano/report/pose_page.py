@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from photonpano.photometry import linear_to_srgb
-from photonpano.poses import centres
+from photonpano.record.poses import centres
 from photonpano.record.run_warnings import DOUBTFUL
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import INK, MUTED, SERIES, WIDTH_IN, Margins, add_axes, add_time_axis, plain_figure, svg_of

@@ -10,17 +10,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from photonpano.captures.preview import still_exposure
+from photonpano.contracts.protocols import Source
 from photonpano.geometry import Canvas, inverse, outline_of, rescaling
 from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.photometry import balanced, flux_std, tone_mapped
-from photonpano.protocols import Source
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
 from photonpano.report.figures import centre_of, instants_of, places_on
+from photonpano.report.preview import still_exposure
 from photonpano.report.residual_figures import misfit_cells, same_projection
 from photonpano.residuals.refinement import Explained, distance_to_nearest
 from photonpano.values import FloatArray, FluxImage, FrameSpan

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from photonpano.context import Context
+from photonpano.contracts.protocols import Source
+from photonpano.execution.context import Context
 from photonpano.geometry import steps_px
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.timeline import Cut
 from photonpano.motion.tracking.spans import DARK, SumTrack, span_image, track_sums
-from photonpano.protocols import Source
 from photonpano.residuals.refinement import MotionFit, standing_out
 from photonpano.values import FloatArray, FluxImage, FrameSpan, true_spans
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture import Capture
-from photonpano.context import Context
+from photonpano.execution.context import Context
 from photonpano.geometry import corners, steps_px
 from photonpano.residuals.block_sums import (
     BLOCK_PX,

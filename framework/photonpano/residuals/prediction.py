@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture import Capture, capture_of
+from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.geometry import Camera, Canvas, corners
 from photonpano.merging.light import gain_image
 from photonpano.photometry import frame_variance
-from photonpano.protocols import Source, Trajectory
 from photonpano.residuals.block_sums import sample_places, sample_view
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Panorama, Response
 

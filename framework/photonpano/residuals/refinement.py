@@ -11,7 +11,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from photonpano.context import Context
+from photonpano.contracts.protocols import Refiner, Source
+from photonpano.execution.context import Context
 from photonpano.filtering import SYSTEMATIC_PX
 from photonpano.geometry import Canvas, corners
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
@@ -19,7 +20,6 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
 from photonpano.merging.panorama import render
 from photonpano.motion.frame_motion import FrameMotion, view_of
-from photonpano.protocols import Refiner, Source
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
 from photonpano.values import BoolArray, FloatArray, Panorama

@@ -11,13 +11,13 @@ from typing import Any
 
 from pydantic import ConfigDict, Field
 
-from photonpano.contributions import Config, Recognised, SourceContribution, SpecLocation
 from photonpano.errors import described
-from photonpano.hookspecs import hookimpl
-from photonpano.interrupts import is_interrupt
-from photonpano.paths import Location, Url
+from photonpano.execution.interrupts import is_interrupt
+from photonpano.files.paths import Location, Url
+from photonpano.plugins.contributions import Config, Recognised, SourceContribution, SpecLocation
+from photonpano.plugins.hookspecs import hookimpl
+from photonpano.plugins.registry import Catalog, Entry
 from photonpano.reading import objections, require_there
-from photonpano.registry import Catalog, Entry
 from photonpano.specs.checks import complaints
 from photonpano.specs.components import LocatorAlias, SourceAlias
 from photonpano.specs.plan import Choice

@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from itertools import islice
 from typing import Any
 
-from photonpano.contributions import MergerContribution
 from photonpano.corrections import Correction, FlatField
 from photonpano.errors import Problem, described
-from photonpano.interrupts import is_interrupt
+from photonpano.execution.interrupts import is_interrupt
+from photonpano.plugins.contributions import MergerContribution
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.settings import CameraSettings, MotionSettings
 from photonpano.specs.spec import Spec

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-from photonpano.contributions import KINDS, ExporterContribution, Kind, LocatorContribution, SourceContribution
 from photonpano.errors import PluginError, described
-from photonpano.interrupts import is_interrupt
-from photonpano.registry import Entry
+from photonpano.execution.interrupts import is_interrupt
+from photonpano.plugins.contributions import KINDS, ExporterContribution, Kind, LocatorContribution, SourceContribution
+from photonpano.plugins.registry import Entry
 from photonpano.specs.plan import Choice
 from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, given

@@ -8,10 +8,10 @@ from typing import Any, TypeAlias
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from photonpano.contributions import KINDS, Kind
 from photonpano.corrections import CORRECTIONS
-from photonpano.registry import Catalog, Entry
-from photonpano.registry.description import TolerantJsonSchema
+from photonpano.plugins.contributions import KINDS, Kind
+from photonpano.plugins.registry import Catalog, Entry
+from photonpano.plugins.registry.description import TolerantJsonSchema
 from photonpano.specs.components import DEFAULT_FALLBACK, LocatorAlias
 from photonpano.specs.corrections import AUTO
 from photonpano.specs.settings import (

@@ -8,8 +8,8 @@ from shlex import quote
 from typing import Any
 
 from photonpano.errors import Problem, SpecError
-from photonpano.paths import Location, location, refusal
-from photonpano.registry import Catalog, discover
+from photonpano.files.paths import Location, location, refusal
+from photonpano.plugins.registry import Catalog, discover
 from photonpano.specs.builtin import ask_sources
 from photonpano.specs.plan import Plan
 from photonpano.specs.resolution import resolve

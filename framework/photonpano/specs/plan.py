@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from photonpano.contributions import Config, Contribution
 from photonpano.corrections import Correction
 from photonpano.errors import InputError
-from photonpano.registry import Observer, Origin
+from photonpano.plugins.contributions import Config, Contribution
+from photonpano.plugins.registry import Observer, Origin
 from photonpano.specs.settings import (
     CameraSettings,
     GraphSettings,

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from photonpano.contributions import KINDS
 from photonpano.errors import Problem, SpecError
+from photonpano.plugins.contributions import KINDS
 from photonpano.specs.checks import check_flat_field, check_settings, complaints
 from photonpano.specs.components import CHOICE, ComponentResolver, Stage
 from photonpano.specs.corrections import AUTO, resolved_corrections, written_corrections

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ByteSize, Field, field_validator
 
-from photonpano.contributions import KINDS, Config, SpecPath
+from photonpano.plugins.contributions import KINDS, Config, SpecPath
 
 _Factor = Annotated[float, Field(gt=0, le=1000)]
 Extent = Literal["panorama", "reference"] | tuple[int, int, int, int]

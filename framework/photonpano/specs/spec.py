@@ -12,10 +12,10 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from photonpano.contributions import KINDS
 from photonpano.errors import Problem
-from photonpano.registry import Catalog
-from photonpano.registry.description import (
+from photonpano.plugins.contributions import KINDS
+from photonpano.plugins.registry import Catalog
+from photonpano.plugins.registry.description import (
     Schema,
     alternative,
     alternatives,

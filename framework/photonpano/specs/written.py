@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from photonpano.errors import Problem
-from photonpano.paths import Url
+from photonpano.files.paths import Url
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from photonpano.contracts.protocols import Closing, Trajectory
 from photonpano.photometry import BinaryResponse
-from photonpano.protocols import Closing, Trajectory
 from photonpano.testing.scenes import Scene
 from photonpano.values import BoolArray, Counts, FloatArray, FrameSpan, Group, Homography, StreamInfo, VirtualExposure
 

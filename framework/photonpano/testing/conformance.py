@@ -17,10 +17,10 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from photonpano.contracts.rules import BrokenContract
-from photonpano.contributions import Contribution, install_command
 from photonpano.errors import PluginError
-from photonpano.registry import KINDS
-from photonpano.registry.plugins import contributions_of
+from photonpano.plugins.contributions import Contribution, install_command
+from photonpano.plugins.registry import KINDS
+from photonpano.plugins.registry.plugins import contributions_of
 
 # Libraries that take long to import; numpy is allowed.
 HEAVY = frozenset(

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from photonpano.capture import PluginSource
-from photonpano.context import Context
-from photonpano.contributions import ExecutorContext, ExecutorContribution
 from photonpano.errors import LocationError
 from photonpano.execution import CaptureElsewhere, Executor
+from photonpano.execution.context import Context
+from photonpano.plugins.contributions import ExecutorContext, ExecutorContribution
 from photonpano.testing.captures import MemorySource
 from photonpano.testing.conformance import Conformance
 from photonpano.values import Counts, FrameSpan

@@ -8,10 +8,10 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from photonpano.contributions import ExporterContribution
 from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.rendering import AttributedExporter, StoredPanorama
+from photonpano.plugins.contributions import ExporterContribution
 from photonpano.testing.conformance import passing
 from photonpano.testing.stages import StageConformance
 

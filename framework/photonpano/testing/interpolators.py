@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from photonpano.contracts.loop import HOMOGRAPHIES, KNOTS, knot_errors
-from photonpano.contributions import InterpolatorContribution
+from photonpano.contracts.protocols import Trajectory
 from photonpano.geometry import corner_displacements, from_parameters, translation
-from photonpano.protocols import Trajectory
+from photonpano.plugins.contributions import InterpolatorContribution
 from photonpano.testing.captures import read_only
 from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, in_threads

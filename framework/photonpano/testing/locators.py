@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from photonpano.contracts.loop import LOCATED, NOT_LOCATED, contract_for
-from photonpano.contributions import LocatorContribution
+from photonpano.contracts.protocols import LocatesTurns
 from photonpano.geometry import Camera, apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
-from photonpano.protocols import LocatesTurns
+from photonpano.plugins.contributions import LocatorContribution
 from photonpano.testing.captures import photographed, read_only
 from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.sameness import copied, fingerprint, global_seed, in_threads

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from photonpano.contracts.loop import EXPOSURE, Asked
-from photonpano.contributions import MergerContribution
+from photonpano.contracts.protocols import Merger, Source, Trajectory
 from photonpano.errors import InputError
 from photonpano.geometry import translation
-from photonpano.protocols import Merger, Source, Trajectory
+from photonpano.plugins.contributions import MergerContribution
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded
 from photonpano.testing.sameness import copied, fingerprint, in_threads
 from photonpano.testing.scenes import Scene

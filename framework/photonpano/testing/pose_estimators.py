@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 
-from photonpano.context import Quiet
 from photonpano.contracts.results import POSES
-from photonpano.contributions import PoseEstimatorContribution
 from photonpano.errors import LocationError
 from photonpano.evaluation import pose_errors
+from photonpano.execution.context import Quiet
 from photonpano.geometry import camera_matrix, rotation_matrices
-from photonpano.poses import in_standard_world
+from photonpano.plugins.contributions import PoseEstimatorContribution
+from photonpano.record.poses import in_standard_world
 from photonpano.testing.captures import MemorySource, ReadOnlySource
 from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.stages import Answer, AnswerConformance

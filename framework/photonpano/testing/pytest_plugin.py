@@ -20,7 +20,7 @@ for _name in ("conformance", "stages", *_KINDS.split()):
 @pytest.fixture(scope="class")
 def photonpano_one_thread_inside() -> Iterator[None]:
     """Keep OpenCV and BLAS from starting threads of their own, as a run does."""
-    from photonpano.threads import one_thread_inside
+    from photonpano.execution.threads import one_thread_inside
 
     with one_thread_inside():
         yield

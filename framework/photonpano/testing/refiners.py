@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.contracts.results import REFINED
-from photonpano.contributions import RefinerContribution
 from photonpano.geometry import corner_displacements, translation
-from photonpano.protocols import Source, Trajectory
+from photonpano.plugins.contributions import RefinerContribution
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, read_only, recorded
 from photonpano.testing.conformance import must_not_raise
 from photonpano.testing.sameness import fingerprint

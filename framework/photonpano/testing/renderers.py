@@ -9,12 +9,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from photonpano.contracts.protocols import Source
 from photonpano.contracts.results import PANORAMA
-from photonpano.contributions import RendererContribution
 from photonpano.errors import InputError
 from photonpano.geometry import Canvas, canvas_of, inverse, translation
 from photonpano.photometry import BinaryResponse
-from photonpano.protocols import Source
+from photonpano.plugins.contributions import RendererContribution
 from photonpano.testing.captures import MemorySource, ReadOnlySource
 from photonpano.testing.conformance import must_not_raise
 from photonpano.testing.mergers import (

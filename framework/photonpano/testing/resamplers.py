@@ -8,8 +8,8 @@ from itertools import islice
 from typing import Any, ClassVar
 
 from photonpano.contracts.loop import GROUPS
-from photonpano.contributions import ResamplerContribution
 from photonpano.errors import InputError
+from photonpano.plugins.contributions import ResamplerContribution
 from photonpano.testing.stages import STREAM, Answer, AnswerConformance
 
 LEVELS = (1, 2, 3, 4)

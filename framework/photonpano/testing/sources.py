@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from photonpano.capture import capture_of
-from photonpano.contributions import SourceContext, SourceContribution
+from photonpano.contracts.protocols import Arrived, PackedSource, Source
 from photonpano.errors import InputError
-from photonpano.protocols import Arrived, PackedSource, Source
+from photonpano.plugins.contributions import SourceContext, SourceContribution
 from photonpano.testing.conformance import Conformance, must_not_raise, passing
 from photonpano.testing.sameness import fingerprint, global_seed, in_threads
 from photonpano.values import FrameSpan, StreamInfo

@@ -10,9 +10,9 @@ from typing import Any, ClassVar, TypeAlias
 import pytest
 
 from photonpano.contracts.rules import Contract, Rule
-from photonpano.contributions import StageContext, StageContribution
 from photonpano.errors import CaptureUnreadError
 from photonpano.photometry import BinaryResponse
+from photonpano.plugins.contributions import StageContext, StageContribution
 from photonpano.testing.conformance import Conformance
 from photonpano.values import CaptureSummary, DecisionValue, StreamInfo
 

@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from photonpano import CameraGuess, CaptureSummary, FrameSpan, LocationError, StageContext, StreamInfo, discover
-from photonpano.context import Quiet
 from photonpano.evaluation import pose_errors
+from photonpano.execution.context import Quiet
 from photonpano.geometry import camera_matrix
 from photonpano.testing import MemorySource
 from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses

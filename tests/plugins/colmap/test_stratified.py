@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from photonpano import CameraGuess, FrameSpan, Group, LocationError, StageContext
-from photonpano.context import Quiet
 from photonpano.evaluation import pose_errors
+from photonpano.execution.context import Quiet
 from photonpano.geometry import camera_matrix, rotation_matrices
 from photonpano.testing import MemorySource
 from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses

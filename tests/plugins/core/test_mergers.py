@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, Light, Merger, Source, StageContext, Trajectory, discover
+from photonpano.corrections.lighting import in_light
 from photonpano.geometry import Camera, translation
-from photonpano.lighting import in_light
 from photonpano.merging import accumulate, chunks_of
 from photonpano.testing import KnownMotion, MemorySource
 

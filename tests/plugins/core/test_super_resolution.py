@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from photonpano import Light, Panorama
+from photonpano.corrections.lighting import in_light
 from photonpano.geometry import Canvas, translation
-from photonpano.lighting import in_light
 from photonpano.merging import MergeRenderer, PhotonSum
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from photonpano import ExecutorContext, InputError, SpecError, parse_spec, run, simulate
-from photonpano.context import Quiet
 from photonpano.execution import CaptureElsewhere
+from photonpano.execution.context import Quiet
 
 pytest.importorskip("distributed")
 

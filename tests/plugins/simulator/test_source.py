@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
-from photonpano.captures.writing import write_packed
+from photonpano.capture.writing import write_packed
 from photonpano.testing.scenes import z_scores
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources

@@ -8,7 +8,7 @@ import pytest
 
 import photonpano
 from photonpano import Config, Plan, RefinerContribution, capture_plan, convert, discover, explain, info, parse_spec, simulate
-from photonpano.cli.app import commands
+from photonpano.api.cli.app import commands
 from photonpano.record.environment import plugin_records
 
 

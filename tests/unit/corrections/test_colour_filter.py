@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from photonpano import ColouredSource, FrameSpan, InputError, LinearlyCorrectedSource, WeightedSource
-from photonpano.captures.obstacles import obstacles
 from photonpano.corrections import corrected_source, without_still_pixels
+from photonpano.pipeline.obstacles import obstacles
 from photonpano.reading import COLOURS, bayer_array
 from photonpano.testing import MemorySource
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from photonpano import InputError, evaluate, evaluate_poses, evaluation
-from photonpano.cli.app import app
+from photonpano.api.cli.app import app
 from photonpano.evaluation import load_truth, pose_errors, true_panorama
 from photonpano.geometry import Camera, Canvas, rotation_matrices, translation
 

@@ -12,12 +12,12 @@ import pytest
 import photonpano.pipeline.run as run_module
 from photonpano import FrameSpan, InputError, Light, PluginError, parse_spec, run
 from photonpano.capture import Capture, capture_of, part_of, seen_through
+from photonpano.contracts.protocols import ColouredSource, LinearlyCorrectedSource, PackedSource, Source, camera_of, light_of
 from photonpano.corrections import ColourFilter, HotPixels, Vignette, corrected_source, divided_by
+from photonpano.corrections.lighting import in_light
 from photonpano.execution.remote import packed, unpacked
 from photonpano.geometry import Camera
-from photonpano.lighting import in_light
 from photonpano.pipeline.executors import CaptureOpener, as_read, met_elsewhere
-from photonpano.protocols import ColouredSource, LinearlyCorrectedSource, PackedSource, Source, camera_of, light_of
 from photonpano.testing import MemorySource
 
 SHAPE, N = (24, 32), 60

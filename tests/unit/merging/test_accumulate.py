@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Light
+from photonpano.corrections.lighting import in_light
 from photonpano.geometry import from_parameters, rescaling, translation
-from photonpano.lighting import in_light
 from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of, divided
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource

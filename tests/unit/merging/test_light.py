@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Light, Response
+from photonpano.corrections.lighting import in_light
 from photonpano.geometry import translation
-from photonpano.lighting import in_light
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.light import LitFrames, gain_image
 from photonpano.photometry import BinaryResponse, IntensityResponse

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import CanvasTooLargeError, FrameSpan, InputError, LocationError, Panorama
-from photonpano.context import Context, Quiet
+from photonpano.execution.context import Context, Quiet
 from photonpano.geometry import Canvas, from_parameters, transform_points, translation
 from photonpano.merging import MergeRenderer, accumulate
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, PluginError
-from photonpano.context import Context, Quiet
 from photonpano.contracts.loop import AttributedTrajectory
+from photonpano.execution.context import Context, Quiet
 from photonpano.geometry import from_parameters, inverse, normalised, translation
 from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, ReferencedTrajectory, estimate_motion

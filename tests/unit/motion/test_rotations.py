@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from photonpano.contracts.protocols import Interpolator
 from photonpano.geometry import (
     Camera,
     align_rotations,
@@ -23,7 +24,6 @@ from photonpano.motion.graph import GraphSolution, solve
 from photonpano.motion.model import MotionModel
 from photonpano.motion.rotation_graph import LensShift, Rotations
 from photonpano.motion.rotations import RotationTrajectory, fit_rotations
-from photonpano.protocols import Interpolator
 from photonpano.values import Edge, FloatArray, Located, NotLocated
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators.interpolating import GeodesicInterpolator, LieInterpolator, LucasKanadeInterpolator

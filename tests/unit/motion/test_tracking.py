@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group
-from photonpano.context import Context
 from photonpano.errors import InputError, LocationError
+from photonpano.execution.context import Context
 from photonpano.geometry import (
     Camera,
     FrameTrajectory,

@@ -23,15 +23,15 @@ from photonpano import (
     StreamInfo,
 )
 from photonpano.capture import seen_through
+from photonpano.contracts.protocols import Renderer
+from photonpano.corrections.lighting import in_light
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, canvas_around, covered_by, rotation_matrices
-from photonpano.lighting import in_light
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
 from photonpano.pipeline.forecast import TRIAL_GROUPS, forecast
 from photonpano.pipeline.rendering import AttributedRenderer, build_renderer
-from photonpano.protocols import Renderer
-from photonpano.registry import Catalog, Origin
-from photonpano.registry.catalog import make_entry
+from photonpano.plugins.registry import Catalog, Origin
+from photonpano.plugins.registry.catalog import make_entry
 from photonpano.specs import Plan, parse_spec
 from photonpano.testing import MemorySource
 from photonpano.values import Decision, Light

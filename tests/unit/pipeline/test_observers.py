@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from photonpano import LocationError, hookimpl
-from photonpano.context import Context
 from photonpano.errors import described
+from photonpano.execution.context import Context
 from photonpano.geometry import Canvas
 from photonpano.motion.loop import estimate_motion
 from photonpano.pipeline.observers import Observers, frozen
-from photonpano.registry import Catalog
+from photonpano.plugins.registry import Catalog
 from photonpano.specs.settings import GraphSettings
 
 DIRECTORY = Path("runs/scan")

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, LocationError, Refined
-from photonpano.context import Context
 from photonpano.errors import CanvasTooLargeError
+from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory, inverse, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut, Timeline

@@ -30,8 +30,8 @@ from photonpano import (
     run,
 )
 from photonpano.pipeline.run import RunResult
+from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import changed_files
-from photonpano.registry import Catalog
 from photonpano.specs import Plan, parse_spec
 
 N_FRAMES, LOST = 300, FrameSpan(280, 300)

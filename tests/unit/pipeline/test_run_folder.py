@@ -96,7 +96,7 @@ def old(tmp_path: Path) -> Path:
 def system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """A system that exchanges folders in one step, and one that cannot."""
     if request.param == "pending":
-        monkeypatch.setattr("photonpano.folders._exchange", lambda *_: False)
+        monkeypatch.setattr("photonpano.files.folders._exchange", lambda *_: False)
     return str(request.param)
 
 
@@ -320,7 +320,7 @@ def test_run_folder_is_old_or_new_when_any_step_fails_once(
 _STOPS = """
 import os, signal, sys
 from pathlib import Path
-from photonpano import folders
+from photonpano.files import folders
 from photonpano.pipeline.run_folder import run_folder
 
 def stop(*args):

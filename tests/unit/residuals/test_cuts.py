@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.context import Context
+from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut

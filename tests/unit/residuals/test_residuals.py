@@ -9,7 +9,7 @@ import pytest
 
 from photonpano import FrameSpan, open_source, parse_spec
 from photonpano.capture import seen_through
-from photonpano.context import Context
+from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging.canvas_plan import View, plan_canvas
 from photonpano.merging.panorama import render

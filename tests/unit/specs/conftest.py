@@ -6,9 +6,9 @@ import pytest
 from pydantic import Field, model_validator
 
 from photonpano import Config, Recognised, Requirement, SpecPath
-from photonpano.registry import KINDS, Catalog, Origin
-from photonpano.registry.catalog import make_entry
-from photonpano.registry.plugins import contributions_of
+from photonpano.plugins.registry import KINDS, Catalog, Origin
+from photonpano.plugins.registry.catalog import make_entry
+from photonpano.plugins.registry.plugins import contributions_of
 from photonpano.specs import builtin
 
 

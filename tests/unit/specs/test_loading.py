@@ -12,8 +12,8 @@ import pytest
 from ruamel.yaml import YAML, YAMLError
 
 from photonpano import Config, ExporterContribution, PluginError, SpecError
-from photonpano.registry import Catalog
-from photonpano.registry.description import snippet
+from photonpano.plugins.registry import Catalog
+from photonpano.plugins.registry.description import snippet
 from photonpano.specs import builtin, json_schema, load_spec, parse_spec
 
 MINIMAL = {"version": 1, "source": {"use": "simulator"}}
@@ -198,7 +198,7 @@ def test_load_spec_accepts_byte_order_mark_and_windows_line_ends(catalog, tmp_pa
 
 def test_reading_specs_imports_nothing_heavy():
     code = (
-        "import sys, photonpano.specs, photonpano.registry\n"
+        "import sys, photonpano.specs, photonpano.plugins.registry\n"
         "heavy = {'cv2', 'scipy', 'skimage', 'matplotlib', 'tifffile', 'PIL', 'jinja2', 'torch'}\n"
         "sys.exit(', '.join(sorted(heavy & sys.modules.keys())) or 0)"
     )

@@ -20,12 +20,12 @@ from photonpano import (
     SourceContribution,
     StageContext,
 )
-from photonpano.cli.errors import reported
+from photonpano.api.cli.errors import reported
 from photonpano.geometry import camera_matrix, translation
 from photonpano.pipeline.run import run
-from photonpano.registry import KINDS as OF_CATALOG
-from photonpano.registry import Catalog, Observer, discover
-from photonpano.registry.catalog import make_entry
+from photonpano.plugins.registry import KINDS as OF_CATALOG
+from photonpano.plugins.registry import Catalog, Observer, discover
+from photonpano.plugins.registry.catalog import make_entry
 from photonpano.specs import parse_spec
 from photonpano.testing import KnownMotion, MemorySource, Scene, pose_estimators
 from photonpano.testing.captures import recorded

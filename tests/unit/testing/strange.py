@@ -19,7 +19,7 @@ from photonpano import (
     ResamplerContribution,
     SourceContribution,
 )
-from photonpano.registry import Origin
+from photonpano.plugins.registry import Origin
 
 ORIGIN = Origin("strange-plugin", "1.2", "strange = strange.hooks")
 SHAPE, FRAMES = (48, 64), 160

@@ -11,7 +11,7 @@ import pytest
 from pydantic import Field, model_validator
 
 from photonpano import Config, FrameSpan, MergerContribution, SourceContribution
-from photonpano.registry import Catalog
+from photonpano.plugins.registry import Catalog
 from photonpano.testing import KnownMotion
 
 from .strange import ERRORS, KINDS, Around, Keys, Outcome, SpeechlessError, around, instead, raising, require_named

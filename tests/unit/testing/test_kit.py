@@ -190,7 +190,7 @@ def test_pytest_plugin_imports_pytest_only():
 
 
 def test_package_does_not_import_pytest():
-    code = "import sys, photonpano, photonpano.testing, photonpano.cli; sys.exit('pytest' in sys.modules)"
+    code = "import sys, photonpano, photonpano.testing, photonpano.api.cli; sys.exit('pytest' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -8,11 +8,11 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
-from photonpano.contributions import SourceContribution
 from photonpano.errors import InputError
-from photonpano.paths import Location, Url, given_path, location, refusal
+from photonpano.files.paths import Location, Url, given_path, location, refusal
+from photonpano.plugins.contributions import SourceContribution
+from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import RECORD
-from photonpano.registry import Catalog
 
 _TRUTH = ".truth.npz"
 _COMPRESSED = (".gz",)

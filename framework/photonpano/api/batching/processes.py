@@ -25,7 +25,7 @@ from types import ModuleType
 from typing import Any
 
 from photonpano.api.batching.sweeps import Job
-from photonpano.atomic import discard_unfinished
+from photonpano.files.atomic import discard_unfinished
 from photonpano.record.batch_row import BatchRow
 
 _END_S = 0.5  # how long a run may take to discard unfinished files when the batch ends

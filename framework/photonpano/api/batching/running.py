@@ -11,11 +11,11 @@ from pathlib import Path
 import cv2
 
 from photonpano.api.batching.sweeps import Job, is_of_capture
-from photonpano.captures.writing import truth_path
-from photonpano.context import Quiet
+from photonpano.capture.writing import truth_path
 from photonpano.errors import InputError, PhotonpanoError, SpecError, described
 from photonpano.evaluation import evaluate, evaluate_poses
-from photonpano.paths import Url
+from photonpano.execution.context import Quiet
+from photonpano.files.paths import Url
 from photonpano.pipeline.run import RunResult, run
 from photonpano.record.batch_row import BatchRow
 from photonpano.report.drawing import jpeg_uri, shrunk

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from photonpano.atomic import atomic_path
 from photonpano.errors import OutputError
+from photonpano.files.atomic import atomic_path
 from photonpano.record.batch_row import FIGURES, BatchRow, written
 from photonpano.report import render_batch
 

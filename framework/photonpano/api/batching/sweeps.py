@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from photonpano.errors import Problem, SpecError
-from photonpano.paths import Location, Url, as_written
+from photonpano.files.paths import Location, Url, as_written
+from photonpano.plugins.registry import Catalog
 from photonpano.record.batch_row import BatchRow, written
-from photonpano.registry import Catalog
 from photonpano.specs import Plan, parse_spec
 from photonpano.specs.written import Place
 from photonpano.specs.yaml_reader import read_yaml

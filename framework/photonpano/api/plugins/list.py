@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from photonpano.api.command import command, json_lines
-from photonpano.registry import KINDS, Catalog, Entry, Origin
+from photonpano.plugins.registry import KINDS, Catalog, Entry, Origin
 from photonpano.text import columns
 
 

@@ -10,9 +10,9 @@ import typer
 
 from photonpano.api.command import command, component_names, json_lines
 from photonpano.api.plugins.list import facts, kind_option
-from photonpano.contributions import install_command
-from photonpano.registry import Catalog, Entry
-from photonpano.registry.description import config_rows, snippet
+from photonpano.plugins.contributions import install_command
+from photonpano.plugins.registry import Catalog, Entry
+from photonpano.plugins.registry.description import config_rows, snippet
 from photonpano.text import columns
 
 

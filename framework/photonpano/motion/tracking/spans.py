@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from photonpano.context import Context
+from photonpano.contracts.protocols import Source
+from photonpano.execution.context import Context
 from photonpano.geometry import translation
 from photonpano.locating import Follows, follows, shift_of_spectra
 from photonpano.merging import binned_mean, binning_of
 from photonpano.photometry import hann_window
-from photonpano.protocols import Source
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
 SHORTEST = {"binary": 4, "intensity": 1}  # frames of the shortest span: sums of fewer binary frames are mostly noise

@@ -10,7 +10,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.context import Context
+from photonpano.contracts.protocols import Source
+from photonpano.execution.context import Context
 from photonpano.geometry import translation
 from photonpano.locating import Follows, correlation_peaks, correlation_surface
 from photonpano.merging import binning_of
@@ -26,7 +27,6 @@ from photonpano.motion.tracking.spans import (
     spectra_of,
     stabilised,
 )
-from photonpano.protocols import Source
 from photonpano.robust import robust_std
 from photonpano.values import FloatArray, FrameSpan, Group
 

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft, optimize
 
-from photonpano.context import Context
+from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, LocationError
+from photonpano.execution.context import Context
 from photonpano.geometry import corners, transform_points
 from photonpano.merging import binned_mean, binning_of
-from photonpano.protocols import Source
 from photonpano.robust import robust_std
 from photonpano.values import FloatArray, FrameSpan
 

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from photonpano.atomic import atomic_path
 from photonpano.errors import OutputError
+from photonpano.files.atomic import atomic_path
 from photonpano.pipeline.checkpoints.records import digest, packed, unpacked
 from photonpano.text import byte_size
 from photonpano.values import Decision
@@ -80,7 +80,7 @@ _END = "end"
 
 
 class Kept:
-    """Checkpoints in a store: see `photonpano.context.Checkpoints`.
+    """Checkpoints in a store: see `photonpano.execution.context.Checkpoints`.
 
     Decisions that components take while they work are kept with the results, and taken again when these are found.
     """
@@ -93,7 +93,7 @@ class Kept:
         self._logs: list[KeptLog] = [] if logs is None else logs
 
     def once(self, step: str, compute: Callable[[], ResultT], *given: Any) -> ResultT:
-        """See `photonpano.context.Checkpoints`."""
+        """See `photonpano.execution.context.Checkpoints`."""
         name = self._name(step, given)
         if (found := self._store.load(name)) is not None:
             kept: ResultT
@@ -106,13 +106,13 @@ class Kept:
         return result
 
     def log(self, step: str, *given: Any) -> KeptLog:
-        """See `photonpano.context.Checkpoints`."""
+        """See `photonpano.execution.context.Checkpoints`."""
         log = KeptLog(self._store, self._name(step, given), self._decisions)
         self._logs.append(log)
         return log
 
     def within(self, *given: Any) -> Kept:
-        """See `photonpano.context.Checkpoints`."""
+        """See `photonpano.execution.context.Checkpoints`."""
         return Kept(self._store, self._decisions, (*self._given, *given), self._logs)
 
     def flush(self) -> None:
@@ -125,7 +125,7 @@ class Kept:
 
 
 class KeptLog:
-    """Results of a step with many of them, in files of what was found within some seconds: see `photonpano.context.Log`."""
+    """Results of a step with many of them, in files of what was found within some seconds: see `context.Log`."""
 
     def __init__(self, store: Store, name: str, decisions: list[Decision]) -> None:
         self._store, self._name, self._decisions = store, name, decisions
@@ -143,13 +143,13 @@ class KeptLog:
         self._flushed = time.monotonic()
 
     def add(self, result: Any) -> None:
-        """See `photonpano.context.Log`."""
+        """See `photonpano.execution.context.Log`."""
         self._pending.append(result)
         if time.monotonic() - self._flushed >= FLUSH_S:
             self.flush()
 
     def finish(self) -> None:
-        """See `photonpano.context.Log`."""
+        """See `photonpano.execution.context.Log`."""
         self.flush()
         for decision in self._restored:
             if decision not in self._decisions[self._first_decision :]:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from photonpano.atomic import atomic_path
-from photonpano.context import Checkpoints, KeepNothing, Progress
 from photonpano.errors import InputError, OutputError, PhotonpanoError
+from photonpano.execution.context import Checkpoints, KeepNothing, Progress
+from photonpano.files.atomic import atomic_path
 from photonpano.pipeline.checkpoints.fingerprint import Fingerprint, differences
 from photonpano.pipeline.checkpoints.store import SUFFIX, Kept, Store, finished
 from photonpano.text import counted

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from photonpano.contracts.protocols import Arrived, Piped, Source
 from photonpano.errors import InputError, OutputError, PhotonpanoError
-from photonpano.protocols import Arrived, Piped, Source
 
 _POLL_S = 0.02
 _TOLERATED_S = 1.0  # time for which an unreadable capture is tolerated: files may appear in any order

@@ -16,24 +16,24 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from photonpano.captures.fingerprint import capture_files
 from photonpano.compiling import notify_on_first_compile
-from photonpano.context import Context, Progress
-from photonpano.contributions import PartOfCapture, SourceContribution
+from photonpano.contracts.protocols import Piped
 from photonpano.errors import InputError, OutputError, PhotonpanoError, described
-from photonpano.folders import lock_path
-from photonpano.interrupts import is_interrupt
-from photonpano.locks import locked
+from photonpano.execution.context import Context, Progress
+from photonpano.execution.interrupts import is_interrupt
+from photonpano.execution.threads import one_thread_inside, thread_count
+from photonpano.files.folders import lock_path
+from photonpano.files.locks import locked
 from photonpano.pipeline.following.arrivals import Arrivals, Spool
 from photonpano.pipeline.following.live_run import Every, LiveRun
 from photonpano.pipeline.following.picture import PAGE, LivePage, PictureSoFar, rehearse
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.pipeline.run_steps import COMPILING
-from photonpano.protocols import Piped
+from photonpano.plugins.contributions import PartOfCapture, SourceContribution
+from photonpano.record.fingerprint import capture_files
 from photonpano.report import LiveFigures
 from photonpano.specs.plan import Plan
 from photonpano.text import counted, duration
-from photonpano.threads import one_thread_inside, thread_count
 
 logger = logging.getLogger(__name__)
 

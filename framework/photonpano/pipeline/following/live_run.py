@@ -8,13 +8,13 @@ from collections import deque
 from dataclasses import replace
 
 from photonpano.capture import Capture, capture_of
-from photonpano.context import Context
+from photonpano.contracts.protocols import Source
 from photonpano.corrections import without_still_pixels
 from photonpano.errors import PhotonpanoError
+from photonpano.execution.context import Context
 from photonpano.pipeline.components import require_suitable, with_corrections
 from photonpano.pipeline.following.arrivals import Arrivals, Delays
 from photonpano.pipeline.following.located import LocatedSoFar, Window
-from photonpano.protocols import Source
 from photonpano.report import LiveFigures
 from photonpano.specs.plan import Plan
 from photonpano.values import BoolArray

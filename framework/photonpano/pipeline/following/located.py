@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from photonpano.capture import part_of
-from photonpano.context import Context
+from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.errors import InputError, LocationError
+from photonpano.execution.context import Context
+from photonpano.execution.threads import Stopwatch
 from photonpano.motion.level import Level
 from photonpano.motion.loop import resample
 from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.state import State
-from photonpano.protocols import Source, Trajectory
 from photonpano.specs.plan import Plan
-from photonpano.threads import Stopwatch
 from photonpano.values import FrameSpan, Homography
 
 LEAST_FRAMES = {"binary": 256, "intensity": 16}  # minimum number of frames for the first group size

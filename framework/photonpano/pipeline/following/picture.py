@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.atomic import atomic_path
-from photonpano.context import Context
 from photonpano.errors import OutputError, PhotonpanoError
+from photonpano.execution.context import Context
+from photonpano.files.atomic import atomic_path
 from photonpano.geometry import Canvas, apply, corners, normalised, rescaling, translation
 from photonpano.merging import accumulate
 from photonpano.merging.accumulate import PhotonSum

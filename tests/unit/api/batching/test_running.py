@@ -30,7 +30,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from photonpano.api.batching.sweeps import Job
 from photonpano.api.batching.sweeps import SpecText
-from photonpano.atomic import atomic_path
+from photonpano.files.atomic import atomic_path
 from photonpano.record.batch_row import BatchRow
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from photonpano import Group, Located, NotLocated, Trajectory
-from photonpano.context import Context
+from photonpano.execution.context import Context
+from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import inverse, translation
 from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import KnownMotion
-from photonpano.threads import Stopwatch
 
 SHAPE = (40, 60)
 N_FRAMES = 120

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from photonpano import Group, Located, NotLocated, Trajectory, VirtualExposure
-from photonpano.context import Context
+from photonpano.execution.context import Context
+from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import inverse, rescaling, translation
 from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.level import Level, VirtualExposures
@@ -19,7 +20,6 @@ from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import KnownMotion, MemorySource, photographed
 from photonpano.testing.scenes import seen_along
-from photonpano.threads import Stopwatch
 from photonpano.values import Edge
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from photonpano import InputError
-from photonpano.context import Quiet
+from photonpano.execution.context import Quiet
 from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, path_of, work_folder
 
 RESUMING = Continuation(resume=True)

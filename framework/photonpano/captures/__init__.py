@@ -1,1 +1,0 @@
-"""What looks at a capture: its summary, copies of it, pictures of it."""

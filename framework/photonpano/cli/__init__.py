@@ -1,5 +1,0 @@
-"""The command line: it reads arguments, calls functions of `api`, and prints their results."""
-
-from photonpano.cli.app import main
-
-__all__ = ["main"]

@@ -1,0 +1,88 @@
+"""The interfaces of the components that render the panorama and write it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from photonpano.contracts.protocols.motion import Trajectory
+from photonpano.contracts.protocols.sources import Source
+from photonpano.values import FrameSpan, Homography, Panorama, PanoramaRows
+
+if TYPE_CHECKING:
+    from photonpano.geometry import Canvas
+
+
+class Renderer(Protocol):
+    """Renders the panorama: flux and weight on a canvas, from the frames and their motion."""
+
+    def render(
+        self,
+        source: Source,
+        trajectory: Trajectory,
+        span: FrameSpan,
+        canvas: Canvas,
+        tolerance_px: float,
+        advance: Callable[[int], None],
+    ) -> Panorama:
+        """Render the frames of a span on a canvas.
+
+        The framework chooses the canvas. One that exceeds the memory of the run is rendered in tiles, each with a call; what a
+        pixel shows should not depend on the tile that it lies in.
+
+        Convention:
+            Points are (x, y), integers are pixel centres. A pixel p of frame t is at `canvas.transform @ trajectory.at(t) @ p`
+            on a planar canvas, and on others at `canvas.pixels(canvas.plane_to_rays @ trajectory.at(t) @ p)`.
+            p is an ideal pixel where the lens is known. A contribution without `renders_on_any_canvas` gets planar canvases,
+            and no lens.
+
+        Args:
+            source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected.
+            trajectory: frame pixels to reference pixels.
+            span: the frames to render.
+            canvas: the pixel grid.
+            tolerance_px: motion, in px of a frame, within which frames may be summed before they are warped.
+            advance: called with the number of frames that are done; over the whole call these add up to the frames of the span.
+
+        Returns:
+            Flux in photons per pixel of a frame per frame, whatever the scale of the canvas, and its weight, with
+            `canvas.transform` as canvas. Flux is NaN exactly where the weight is 0.
+        """
+
+
+class FinishedPanorama(Protocol):
+    """A panorama that is rendered and stored. It may exceed the memory, so it is read in rows."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+
+    @property
+    def in_colour(self) -> bool:
+        """Whether pixels have red, green and blue."""
+
+    @property
+    def canvas(self) -> Homography:
+        """(3, 3), pixels of the reference plane to pixels of the panorama."""
+
+    @property
+    def white_flux(self) -> float:
+        """Flux that is white in panorama.png, photons per pixel per frame."""
+
+    def rows(self, start: int, stop: int) -> PanoramaRows:
+        """Return flux, weight, standard deviation and saturated pixels of the rows from `start` to `stop - 1`."""
+
+
+class Exporter(Protocol):
+    """Writes the panorama as a file of another format."""
+
+    def export(self, panorama: FinishedPanorama, path: Path) -> None:
+        """Write one file, and nothing else.
+
+        The framework puts it into the run folder with the other results, and records its hash.
+
+        Args:
+            panorama: what to write.
+            path: the file; it does not exist yet.
+        """

@@ -1,0 +1,238 @@
+"""Find out whether the light of a capture changes, measure it for each frame, and store it as light.npz."""
+
+from __future__ import annotations
+
+import warnings
+import zipfile
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import UnivariateSpline
+
+from photonpano.capture import in_light
+from photonpano.contracts.protocols import Source, Trajectory
+from photonpano.corrections.lighting.flicker import LocalFlicker, local_frequency, measure_local_flicker
+from photonpano.corrections.lighting.gains import Gains, seen_cells, solve_gains
+from photonpano.errors import InputError
+from photonpano.execution.context import Context
+from photonpano.geometry import corner_displacements, inverse
+from photonpano.values import Decision, FloatArray, FrameSpan, Homography, Light
+
+LIGHT_DECISION = "light"  # what a record names the decision to divide by the gain of the light
+# Least root mean square of changes of the light, between instants that see the same places, that are divided out.
+LEAST_CHANGE = 0.03
+_LEAST_SIGMAS = 3.0  # least ratio of these changes to their noise
+_PROBES, _PROBE_FRAMES = 128, 16  # spans all over the capture, and frames of each, that are compared to find out
+_MOST_SPANS, _FEWEST_FRAMES = 640, 4  # most spans, and fewest frames of each, with which the light is measured
+_SPAN_PX = 4.0  # the image moves by no more than this in a span
+_HARMONICS = 3  # harmonics of a flicker that are fitted
+_FEWEST_PERIODS, _FEWEST_SPANS = 2.5, 32  # of the capture, for a flicker to be searched for
+_FINER = 16  # oversampling of frequency: steps per 1/T, for a capture of the duration T
+_LINE_SHARE = 0.6  # least share of the changes of the light, without a slow curve, that a flicker explains
+_SMALLEST = 0.01  # least root mean square of a flicker, relative to the light
+_DARKEST = 0.02  # least gain of spans from which slow changes are fitted
+LIGHT_FILE = "light.npz"
+_ARRAYS = ("gain", "waves", "maps", "to_map", "frequency", "std")
+
+
+def find_light(source: Source, trajectory: Trajectory, context: Context) -> Light | None:
+    """Measure the light of a capture along its motion, known to a few pixels; None if it is steady."""
+    n_frames = source.info.n_frames
+    longest = max(1, min(_PROBE_FRAMES, int(_SPAN_PX / max(speed_px(source, trajectory), 1e-9)), n_frames // _PROBES))
+    gains = _gains(source, trajectory, _spread(n_frames, longest), context)
+    return measure_light(source, trajectory, context) if changes(gains) or local_frequency(gains) else None
+
+
+def changes(gains: Gains) -> bool:
+    """Return whether the changes of the light exceed those of steady light, and noise."""
+    return gains.change > max(LEAST_CHANGE, _LEAST_SIGMAS * float(np.median(gains.std)))
+
+
+def measure_light(source: Source, trajectory: Trajectory, context: Context) -> Light:
+    """Measure the gain of each frame of a capture along its motion, known to a few pixels."""
+    n_frames = source.info.n_frames
+    length = min(n_frames, max(_FEWEST_FRAMES, -(-n_frames // _MOST_SPANS)))
+    bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
+    gains = _gains(source, trajectory, [FrameSpan(*pair) for pair in pairwise(bounds)], context)
+    frequency = local_frequency(gains)
+    if frequency and gains.seen.to_cells is not None:
+        return _light_of(measure_local_flicker(gains, frequency), gains.seen.to_cells, gains, n_frames)
+    lengths = np.array([len(span) for span in gains.seen.spans], float)
+    gain, std, frequency = gain_of_frames(gains.seen.instants, gains.gain, gains.std, lengths, n_frames)
+    mean = float(gain.mean())
+    return Light.of_frames(gain / mean, frequency, std / mean)
+
+
+def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray, std: FloatArray) -> Light:
+    """Correct light by the (S,) changes of spans that the panorama rendered in it does not explain, with standard deviations.
+
+    A change is the brightness of a span relative to that of the panorama in this light, minus 1. Squares of the scene are
+    brighter and darker inside, so that a sensor that saturates sees too little of their changes; a panorama has every pixel.
+    Lamps over parts of the scene stay as they are.
+    """
+    if light.has_lamps:
+        return light
+    instants = np.array([span.centre for span in spans])
+    lengths = np.array([len(span) for span in spans], float)
+    gain = np.array([light.mean(span) for span in spans]) * np.maximum(1 + change, 0)
+    found, noise, frequency = gain_of_frames(instants, gain, std, lengths, len(light.gain))
+    if bool(frequency) != bool(light.frequency):
+        return light
+    mean = float(found.mean())
+    return Light.of_frames(found / mean, frequency, noise / mean)
+
+
+def _light_of(flicker: LocalFlicker, to_map: Homography, gains: Gains, n_frames: int) -> Light:
+    """Return the light of each frame, which flickers differently at each place."""
+    frames = np.arange(n_frames)
+    slow, std = (np.interp(frames, gains.seen.instants, each) for each in (flicker.slow, gains.std))
+    phase = 2 * np.pi * flicker.frequency * frames
+    maps = np.stack([flicker.cosine, flicker.sine])
+    return Light(slow / slow.mean(), np.stack([np.cos(phase), np.sin(phase)]), maps, to_map, flicker.frequency, std)
+
+
+def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:
+    """Return what was found, for the record: the depth of the changes, and the frequency of a flicker."""
+    low, high = (float(np.quantile(light.gain, each)) for each in (0.01, 0.99))
+    depth = (high - low) / (high + low)
+    where = f"the light of the scene changes between {low:.2f} and {high:.2f} of its mean"
+    if light.has_lamps:
+        depth = float(np.quantile(np.hypot(*light.maps), 0.9))
+        where = f"lamps over parts of the scene, each at its own phase, flicker by up to {depth:.2f} of the mean light"
+    if light.frequency:
+        period = f"with a period of {1 / light.frequency:.4g} frames"
+        where += f", {period}" if frame_rate_hz is None else f", at {light.frequency * frame_rate_hz:.2f} Hz"
+    return Decision(LIGHT_DECISION, round(depth, 3), where)
+
+
+def _gains(source: Source, trajectory: Trajectory, spans: list[FrameSpan], context: Context) -> Gains:
+    return solve_gains(seen_cells(source, trajectory, spans, context))
+
+
+def _spread(n_frames: int, length: int) -> list[FrameSpan]:
+    """Return spans all over the capture, at uneven distances, so that no flicker has their period."""
+    even = np.linspace(0, n_frames - length, min(_PROBES, n_frames // length))
+    jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(even)) * max(n_frames / _PROBES - length, 0)
+    starts = np.clip(even + jitter, 0, n_frames - length).astype(int)
+    return [FrameSpan(start, start + length) for start in np.unique(starts).tolist()]
+
+
+def speed_px(source: Source, trajectory: Trajectory) -> float:
+    """Return the usual speed of the image, in px per frame."""
+    instants = np.linspace(0, source.info.n_frames - 1, 65)
+    steps = inverse(trajectory.at(instants[:-1])) @ trajectory.at(instants[1:])
+    moved = np.median(corner_displacements(steps, np.eye(3), source.info.frame_shape).max(axis=-1))
+    return float(moved) / max(float(instants[1]), 1e-9)
+
+
+def flicker_frequency(instants: FloatArray, gain: FloatArray) -> float:
+    """Return the frequency of the strongest line in the spectrum of a series, in cycles per frame; 0 if none stands out.
+
+    The instants (S,) are evenly spaced, in frames; `gain` is (S,), or (S, N) for several series of one frequency.
+    """
+    n = len(instants)
+    if n < _FEWEST_SPANS:
+        return 0.0
+    spacing = (instants[-1] - instants[0]) / (n - 1)
+    series = np.asarray(gain, float).reshape(n, -1)
+    slow = np.linspace(-1, 1, n)[:, None] ** np.arange(4)
+    rest = series - slow @ np.linalg.lstsq(slow, series)[0]
+    power = (np.abs(np.fft.rfft(rest * np.hanning(n)[:, None], _FINER * n, axis=0)) ** 2).sum(axis=1)
+    first = int(_FEWEST_PERIODS * _FINER)
+    peak = first + int(power[first:].argmax())
+    frequencies = (peak + np.linspace(-1, 1, 41)) / (_FINER * n * spacing)
+    left = [_residual(instants, rest, slow, each) for each in frequencies]
+    frequency = float(frequencies[int(np.argmin(left))])
+    total = float((rest**2).sum())
+    explained = total - min(left)
+    if explained < _LINE_SHARE * total or explained / rest.size < _SMALLEST**2:
+        return 0.0
+    return frequency
+
+
+def gain_of_frames(
+    instants: FloatArray, gain: FloatArray, std: FloatArray, lengths: FloatArray, n_frames: int
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the gain of each frame, (T,), its standard deviation, (T,), and the frequency of its flicker, 0 if there is none.
+
+    Given are the (S,) centres of spans, in frames, their mean gains, the standard deviations of the logarithms of these, and
+    the frames of each span, over which a flicker is averaged.
+    """
+    frames = np.arange(n_frames, dtype=float)
+    at = np.clip(frames, instants[0], instants[-1])
+    frequency = flicker_frequency(instants, gain)
+    if not frequency:
+        logarithm = _smooth(instants, np.log(np.maximum(gain, 1e-3)), std)(at)
+        return np.exp(logarithm), np.interp(frames, instants, std), 0.0
+    # A slow change multiplies the flicker: both are fitted in turn.
+    slow = np.ones(len(instants))
+    for _ in range(3):
+        waves = _waves(instants, frequency, lengths) * slow[:, None]
+        coefficients = np.linalg.lstsq(waves, gain)[0]
+        model = _waves(instants, frequency, lengths) @ coefficients
+        known = model > _DARKEST
+        ratio = np.log(np.maximum(gain[known], 1e-3) / model[known])
+        curve = _smooth(instants[known], ratio, std[known] / np.minimum(1, model[known]))
+        slow = np.exp(curve(np.clip(instants, instants[known][0], instants[known][-1])))
+    found = _waves(frames, frequency, np.ones(n_frames)) @ coefficients
+    found *= np.exp(curve(np.clip(frames, instants[known][0], instants[known][-1])))
+    return np.maximum(found, 0), np.interp(frames, instants, std) / np.sqrt(len(instants) / 8), frequency
+
+
+def _waves(instants: FloatArray, frequency: float, lengths: FloatArray) -> FloatArray:
+    """Return a constant and the harmonics of a frequency, averaged over spans: (S, 1 + 2 * 3)."""
+    columns = [np.ones(len(instants))]
+    for harmonic in range(1, _HARMONICS + 1):
+        turns = harmonic * frequency * instants
+        averaged = np.sinc(harmonic * frequency * lengths)
+        if harmonic > 1 and harmonic * frequency * float(np.median(lengths)) > 0.5:
+            averaged = np.zeros_like(averaged)
+        columns += [averaged * np.cos(2 * np.pi * turns), averaged * np.sin(2 * np.pi * turns)]
+    return np.stack(columns, axis=1)
+
+
+def _residual(instants: FloatArray, series: FloatArray, slow: FloatArray, frequency: float) -> float:
+    """Return the residual sum of squares of a fit of a wave of one frequency and a slow curve."""
+    turns = 2 * np.pi * frequency * instants[:, None]
+    columns = np.concatenate([slow, np.cos(turns), np.sin(turns)], axis=1)
+    return float(((series - columns @ np.linalg.lstsq(columns, series)[0]) ** 2).sum())
+
+
+def _smooth(instants: FloatArray, values: FloatArray, std: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the smoothest cubic curve that fits values within their noise; of fewer than four values, lines between them."""
+    if len(values) < 4:
+        return lambda at: np.interp(at, instants, values)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that a closer fit was not found in its limit of steps
+        return UnivariateSpline(instants, values, w=1 / np.maximum(std, 1e-4), k=3, s=len(values))
+
+
+def write_light(folder: Path, light: Light) -> None:
+    """Write light.npz into a folder."""
+    arrays: dict[str, Any] = {name: np.asarray(getattr(light, name)) for name in _ARRAYS}
+    np.savez(folder / LIGHT_FILE, **arrays)
+
+
+def in_light_of(source: Source, folder: Path) -> Source:
+    """Return a capture in the light that a run folder holds; as it is, if the run found steady light.
+
+    Raises:
+        InputError: light.npz is damaged, or of a capture with another number of frames.
+    """
+    path = folder / LIGHT_FILE
+    if not path.exists():
+        return source
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays: dict[str, Any] = {name: archive[name] for name in _ARRAYS}
+        light = Light(**{**arrays, "frequency": float(arrays["frequency"])})
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: cannot be read as the light of a run ({error}); run again") from error
+    if len(light.gain) != source.info.n_frames:
+        raise InputError(
+            f"{path} is the light of {len(light.gain)} frames, but the capture has {source.info.n_frames}; run again"
+        )
+    return in_light(source, light)

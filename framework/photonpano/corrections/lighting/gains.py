@@ -1,0 +1,243 @@
+"""Compare what successive frames see of the same places: the gain of the light, apart from the brightness of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
+from photonpano.execution.context import Context
+from photonpano.geometry import Canvas, canvas_around, canvas_of, covered_by, depths
+from photonpano.merging import Chunk, accumulate
+from photonpano.merging.accumulate import weights_of
+from photonpano.robust import huber_weights, robust_std
+from photonpano.values import FloatArray, FrameSpan, Homography
+
+_CELLS = 24  # squares of the scene along the shorter side of a frame
+_LARGEST_PX = 32  # largest side of a square, px
+# Standard deviation of the Gaussian that weights the pixels of a square, in sides: sums must not depend on the sub-pixel
+# position of a frame.
+_BLUR = 0.75
+# Of frames before the reference plane, relative to its own frame: squares are at most four times as wide there.
+_LEAST_DEPTH = 0.25
+# Factor by which the Gaussian lowers the noise of a square; errors of neighbours are correlated instead.
+SMOOTHING = 2 * _BLUR * np.sqrt(np.pi)
+_COVERED = 0.999  # least covered share of a square: those at the border of a frame are left out
+_MOST_CELLS = 16_000  # squares of the whole scene: they are larger if the motion is long
+# Relative error of a square beside photon noise: frames sample its structure at different sub-pixel positions.
+STRUCTURE = 0.1
+_ROUNDS = 4  # of iteratively reweighted least squares
+_OUTLIER = 3.0  # standard deviations from which a square is down-weighted (Huber), such as one that an object crosses
+_DARKEST = -7.0  # least logarithm of a gain
+# Weight of the prior of steady light, relative to that of the photons: it matters where frames share no place.
+_WEAK = 1e-6
+
+_WIDEST = np.pi / 2  # widest field of view, in radians, of which squares lie on a plane
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenCells:
+    """Photons of squares of the scene in spans of frames: N observations of C squares in S spans."""
+
+    spans: tuple[FrameSpan, ...]
+    cells: NDArray[np.intp]  # (N,) index of the square, below `n_cells`
+    times: NDArray[np.intp]  # (N,) index of the span
+    photons: FloatArray  # (N,) photons, those that a saturated pixel missed included
+    exposure: FloatArray  # (N,) pixels times frames
+    shape: tuple[int, int]  # (h, w) rows and columns of squares, C in all
+    # (3, 3), pixels of the reference plane to squares: integers are their middles. None if they lie on a sphere.
+    to_cells: Homography | None
+
+    @property
+    def n_cells(self) -> int:
+        """C."""
+        return self.shape[0] * self.shape[1]
+
+    @property
+    def instants(self) -> FloatArray:
+        """(S,) centres of the spans."""
+        return np.array([span.centre for span in self.spans])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gains:
+    """The light of spans of frames, up to a common factor."""
+
+    seen: SeenCells
+    logarithm: FloatArray  # (S,) of the gain, 0 on average
+    std: FloatArray  # (S,) its standard deviation
+    brightness: FloatArray  # (C,) logarithm of the flux of each square in light of gain 1; NaN for squares that were not seen
+    change: float  # root mean square of the change of the light between spans that see the same places, noise subtracted
+    shifted: FloatArray  # (N,) logarithm of what errors of the motion change in each observation
+
+    @property
+    def gain(self) -> FloatArray:
+        """(S,) gain of each span, 1 on average."""
+        gain = np.exp(self.logarithm)
+        return np.asarray(gain / gain.mean())
+
+
+def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan], context: Context) -> SeenCells:
+    """Sum the photons of squares of the scene in spans of frames, along a motion known to a few pixels.
+
+    The image must hardly move in a span; spans that a plane can hardly show are left out.
+    """
+    shape = source.info.frame_shape
+    motions = trajectory.at([span.centre for span in spans])
+    if camera_of_motion(trajectory) is None:
+        # A first motion may be wrong somewhere. Frames far to the side of the plane would need a canvas without end.
+        near = depths(motions, shape).min(axis=1) > _LEAST_DEPTH
+        spans, motions = [span for span, is_near in zip(spans, near, strict=True) if is_near], motions[near]
+    half = int(np.clip(min(shape) // _CELLS, 2, _LARGEST_PX)) // 2
+    canvas = _canvas(trajectory, motions, shape, 1 / half)
+    while canvas.height * canvas.width > 4 * _MOST_CELLS:
+        half *= 2
+        canvas = _canvas(trajectory, motions, shape, 1 / half)
+    n_rows, n_columns = canvas.height // 2, canvas.width // 2
+    covered = _COVERED * _least_weight(source, 2 * half)
+
+    seen = partial(_seen, source, canvas, half, covered)
+    parts = list(context.in_order(seen, list(zip(spans, motions, strict=True))))
+    cells = np.concatenate([part[0] for part in parts])
+    times = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
+    return SeenCells(
+        tuple(spans),
+        cells,
+        times,
+        np.concatenate([part[1] for part in parts]),
+        np.concatenate([part[2] for part in parts]),
+        (n_rows, n_columns),
+        np.array([[0.5, 0, -0.5], [0, 0.5, -0.5], [0, 0, 1]]) @ canvas.transform if canvas.planar else None,
+    )
+
+
+def _least_weight(source: Source, side: int) -> float:
+    """Return the least weight of a square of `side` px: masked pixels, and those of faint colours, weigh less."""
+    weights = weights_of(source)
+    if weights is None:
+        return 1.0
+    weight, valid = (cv2.blur(each, (side, side)) for each in (weights, source.valid.astype(np.float32)))
+    inside = valid >= min(0.5, float(valid.max()))
+    return float((weight[inside] / valid[inside]).min() * source.valid.mean())
+
+
+def _seen(
+    source: Source, canvas: Canvas, half: int, covered: float, place: tuple[FrameSpan, Homography]
+) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Return the squares that a span sees, the photons in them, and their exposures in frames and pixels.
+
+    A square has the side of two pixels of the canvas, each of which has the side of `half` pixels of a frame; it is seen in
+    the share `covered` of the frames at least. `place` is the span, and where its frames lie.
+    """
+    span, homography = place
+    summed = accumulate(source, [Chunk(span, homography)], canvas, canvas.shape)
+    n_rows, n_columns = canvas.height // 2, canvas.width // 2
+    counts, weight = (
+        cv2.GaussianBlur(image, (0, 0), 2 * _BLUR)[1::2, 1::2][:n_rows, :n_columns]
+        for image in (np.maximum(summed.counts, 0), summed.weight)
+    )
+    index = np.flatnonzero(weight > covered * len(span))
+    frames = np.asarray(weight.ravel()[index], np.float32)
+    exposure = 4 * half**2 * frames
+    flux = source.response.flux(np.asarray(counts.ravel()[index] / frames, np.float32), exposure)
+    return index, np.asarray(np.maximum(flux, 0) * exposure, np.float64), exposure.astype(np.float64)
+
+
+def _canvas(trajectory: Trajectory, motions: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
+    """Return a canvas that holds all frames: a sphere if the camera turns far."""
+    camera = camera_of_motion(trajectory)
+    if camera is not None:
+        covered = covered_by(camera.rotations(motions), camera, frame_shape)
+        if covered.field_of_view > _WIDEST:
+            return canvas_around(covered, camera, scale, "spherical")
+    return canvas_of(motions, frame_shape, scale)
+
+
+def solve_gains(seen: SeenCells) -> Gains:
+    """Solve for the gain of each span and the brightness of each square, from all that saw the same places.
+
+    A square c in a span t sends `exposure exp(s_c + l_t + g_c d_t)` photons, where d_t is the error of the motion, and g_c the
+    gradient of s: a tremor makes squares beside an edge flicker. The weight of a square is that of photon noise together with
+    what its structure adds. Squares and light are found by iterated least squares, the squares eliminated, and the errors of
+    the motion between these steps.
+    """
+    n_times = len(seen.spans)
+    photons, exposure = (np.bincount(seen.cells, each, seen.n_cells) for each in (seen.photons, seen.exposure))
+    brightness, light = np.log((photons + 0.5) / np.maximum(exposure, 1)), np.zeros(n_times)
+    shifted = np.zeros(len(seen.photons))
+    robust = np.ones(len(seen.photons))
+    for _ in range(_ROUNDS):
+        expected = seen.exposure * np.exp(brightness[seen.cells] + light[seen.times] + shifted)
+        step = (seen.photons - expected) / np.maximum(expected, 1e-12)
+        weight = robust / (1 / np.maximum(expected, 1e-12) + STRUCTURE**2)
+        change, of_cells, covariance, shared = _step(seen, weight, np.clip(step, -2, 2))
+        light = np.clip(light + change, _DARKEST, -_DARKEST)
+        brightness = brightness + of_cells
+        light -= light.mean()
+        left = step - change[seen.times] - of_cells[seen.cells]
+        shifted += _shifted(seen, brightness, weight, left)
+        left *= np.sqrt(weight / np.maximum(robust, 1e-9))
+        scale = max(robust_std(left), 1e-9)
+        # Smoothed squares share photons: their residuals are small, and correlated.
+        noise = scale * SMOOTHING
+        robust = huber_weights(left, _OUTLIER * scale)
+    difference = light[:, None] - light
+    covariance *= noise**2
+    expected = np.diag(covariance)[:, None] + np.diag(covariance) - 2 * covariance
+    off = shared * (1 - np.eye(n_times))
+    squares = float((off * (difference**2 - expected)).sum() / max(off.sum(), 1e-12))
+    unseen = np.bincount(seen.cells, minlength=seen.n_cells) == 0
+    return Gains(
+        seen,
+        light,
+        np.sqrt(np.diag(covariance)),
+        np.where(unseen, np.nan, brightness),
+        float(np.sqrt(max(squares, 0))),
+        shifted,
+    )
+
+
+def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: FloatArray) -> FloatArray:
+    """Return the part of residuals that a shift of each span explains: (N,)."""
+    unseen = np.bincount(seen.cells, minlength=seen.n_cells) == 0
+    image = np.where(unseen, np.nan, brightness).reshape(seen.shape)
+    gradient = np.stack([np.nan_to_num(each).ravel() for each in np.gradient(image)])[:, seen.cells]
+    columns = np.concatenate([gradient, np.ones((1, len(left)))])
+    normal, right = equations_of_groups(seen.times, len(seen.spans), columns, weight, left)
+    shift = np.linalg.solve(normal + np.eye(3), right[..., None])[:, :2, 0]
+    return np.asarray((shift[seen.times].T * gradient).sum(axis=0))
+
+
+def equations_of_groups(
+    groups: NDArray[np.intp], number: int, columns: FloatArray, weight: FloatArray, target: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the least-squares equations of each group of observations, for K columns (K, N): (G, K, K) and (G, K)."""
+    normal = np.array([[np.bincount(groups, weight * one * other, number) for other in columns] for one in columns])
+    right = np.array([np.bincount(groups, weight * one * target, number) for one in columns])
+    return np.moveaxis(normal, -1, 0), right.T
+
+
+def _step(seen: SeenCells, weight: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Solve `step = s_c + l_t` for changes of the light (S,) and of the squares (C,).
+
+    Also return the covariance of the light, (S, S), and how much two spans saw of the same squares, (S, S), in weights.
+    """
+    n_times = len(seen.spans)
+    matrix = np.zeros((seen.n_cells, n_times))
+    matrix[seen.cells, seen.times] = weight
+    of_cell = np.maximum(matrix.sum(axis=1), 1e-12)
+    right_cells = np.bincount(seen.cells, weight * step, seen.n_cells)
+    right_times = np.bincount(seen.times, weight * step, n_times)
+    shared = matrix.T @ (matrix / of_cell[:, None])
+    normal = np.diag(matrix.sum(axis=0)) - shared
+    normal[np.diag_indices(n_times)] += _WEAK * max(float(weight.sum()) / n_times, 1e-12)
+    covariance = np.linalg.inv(normal)
+    light = covariance @ (right_times - matrix.T @ (right_cells / of_cell))
+    light -= light.mean()
+    centred = np.eye(n_times) - 1 / n_times
+    return light, (right_cells - matrix @ light) / of_cell, centred @ covariance @ centred, shared

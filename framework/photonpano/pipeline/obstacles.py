@@ -1,0 +1,167 @@
+"""Find what makes a capture hard to locate: another order of pixels, repeated frames, parts that stand still, repetitions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from photonpano.capture import Capture, capture_of
+from photonpano.contracts.protocols import Source
+from photonpano.errors import InputError, LocationError
+from photonpano.execution.context import Context
+from photonpano.locating.phase import correlation_peaks
+from photonpano.merging.accumulate import weights_of
+from photonpano.motion.timeline import Timeline
+from photonpano.reading import other_order, sampled_spans
+from photonpano.values import BoolArray, Decision, FrameSpan, true_spans
+
+_PLACES, _FRAMES = 5, 256  # spans all over the capture, and most frames of each
+_ALIKE = 0.7  # an image repeats if another shift fits at least this well, as a share of the best one
+_DIP = 0.5  # between two peaks, the correlation falls below this share of the highest one
+_AGREE = 0.2  # largest difference of the periods of spans from their median, relative to it
+_SURE = 6.0  # standard deviations from which the best correlation is not chance
+_MOST_PEAKS = 200  # most peaks that are compared
+_REACH = 1 / 3  # largest shift that is looked at, as a share of the frame
+_FILTER_BLUR_PX = 1.0  # standard deviation of the Gaussian that blurs a colour filter array
+_STANDING = 0.3  # share of the frame from which what stands still is named
+_BLOCK_FRAMES = 256  # frames that are compared at a time
+_ROW_STRIDE = 16  # frames are compared on every 16th row first
+# Frames that are repeated differ from the frame before by this many newly lit pixels, and as many that went dark: dark frames
+# are alike by chance, and so are saturated ones.
+_FEWEST_NEW = 20
+
+
+def order_warning(source: Source) -> str | None:
+    """Return a warning if sampled frames of a packed source show another order of pixels in their bytes; None if not.
+
+    Most formats fix the order, and a sensor may arrange its pixels in its own way: so this is no error.
+    """
+    capture, info = capture_of(source), source.info
+    if not capture.is_packed:
+        return None
+    spans = sampled_spans(info.n_frames, info.height * -(-info.width // 8))
+    other = other_order([capture.packed(span) for span in spans])
+    if other is None:
+        return None
+    return f"the pixels of the frames seem to be in another order than they are read in: {other}; check the source and its keys"
+
+
+@contextmanager
+def naming_obstacles(source: Source, decisions: Sequence[Decision]) -> Iterator[None]:
+    """Append the sentences of `obstacles` to the `LocationError` of a block."""
+    try:
+        yield
+    except LocationError as error:
+        found = obstacles(source, decisions)
+        error.args = ("\n".join([str(error), *found]),)
+        raise
+
+
+def obstacles(source: Source, decisions: Sequence[Decision]) -> list[str]:
+    """Return sentences about what makes a capture hard to locate; `decisions` hold the share of the frame that stands still."""
+    return [*_standing(decisions), *_repeating(source)]
+
+
+def _standing(decisions: Sequence[Decision]) -> Iterator[str]:
+    share = next((float(each.value) for each in decisions if each.what == "standing_share"), 0.0)
+    if share >= _STANDING:
+        yield (
+            f"{share:.0%} of the frame stands still while the rest moves, as a window or dirt in front of the sensor does: "
+            "mask it under corrections, or cut it off."
+        )
+
+
+def _repeating(source: Source) -> Iterator[str]:
+    spans = source.info.spread(_PLACES, min(_FRAMES, max(2, source.info.n_frames // _PLACES - 1)))
+    found = [each for span in spans if (each := _repetition_within(source, span)) is not None]
+    period = float(np.median(found)) if found else 0.0
+    if 2 * sum(abs(each - period) < _AGREE * period for each in found) > len(spans):
+        yield (
+            f"The image repeats every {period:.0f} px, so that pairs fit at several places: "
+            "use shorter groups, between which it moves by less than half of that."
+        )
+
+
+def _repetition_within(source: Source, span: FrameSpan) -> float | None:
+    middle = (span.start + span.stop) // 2
+    if middle == span.start:
+        return None
+    parts = FrameSpan(span.start, middle), FrameSpan(middle, span.stop)
+    return repetition_px(*(_sum(source, part) for part in parts))
+
+
+def _sum(source: Source, span: FrameSpan) -> NDArray[Any]:
+    """Sum the frames of a span; colours are made alike, and blurred, so that their filter array is not seen."""
+    capture, weights = capture_of(source), weights_of(source)
+    if capture.colour is None or weights is None:
+        return np.where(source.valid, source.counts(span), 0)
+    lit, near = (
+        ndimage.gaussian_filter(image, _FILTER_BLUR_PX) for image in (capture.corrected_counts(span) * weights, weights)
+    )
+    return np.asarray(lit / np.maximum(near, 1e-6))
+
+
+def repetition_px(first: NDArray[Any], second: NDArray[Any]) -> float | None:
+    """Return the distance after which an image repeats, from two sums of frames (H, W); None if it does not.
+
+    Photon noise plays no part, since the two sums do not share it.
+    """
+    height, width = first.shape
+    padded = 2 * height, 2 * width
+    window = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1])
+    views = [window * (image - np.average(image, weights=window)) for image in (first, second)]
+    spectra = [fft.rfft2(view, padded) for view in views]
+    alike = fft.irfft2(spectra[1] * spectra[0].conj(), padded)
+    if not alike.max() > _SURE * np.sqrt(np.sum(views[0] ** 2) * np.sum(views[1] ** 2) * np.sum(window**4)) / np.sum(window**2):
+        return None
+    overlap = fft.irfft2(np.abs(fft.rfft2(window, padded)) ** 2, padded)
+    down, across = (np.minimum(np.arange(2 * size), 2 * size - np.arange(2 * size)) for size in (height, width))
+    near = np.logical_and.outer(down <= _REACH * height, across <= _REACH * width)
+    surface = np.divide(alike, overlap, out=np.zeros(padded), where=near)
+    shifts, _ = correlation_peaks(surface, _ALIKE, _MOST_PEAKS)
+    between = shifts[0] + np.linspace(0, 1, 33)[:, np.newaxis, np.newaxis] * (shifts[1:] - shifts[0])
+    along = ndimage.map_coordinates(surface, np.moveaxis(between, -1, 0)[::-1], order=1, mode="grid-wrap")
+    apart = np.hypot(*(shifts[1:] - shifts[0]).T)[along.min(axis=0, initial=np.inf) < _DIP * surface.max()]
+    return float(apart.min()) if apart.size else None
+
+
+def timeline_of(source: Source, context: Context) -> Timeline:
+    """Return the timeline of a capture, in which repeated frames take no time; raise an `InputError` if all are copies.
+
+    Only packed frames are compared: others would have to be read twice.
+    """
+    capture, n_frames = capture_of(source), source.info.n_frames
+    if not capture.is_packed:
+        return Timeline.regular(n_frames)
+    spans = [FrameSpan(max(0, span.start - 1), span.stop) for span in source.info.span.blocks(_BLOCK_FRAMES)]
+    same = np.zeros(n_frames, dtype=bool)
+    for span, found in zip(spans, context.in_order(partial(_same_as_before, capture), spans), strict=True):
+        same[span.start + 1 : span.stop] = found
+    if n_frames > 1 and same[1:].all():
+        raise InputError(f"all {n_frames} frames are copies of the first one; check that the camera went on recording")
+    for run in true_spans(same):
+        original = run.start - 1
+        if original and not _differ(*capture.packed(FrameSpan(original - 1, original + 1))):
+            same[run.start : run.stop] = False
+    return Timeline.with_repeats(same)
+
+
+def _same_as_before(capture: Capture, span: FrameSpan) -> BoolArray:
+    """Return whether each frame of a span but the first equals the one before it."""
+    packed = capture.packed(span)
+    some = packed[:, ::_ROW_STRIDE]
+    same = (some[1:] == some[:-1]).all(axis=(1, 2))
+    for index in np.flatnonzero(same):
+        same[index] = np.array_equal(packed[index], packed[index + 1])
+    return np.asarray(same)
+
+
+def _differ(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> bool:
+    """Return whether photons make two packed frames differ, so that others that are equal are copies."""
+    return all(int(np.unpackbits(new).sum()) >= _FEWEST_NEW for new in (first & ~second, second & ~first))

@@ -1,0 +1,57 @@
+"""What plugins are made of: the records that offer components, their configs, and what components are told."""
+
+from photonpano.plugins.contributions.configs import Config, SpecLocation, SpecPath
+from photonpano.plugins.contributions.contexts import ExecutorContext, SourceContext, StageContext
+from photonpano.plugins.contributions.kinds import KINDS, PROJECT, Kind, hookimpl, hookspec
+from photonpano.plugins.contributions.records import (
+    API_VERSION,
+    Contribution,
+    ExecutorContribution,
+    ExporterContribution,
+    InterpolatorContribution,
+    LocatorContribution,
+    MergerContribution,
+    PartOfCapture,
+    PoseEstimatorContribution,
+    Recognised,
+    RefinerContribution,
+    RendererContribution,
+    Requirement,
+    ResamplerContribution,
+    SourceContribution,
+    StageContribution,
+    WriteFrames,
+    install_command,
+)
+
+__all__ = [
+    "API_VERSION",
+    "KINDS",
+    "PROJECT",
+    "Config",
+    "Contribution",
+    "ExecutorContext",
+    "ExecutorContribution",
+    "ExporterContribution",
+    "InterpolatorContribution",
+    "Kind",
+    "LocatorContribution",
+    "MergerContribution",
+    "PartOfCapture",
+    "PoseEstimatorContribution",
+    "Recognised",
+    "RefinerContribution",
+    "RendererContribution",
+    "Requirement",
+    "ResamplerContribution",
+    "SourceContext",
+    "SourceContribution",
+    "SpecLocation",
+    "SpecPath",
+    "StageContext",
+    "StageContribution",
+    "WriteFrames",
+    "hookimpl",
+    "hookspec",
+    "install_command",
+]

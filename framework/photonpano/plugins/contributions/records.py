@@ -1,0 +1,336 @@
+"""The frozen records with which a plugin offers its components."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    BaseModel,
+    Field,
+    field_validator,
+)
+
+from photonpano.contracts.protocols import (
+    Arrived,
+    Exporter,
+    Interpolator,
+    Locator,
+    Merger,
+    Piped,
+    PoseEstimator,
+    Refiner,
+    Renderer,
+    Resampler,
+    Source,
+)
+from photonpano.execution import Executor
+from photonpano.plugins.contributions.configs import Config
+from photonpano.plugins.contributions.contexts import ExecutorContext, SourceContext, StageContext
+from photonpano.plugins.contributions.kinds import KINDS, Kind
+from photonpano.text import install_line
+from photonpano.values import StreamInfo
+
+API_VERSION = 1
+"""The version of the contract with plugins: hooks, contributions, protocols. It changes only when plugins must change."""
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """A library that a component imports when it is built.
+
+    Attributes:
+        module: the name to import, such as `kornia`.
+        install: what to pass to `pip install`, such as `photonpano[kornia]`.
+    """
+
+    module: str
+    install: str
+
+
+def install_command(requirements: Iterable[Requirement]) -> str:
+    """Return the line that installs libraries, from an index and from a checkout of photonpano."""
+    return install_line(each.install for each in requirements)
+
+
+def no_problems(*_: Any) -> Sequence[str]:
+    """Find nothing: the default `check` of a contribution."""
+    return ()
+
+
+_KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+
+_SUFFIX = re.compile(r"(\.[a-z0-9]+)+")
+_TAKEN_SUFFIXES = (".tiff", ".png")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contribution:
+    """One component that a plugin offers. Plugins yield the subclasses, one for each kind.
+
+    Attributes:
+        name: its name in specs, in kebab-case.
+        summary: one line for lists.
+        config: the closed, frozen model of the keys under `with`.
+        build: makes the component from an instance of `config` and the context; heavy libraries are imported here, not before.
+        check: finds problems of a config; see the subclasses.
+        requires: libraries that may be missing, and how to install them.
+        api_version: the version of the contract that the plugin was made for. A published plugin writes the number, so that a
+            photonpano with another contract refuses it with a clear message.
+    """
+
+    kind: ClassVar[str]
+
+    name: str
+    summary: str
+    config: type[Config]
+    build: Callable[[Any, Any], Any]
+    check: Callable[..., Sequence[str]] = no_problems
+    requires: tuple[Requirement, ...] = ()
+    api_version: int = API_VERSION
+
+    def __init_subclass__(cls, kind: str = "", **row: Any) -> None:
+        super().__init_subclass__()
+        if kind:
+            cls.kind = kind
+            KINDS[kind] = Kind(kind, contribution=cls, **row)
+
+    def __post_init__(self) -> None:
+        if not _KEBAB.fullmatch(self.name):
+            raise ValueError(f"the name of a contribution is kebab-case, such as 'my-{self.kind}'; got {self.name!r}")
+        if not self.summary or "\n" in self.summary:
+            raise ValueError(f"{self.name}: the summary is one line, got {self.summary!r}")
+        if not issubclass(self.config, BaseModel):
+            raise TypeError(f"{self.name}: config is a pydantic model class, got {self.config!r}")
+        if not isinstance(self.api_version, int):
+            raise TypeError(f"{self.name}: api_version is a whole number, such as {API_VERSION}; got {self.api_version!r}")
+        settings = self.config.model_config
+        if settings.get("extra") != "forbid" or not settings.get("frozen"):
+            raise ValueError(
+                f"{self.name}: the config must be closed and frozen; derive {self.config.__name__} from photonpano.Config"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Recognised:
+    """The answer of a source that recognises a capture.
+
+    Attributes:
+        keys: the keys that open it, the path among them, as a spec would have them under `with`.
+        because: the reason, as a clause after "it was recognised as ...: ", such as "8,388,608 bytes a file".
+    """
+
+    keys: Mapping[str, Any]
+    because: str
+
+
+class PartOfCapture(Config):
+    """The key of every source that the framework applies: which part of the capture to read."""
+
+    frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = Field(
+        None, description="the part of the capture to read, [start, stop]: frames start to stop - 1; all by default"
+    )
+
+    @field_validator("frames", mode="after")
+    @classmethod
+    def _in_order(cls, frames: tuple[int, int] | None) -> tuple[int, int] | None:
+        if frames is not None and frames[0] >= frames[1]:
+            raise ValueError(f"expected [start, stop] with start < stop, got {list(frames)}")
+        return frames
+
+
+def _not_ours(_: Path) -> None:
+    """Recognise nothing: the default `recognise` of a source."""
+
+
+class WriteFrames(Protocol):
+    """Writes binary frames as a capture."""
+
+    def __call__(self, folder: Path, info: StreamInfo, frames: Iterable[NDArray[np.uint8]], *, compressed: bool) -> None:
+        """Write a capture into an empty folder, which gets its name once this returns.
+
+        Args:
+            folder: the folder.
+            info: frames, size and rate.
+            frames: all packed frames in order, some at a time: (n, height, ceil(width / 8)), as from `PackedSource.packed`.
+            compressed: whether to compress them.
+        """
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceContribution(Contribution, kind="source", section="source"):
+    """Offers a source.
+
+    The config gets one more key, `frames`: see `PartOfCapture`. The framework reads that part of what `build` returns.
+
+    Attributes:
+        check: finds problems of a config without reading the capture, such as a missing file.
+        recognise: returns the keys of a capture if it is one of this source, for specs that leave the choice to `auto`. It
+            reads names, sizes and a few megabytes at most, imports nothing heavy, and raises nothing.
+        write: writes binary frames as a capture that this source reads, for `photonpano convert` to a name with one of its
+            `suffixes`; None if it cannot.
+        recognises_urls: whether `recognise` also gets a `photonpano.Url`, which a path of the type `SpecLocation` may be.
+        suffixes: the endings of its files, in small letters, such as ".npy"; empty for any. If no source recognises a path,
+            the message has the problems of the sources with its ending.
+        arrived: opens what is there of a capture that is still being written, or says that it comes from a pipe, for
+            `photonpano run --follow`; None if this source cannot. It is called some fifty times a second. A file that is not
+            there yet is no error, one that will never be a capture is an `InputError`.
+    """
+
+    build: Callable[[Any, SourceContext], Source]
+    check: Callable[[Any], Sequence[str]] = no_problems
+    recognise: Callable[[Any], Recognised | None] = _not_ours
+    write: WriteFrames | None = None
+    recognises_urls: bool = False
+    suffixes: tuple[str, ...] = ()
+    arrived: Callable[[Any], Arrived | Piped] | None = None
+
+    def __post_init__(self) -> None:
+        Contribution.__post_init__(self)
+        if issubclass(self.config, PartOfCapture):
+            return
+        if "frames" in self.config.model_fields:
+            raise ValueError(f"{self.name}: the key 'frames' of a source is the framework's; give yours another name")
+        own = {"__module__": self.config.__module__, "__doc__": self.config.__doc__}
+        object.__setattr__(self, "config", type(self.config.__name__, (PartOfCapture, self.config), own))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageContribution(Contribution):
+    """Offers a component that is built for a capture: of a stage of the levels, a refiner, a renderer, or an exporter.
+
+    Attributes:
+        check: finds problems of a config with a capture, from its description; reads no data, imports nothing heavy.
+    """
+
+    check: Callable[[Any, StreamInfo], Sequence[str]] = no_problems
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResamplerContribution(StageContribution, kind="resampler", section="resample", default="midpoint", of_level=True):
+    """Offers a resampler."""
+
+    build: Callable[[Any, StageContext], Resampler]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MergerContribution(StageContribution, kind="merger", section="merge", default="photon-mle", of_level=True):
+    """Offers a merger.
+
+    Attributes:
+        accepts_corrected_sums: whether it merges corrected sums. The framework then divides the sums of frames by
+            a vignette that it finds.
+    """
+
+    build: Callable[[Any, StageContext], Merger]
+    accepts_corrected_sums: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocatorContribution(StageContribution, kind="locator", section="locate", default="direct", of_level=True):
+    """Offers a locator."""
+
+    build: Callable[[Any, StageContext], Locator]
+
+
+@dataclass(frozen=True, kw_only=True)
+class InterpolatorContribution(
+    StageContribution, kind="interpolator", section="interpolate", default="smoothing-spline", of_level=True
+):
+    """Offers an interpolator."""
+
+    build: Callable[[Any, StageContext], Interpolator]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinerContribution(
+    StageContribution,
+    kind="refiner",
+    section="refine",
+    default="short-spans",
+    several=True,
+    meaning="the refiners that correct the motion after the last level, in order: one or a list, each a name or {use, with}",
+):
+    """Offers a refiner."""
+
+    build: Callable[[Any, StageContext], Refiner]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RendererContribution(StageContribution, kind="renderer", section="render", default="merge"):
+    """Offers a renderer.
+
+    Attributes:
+        bytes_per_pixel: peak memory of rendering for a pixel of the canvas. The framework renders a canvas that exceeds the
+            memory of the run in tiles.
+        divides_by_light: whether it divides by the gains of a `LitSource`, as `photonpano.merging.accumulate` does. If not, a
+            run in changing light warns that the panorama shows the light of the moment.
+        renders_on_any_canvas: whether it renders on a canvas of any projection, and a `LensedSource` through its lens, as
+            `photonpano.merging.accumulate` does. If not, a run that needs it is refused.
+    """
+
+    build: Callable[[Any, StageContext], Renderer]
+    bytes_per_pixel: int = 40
+    divides_by_light: bool = False
+    renders_on_any_canvas: bool = False
+
+    def __post_init__(self) -> None:
+        StageContribution.__post_init__(self)
+        if type(self.bytes_per_pixel) is not int or self.bytes_per_pixel < 1:
+            raise ValueError(f"{self.name}: bytes_per_pixel is a whole number of at least 1, got {self.bytes_per_pixel!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExporterContribution(
+    StageContribution,
+    kind="exporter",
+    section="output.formats",
+    several=True,
+    meaning="further files of the panorama, beside panorama.tiff and panorama.png: one or a list, each a name or {use, with}",
+):
+    """Offers an exporter.
+
+    Attributes:
+        suffix: the ending of its file, in small letters, such as ".exr": the run folder gets `panorama.exr`.
+    """
+
+    build: Callable[[Any, StageContext], Exporter]
+    suffix: str
+
+    def __post_init__(self) -> None:
+        StageContribution.__post_init__(self)
+        if not _SUFFIX.fullmatch(self.suffix):
+            raise ValueError(f"{self.name}: suffix is a dot and small letters or digits, such as .exr, got {self.suffix!r}")
+        if self.suffix in _TAKEN_SUFFIXES:
+            raise ValueError(f"{self.name}: every run writes panorama{self.suffix} itself; choose another suffix")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseEstimatorContribution(
+    StageContribution,
+    kind="pose-estimator",
+    section="pose",
+    meaning="instead of a panorama, the pose of each frame of a camera that travels through a scene: a name, or {use, with}. "
+    "The sections of the panorama do not apply then. Experimental",
+):
+    """Offers a pose estimator. Experimental: the record may change with any version."""
+
+    build: Callable[[Any, StageContext], PoseEstimator]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutorContribution(
+    Contribution,
+    kind="executor",
+    section="run.executor",
+    meaning="what works on the tasks of the run: a name, or {use, with}; by default threads of this process",
+):
+    """Offers an executor. Experimental: the record may change with any version."""
+
+    build: Callable[[Any, ExecutorContext], Executor]

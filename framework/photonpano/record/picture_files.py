@@ -1,0 +1,113 @@
+"""Write pictures as a folder of PNGs, an MP4, or an animated WebP or GIF, whole or not at all."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.errors import OutputError
+from photonpano.files.atomic import atomic_folder, atomic_path
+from photonpano.plugins.contributions import Requirement, install_command
+
+Picture = NDArray[np.uint8] | NDArray[np.uint16]  # of 16 bits in a folder of PNGs only
+
+MOST_ANIMATED = 500  # pictures of an animated WebP or GIF, which is made in memory
+_MOST_H264_PX = 16_384
+_ANIMATED = {".webp": "WebP", ".gif": "GIF"}
+_WEBP_QUALITY, _CRF = 90, "18"  # quality of lossy compression, whose errors are hardly visible
+
+
+def require_writable(path: Path, n_pictures: int) -> None:
+    """Raise an `OutputError` if `write_pictures` cannot write a name: its suffix, too many pictures, or a missing library."""
+    if path.suffix not in ("", ".mp4", *_ANIMATED):
+        raise OutputError(
+            f"cannot write {path}: pictures go to a folder, as PNGs, or to a file that ends in .mp4, .webp or .gif"
+        )
+    if path.suffix in _ANIMATED and n_pictures > MOST_ANIMATED:
+        raise OutputError(
+            f"cannot write {path}: {n_pictures:,} pictures are too many for an animated {_ANIMATED[path.suffix]}, which holds "
+            f"{MOST_ANIMATED}; take fewer, or write an .mp4"
+        )
+    if path.suffix == ".mp4" and importlib.util.find_spec("av") is None:
+        install = install_command([Requirement("av", "photonpano[video]")])
+        raise OutputError(f"cannot write {path}: videos need av, which is not installed: {install}")
+
+
+def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str], fps: float) -> None:
+    """Write pictures of one size, (H, W) or (H, W, 3) with red first; uint8, or uint16 into a folder.
+
+    The path is a new or empty folder for PNGs, or a film that ends in .mp4, .webp or .gif. `names` are those of the PNGs,
+    without suffix, as many as there are pictures; a GIF counts the time of a picture in 1/100 s.
+
+    Raises:
+        OutputError: see `require_writable`; or the files cannot be written. Nothing is left then.
+    """
+    require_writable(path, len(names))
+    if path.suffix == "":
+        with atomic_folder(path) as folder:
+            write_pngs(folder, pictures, names)
+        return
+    write: Callable[[Path, Iterable[Picture], float], None] = _write_mp4 if path.suffix == ".mp4" else _write_animated
+    with atomic_path(path) as temporary:
+        write(temporary, pictures, fps)
+
+
+def write_pngs(folder: Path, pictures: Iterable[Picture], names: Sequence[str]) -> None:
+    """Write pictures, (H, W) or (H, W, 3) with red first, into a folder under these names, without suffix."""
+    for name, picture in zip(names, pictures, strict=True):
+        (folder / f"{name}.png").write_bytes(_png(picture))
+
+
+def counted(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
+    """Yield pictures, and call `advance` with 1 when each is written."""
+    for picture in made:
+        yield picture
+        advance(1)
+
+
+def _png(picture: Picture) -> bytes:
+    encoded, png = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
+    if not encoded:
+        raise OutputError(f"OpenCV could not encode a picture of {picture.shape} as PNG")
+    return png.tobytes()
+
+
+def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+    """Write H.264, whose sides must be even: an odd row or column at the end is doubled."""
+    import av
+
+    frames = (
+        np.pad(picture, [(0, side % 2) for side in picture.shape[:2]] + [(0, 0)] * (picture.ndim - 2), mode="edge")
+        for picture in pictures
+    )
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": _CRF})
+        stream.pix_fmt = "yuv420p"
+        for number, frame in enumerate(frames):
+            if number == 0:
+                _require_mp4(*frame.shape[:2])
+                stream.height, stream.width = frame.shape[:2]
+            layout = "gray" if frame.ndim == 2 else "rgb24"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format=layout)))
+        container.mux(stream.encode())
+
+
+def _require_mp4(height: int, width: int) -> None:
+    if max(height, width) > _MOST_H264_PX:
+        raise OutputError(
+            f"cannot write an MP4 of {width} x {height} pixels: its sides hold up to {_MOST_H264_PX:,}; make them smaller, or "
+            "write PNGs to a folder"
+        )
+
+
+def _write_animated(path: Path, pictures: Iterable[Picture], fps: float) -> None:
+    from PIL import Image
+
+    first, *others = map(Image.fromarray, pictures)
+    first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0, quality=_WEBP_QUALITY)

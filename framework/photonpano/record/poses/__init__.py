@@ -1,0 +1,25 @@
+"""Poses of a camera: their gauge, and the files in which other programs read them."""
+
+from photonpano.record.poses.formats import (
+    POSE_FORMATS,
+    PoseFormat,
+    Poses,
+    centres,
+    colmap,
+    in_standard_world,
+    nerfstudio,
+    ply,
+    tum,
+)
+
+__all__ = [
+    "POSE_FORMATS",
+    "PoseFormat",
+    "Poses",
+    "centres",
+    "colmap",
+    "in_standard_world",
+    "nerfstudio",
+    "ply",
+    "tum",
+]

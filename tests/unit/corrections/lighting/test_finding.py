@@ -1,0 +1,211 @@
+"""Light that changes over time, and the gain of the pixels, are told from the brightness of the scene."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError
+from photonpano.contracts.protocols import WeightedSource
+from photonpano.corrections import Vignette, divided_by
+from photonpano.corrections.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
+from photonpano.corrections.lighting.finding import flicker_frequency, gain_of_frames
+from photonpano.execution.context import Context
+from photonpano.geometry import Camera, Canvas, FrameTrajectory, rotation_matrices, translation
+from photonpano.merging.light import gain_image
+from photonpano.merging.panorama import render
+from photonpano.testing import KnownMotion, MemorySource, Scene
+from photonpano.testing.scenes import detected, seen_along
+
+SHAPE, N = (48, 64), 1024
+MOTION = KnownMotion(lambda frame: translation(0.06 * float(frame), 0.01 * float(frame)))
+STEADY = np.ones(N)
+DRIFT = 0.5 ** np.linspace(0, 1, N)
+FLICKER = 1 + 0.5 * np.cos(2 * np.pi * np.arange(N) / 90.5)
+
+
+class Turning(FrameTrajectory):
+    """Rotations of a camera, as homographies of all frames."""
+
+    def __init__(self, camera: Camera, homographies: np.ndarray) -> None:
+        super().__init__(homographies)
+        self.camera = camera
+
+
+def panned(
+    light: np.ndarray, flux: tuple[float, float] = (0.05, 0.5), seed: int = 0, tremor_px: np.ndarray | None = None
+) -> MemorySource:
+    """A pan over a scene that gets brighter along the way, with a tremor along x."""
+    scene, rng = Scene(seed, flux), np.random.default_rng(seed)
+    frames = np.empty((N, *SHAPE), np.uint8)
+    for first in range(0, N, 8):
+        at = MOTION.at([first + 3.5])[0]
+        if tremor_px is not None:
+            at = at @ translation(tremor_px[first + 4], 0)
+        view = scene.view(at, SHAPE) * (1 + (at[0, 2] + np.arange(SHAPE[1])) / 60)
+        frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-view * light[first : first + 8, None, None])
+    return MemorySource(frames)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_pan_over_bright_scene_is_no_change_of_light(seed: int) -> None:
+    assert find_light(panned(STEADY, seed=seed), MOTION, Context(1)) is None
+
+
+def test_tremor_that_the_motion_lacks_is_no_flicker() -> None:
+    tremor = 1.5 * np.sin(2 * np.pi * np.arange(N) / 90.5)
+    assert find_light(panned(STEADY, tremor_px=tremor), MOTION, Context(1)) is None
+
+
+@pytest.mark.parametrize(("light", "period"), [(DRIFT, None), (FLICKER, 90.5)], ids=["drift", "flicker"])
+def test_gain_of_each_frame_is_measured(light: np.ndarray, period: float | None) -> None:
+    found = find_light(panned(light), MOTION, Context(1))
+    assert found is not None
+    error = found.gain - light / light.mean()
+    assert float(np.sqrt(np.mean(error**2))) < 0.02
+    assert found.gain.mean() == pytest.approx(1)
+    assert found.frequency == (0 if period is None else pytest.approx(1 / period, rel=2e-3))
+    decision = decision_of(found, 9050.0)
+    assert decision.what == "light"
+    if period is not None:
+        assert decision.value == pytest.approx(0.5, abs=0.03)
+        assert "Hz" in decision.reason
+
+
+def test_frames_that_a_wrong_motion_sends_behind_the_plane_do_not_count() -> None:
+    def at(frame: float) -> np.ndarray:
+        found = MOTION.at([frame])[0].copy()
+        if 200 <= frame < 230:
+            found[2, 0] = -0.5
+        return found
+
+    found = find_light(panned(DRIFT), KnownMotion(at), Context(1))
+    assert found is not None
+    assert float(np.sqrt(np.mean((found.gain - DRIFT / DRIFT.mean()) ** 2))) < 0.02
+
+
+def test_lamps_of_two_phases_are_told_apart() -> None:
+    scene, rng, shape = Scene(3, (0.1, 0.6)), np.random.default_rng(3), (32, 96)
+    motion = KnownMotion(lambda frame: translation(0.03 * float(frame), 0))
+    turns = 2 * np.pi * np.arange(768) / 64
+    frames = np.empty((768, *shape), np.uint8)
+    for first in range(0, 768, 4):
+        at = motion.at([first + 1.5])[0]
+        x = at[0, 2] + np.arange(shape[1])
+        # The left part of the scene has another phase than the right one.
+        phase = np.where(x < 60, 0, 2 * np.pi / 3)
+        gain = 1 + 0.6 * np.cos(turns[first : first + 4, None] + phase)
+        frames[first : first + 4] = rng.random((4, *shape)) < -np.expm1(-scene.view(at, shape) * gain[:, None, :])
+    light = find_light(MemorySource(frames), motion, Context(1))
+    assert light is not None
+    assert light.has_lamps
+    assert light.frequency == pytest.approx(1 / 64, rel=5e-3)
+    assert "lamps over parts of the scene" in decision_of(light, None).reason
+    for frame in (200, 333, 500):
+        x = motion.at([frame])[0][0, 2] + np.arange(shape[1])
+        expected = 1 + 0.6 * np.cos(turns[frame] + np.where(x < 60, 0, 2 * np.pi / 3))
+        found = gain_image(light, FrameSpan(frame, frame + 1), motion.at([frame])[0], shape)[16]
+        inside = (np.abs(x - 60) > 8) & (x > 20) & (x < 96)
+        assert float(np.sqrt(np.mean((found - expected)[inside] ** 2))) < 0.08
+
+
+def test_drift_is_measured_along_a_turn_by_200_degrees() -> None:
+    camera, rng = Camera.of(50.0, SHAPE), np.random.default_rng(0)
+    rotations = rotation_matrices(np.linspace([0, -1.75, 0], [0, 1.75, 0], N))
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    rays = camera.directions(np.stack([x, y], axis=-1))
+    frames = np.empty((N, *SHAPE), np.uint8)
+    for first in range(0, N, 4):
+        across, down, _ = np.moveaxis(rays @ rotations[first + 2].T, -1, 0)
+        flux = 0.2 + 0.1 * np.sin(20 * across) * np.cos(17 * down) + 0.05 * np.sin(9 * across)
+        frames[first : first + 4] = rng.random((4, *SHAPE)) < -np.expm1(-flux * DRIFT[first : first + 4, None, None])
+    motion = Turning(camera, camera.homographies(rotations))
+    found = find_light(MemorySource(frames), motion, Context(1))
+    assert found is not None
+    assert float(np.sqrt(np.mean((found.gain - DRIFT / DRIFT.mean()) ** 2))) < 0.02
+
+
+def test_frequency_of_noise_is_none() -> None:
+    noise = np.random.default_rng(0).normal(1, 0.05, 400)
+    assert flicker_frequency(np.arange(400.0), noise) == 0
+
+
+@pytest.mark.parametrize("spans", [1, 2, 3, 4])
+def test_gain_is_measured_in_few_spans(spans: int) -> None:
+    """Of a short video of a dozen frames, of which few are located."""
+    instants, gain = np.arange(spans) + 0.5, 1 + 0.1 * np.arange(spans)
+    frames, std, frequency = gain_of_frames(instants, gain, np.full(spans, 1e-3), np.ones(spans), spans + 2)
+    assert (frequency, std.shape) == (0, (spans + 2,))
+    np.testing.assert_allclose(frames[[0, -1]], gain[[0, -1]], atol=0.01)
+
+
+FIELD, N_FIELD = (64, 96), 120
+Y, X = np.indices(FIELD) / 32
+GAIN = np.exp(0.3 * np.sin(2 * X + 0.5) * np.cos(1.5 * Y) + 0.1 * X)
+GAIN /= GAIN.mean()
+"""Brighter and darker by 30 % over distances of 50 px, and brighter to the right."""
+EVEN = np.ones(FIELD)
+
+
+def path(frame: float) -> np.ndarray:
+    """Move through the scene, in both directions and back again."""
+    turn = 2 * np.pi * frame / N_FIELD
+    return translation(50 * np.sin(3 * turn), 40 * np.sin(2 * turn))
+
+
+CROSSING = KnownMotion(path)
+
+
+@pytest.fixture(scope="module")
+def recorded(street: np.ndarray) -> Callable[..., MemorySource]:
+    """Record a street, seen with this gain along this motion."""
+
+    @cache
+    def recorded(uneven: bool, motion: KnownMotion = CROSSING) -> MemorySource:
+        views = seen_along(street, translation(300, 250) @ motion.at(np.arange(N_FIELD)), FIELD)
+        return MemorySource(detected(0.4 * views * (GAIN if uneven else EVEN)))
+
+    return recorded
+
+
+@pytest.fixture(scope="module")
+def measured(recorded: Callable[..., MemorySource]) -> Callable[..., PixelGain]:
+    """Measure the gain of a recorded capture along its motion."""
+    return cache(lambda uneven: measure_pixel_gain(recorded(uneven), CROSSING, Context()))
+
+
+@pytest.mark.parametrize(("uneven", "most"), [(True, 0.04), (False, 0.02)], ids=["uneven", "even"])
+def test_gain_is_measured_to_its_expected_error(uneven: bool, most: float, measured: Callable[..., PixelGain]) -> None:
+    found = measured(uneven)
+    error = found.gain / (GAIN if uneven else EVEN) - 1
+    rms, expected = (float(np.sqrt(np.mean(each**2))) for each in (error, found.std))
+    assert rms < 1.5 * expected
+    assert expected < most
+
+
+def rendered(source: MemorySource, found: PixelGain | None) -> np.ndarray:
+    """Return the flux of what most frames saw: (60, 80)."""
+    whole = FrameSpan(0, N_FIELD)
+    if found is not None:
+        mean = (source.counts(whole) / N_FIELD).astype(np.float32)
+        source = divided_by(source, Vignette(found.gain, mean, found.spans, found.std))
+        assert isinstance(source, WeightedSource)
+    canvas = Canvas(60, 80, translation(-8, -2))
+    return render(source, CROSSING, whole, canvas, 0.1, Context()).flux
+
+
+@pytest.mark.parametrize(("uneven", "most"), [(True, 0.04), (False, 0.02)], ids=["uneven", "even"])
+def test_divided_panorama_is_that_of_an_even_sensor(
+    uneven: bool, most: float, recorded: Callable[..., MemorySource], measured: Callable[..., PixelGain]
+) -> None:
+    """Its contrast is that of the scene, of which the flat field takes nothing."""
+    divided, truth = rendered(recorded(uneven), measured(uneven)), rendered(recorded(False), None)
+    assert np.std(divided) / np.mean(divided) == pytest.approx(np.std(truth) / np.mean(truth), rel=most)
+
+
+def test_camera_that_stands_still_is_refused(recorded: Callable[..., MemorySource]) -> None:
+    still = KnownMotion(lambda _: np.eye(3))
+    expected = r"^corrections: flat-field: photons and motion determine 0% of the variance of the gain, and 50% are needed;"
+    with pytest.raises(InputError, match=expected):
+        measure_pixel_gain(recorded(True, still), still, Context())

@@ -1,0 +1,270 @@
+"""Texts, paths, files that appear whole, and filters."""
+
+import errno
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonpano import (
+    Config,
+    OutputError,
+    SpecLocation,
+    SpecPath,
+    Url,
+)
+from photonpano import text as words
+from photonpano.files.atomic import atomic_folder, atomic_path
+from photonpano.files.paths import location
+from photonpano.filtering import exceeding_noise
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0, "0 µs"),
+        (0.000_25, "250 µs"),
+        (0.1033, "103 ms"),
+        (0.0421, "42.1 ms"),
+        (8.25, "8.25 s"),
+        (59.9, "59.9 s"),
+        (59.96, "1 min 00 s"),
+        (83.2, "1 min 23 s"),
+        (3599.7, "1 h 00 min"),
+        (7380, "2 h 03 min"),
+    ],
+)
+def test_duration_formats_with_unit_and_three_digits(seconds, text):
+    assert words.duration(seconds) == text
+
+
+@pytest.mark.parametrize(("hertz", "text"), [(96_800, "96.8 kHz"), (500, "500 Hz"), (1.5e6, "1.5 MHz"), (29.97, "30 Hz")])
+def test_rate_formats_hz_khz_mhz(hertz, text):
+    assert words.rate(hertz) == text
+
+
+@pytest.mark.parametrize(
+    ("size", "text"), [(512, "512 B"), (812 * 2**20, "812 MiB"), (1023 * 2**20, "1 GiB"), (3 * 2**29, "1.5 GiB")]
+)
+def test_byte_size_has_the_unit_that_fits(size, text):
+    assert words.byte_size(size) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "\N{EN DASH}"), (0.0, "0"), (0.0631, "0.063"), (1.834, "1.83"), (12.34, "12.3"), (1234.5, "1,234")],
+)
+def test_pixels_has_two_digits_below_a_tenth_and_a_dash_for_none(value, text):
+    assert words.pixels(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(1, "100 %"), (0.998, "over 99 %"), (0.934, "93 %"), (0.003, "under 1 %"), (0, "0 %")]
+)
+def test_share_is_exact_at_0_and_100_percent_only(value, text):
+    assert words.share(value) == text
+
+
+def test_count_counted_and_span_format_whole_numbers():
+    assert words.counted(1, "frame") == "1 frame"
+    assert words.counted(12_000, "frame") == "12,000 frames"
+    assert words.span(1000, 2000) == "1,000 to 1,999"
+    assert words.span(7, 8) == "7"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("s3://bucket/night/cube.npy", "s3://bucket/night/cube.npy"),
+        ("s3:/bucket/cube.npy", "s3://bucket/cube.npy"),
+        ("https://me:secret@host:8000/a/cube.npy?X-Signature=secret#1", "https://host:8000/a/cube.npy"),
+        ("s3://me:secret@bucket/what?.npy", "s3://bucket/what?.npy"),
+    ],
+)
+def test_urls_are_shown_without_their_secrets(text: str, shown: str) -> None:
+    url = location(text)
+    assert isinstance(url, Url)
+    assert str(url) == shown
+    assert "secret" not in repr(url)
+    assert location(Path(text)) == location(str(Path(text)))
+
+
+@pytest.mark.parametrize("text", ["cube.npy", "/data/cube.npy", "C:/cube.npy", "night:1/cube.npy", "s3:", "a::b"])
+def test_paths_are_no_urls(text: str) -> None:
+    assert location(text) == Path(text)
+
+
+def test_parts_of_a_url() -> None:
+    url = Url("https://me:secret@host/a/cube.zarr?token=secret")
+    assert (url.scheme, url.host, url.name, url.stem, url.suffix) == ("https", "host", "cube.zarr", "cube", ".zarr")
+    assert (url / "zarr.json").address == "https://me:secret@host/a/cube.zarr/zarr.json?token=secret"
+    assert Url("s3://bucket").name == ""
+    assert (Url("s3://bucket/folder/") / "c.0").address == "s3://bucket/folder/c.0"
+
+
+class Opens(Config):
+    path: SpecLocation
+    mask: SpecPath | None = None
+
+
+def test_urls_in_configs_keep_their_secrets_and_records_do_not() -> None:
+    config = Opens.model_validate_json('{"path": "https://me:secret@host/cube.npy"}', context={"directory": Path("/specs")})
+    assert config.path == Url("https://me:secret@host/cube.npy")
+    assert config.model_dump(mode="json")["path"] == "https://host/cube.npy"
+    assert Opens.model_validate_json('{"path": "cube.npy"}', context={"directory": Path("/specs")}).path == Path(
+        "/specs/cube.npy"
+    )
+
+
+def test_keys_for_files_refuse_urls() -> None:
+    with pytest.raises(ValueError, match=r"s3://bucket/mask.npy is a URL, and this must be a file: download it"):
+        Opens.model_validate_json('{"path": "cube.npy", "mask": "s3://bucket/mask.npy"}')
+
+
+def test_atomic_path_creates_the_file_when_the_block_ends(tmp_path: Path) -> None:
+    final = tmp_path / "result.bin"
+    with atomic_path(final) as temporary:
+        temporary.write_bytes(b"half")
+        assert not final.exists()
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".bin"
+        temporary.write_bytes(b"whole")
+    assert final.read_bytes() == b"whole"
+    assert list(tmp_path.iterdir()) == [final]
+
+
+def test_atomic_path_follows_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        with atomic_path(tmp_path / "result.bin") as temporary:
+            temporary.write_bytes(b"whole")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "result.bin").stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_atomic_path_keeps_the_old_file_on_failure(tmp_path: Path, error: type[BaseException]) -> None:
+    final = tmp_path / "result.bin"
+    final.write_bytes(b"old")
+    with pytest.raises(error), atomic_path(final) as temporary:
+        raise error(temporary.write_bytes(b"new"))
+    assert final.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [final]
+
+
+def test_atomic_path_names_a_missing_folder(tmp_path: Path) -> None:
+    final = tmp_path / "nowhere" / "result.bin"
+    with pytest.raises(OutputError) as caught, atomic_path(final):
+        raise AssertionError("the block must not run")
+    assert str(caught.value) == (
+        f"cannot write {final}: there is no folder {tmp_path / 'nowhere'}; create it or choose another"
+    )
+
+
+def test_atomic_path_refuses_a_folder_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as caught, atomic_path(tmp_path):
+        raise AssertionError("the block must not run")
+    assert str(caught.value) == f"cannot write {tmp_path}: Is a directory; choose another name, or remove the folder"
+
+
+def test_atomic_path_reports_missing_permission(tmp_path: Path) -> None:
+    final = tmp_path / "result.bin"
+    with pytest.raises(OutputError) as caught, atomic_path(final):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    assert str(caught.value) == f"cannot write {final}: Permission denied; choose a folder that you may write to"
+
+
+_FILLS_THE_DISK = """
+import resource, signal, sys
+from pathlib import Path
+from photonpano import OutputError
+from photonpano.files.atomic import atomic_path
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+try:
+    with atomic_path(Path(sys.argv[1])) as temporary:
+        temporary.write_bytes(bytes(8192))
+except OutputError as error:
+    print(error)
+"""
+
+
+def test_atomic_path_leaves_no_file_after_a_short_write(tmp_path: Path) -> None:
+    """A limit on file sizes stops the write half-way, as a full disk does."""
+    final = tmp_path / "result.bin"
+    done = subprocess.run([sys.executable, "-c", _FILLS_THE_DISK, final], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == (
+        f"cannot write {final}: File too large; raise the limit on file sizes or choose another file system"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_atomic_path_reports_a_full_disk_and_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is found to be full when the whole file is flushed, as some file systems do."""
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    final = tmp_path / "result.bin"
+    final.write_bytes(b"old")
+    monkeypatch.setattr("photonpano.files.atomic.os.fsync", full)
+    with pytest.raises(OutputError) as caught, atomic_path(final) as temporary:
+        temporary.write_bytes(b"new")
+    assert str(caught.value) == (f"cannot write {final}: No space left on device; free some space or choose another folder")
+    assert final.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [final]
+
+
+@pytest.mark.parametrize("lend", [atomic_path, atomic_folder])
+def test_interrupt_while_the_temporary_file_is_made_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lend: Callable[[Path], AbstractContextManager[Path]]
+) -> None:
+    def interrupted(_: int) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("photonpano.files.atomic.claimed", interrupted)
+    with pytest.raises(KeyboardInterrupt), lend(tmp_path / "cube.npy"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+STEPS = np.arange(1000)
+
+
+def noise(seed: int, std: float = 0.3) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0, std, len(STEPS))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_alone_is_left_out(seed: int) -> None:
+    filtered = exceeding_noise(noise(seed), np.full(len(STEPS), 0.3**2))
+    assert np.sqrt(np.mean(filtered.signal**2)) < 0.03
+    assert filtered.std.max() < 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tremor_is_kept_and_its_noise_known(seed: int) -> None:
+    tremor = np.sin(2 * np.pi * STEPS / 11) + 0.5 * np.sin(2 * np.pi * STEPS / 37)
+    filtered = exceeding_noise(tremor + noise(seed), np.full(len(STEPS), 0.3**2))
+    error = np.sqrt(np.mean((filtered.signal - tremor) ** 2))
+    assert error < 0.15
+    assert 0.5 < error / np.sqrt(np.mean(filtered.std**2)) < 2
+
+
+def test_unknown_steps_count_for_nothing() -> None:
+    tremor, variances = np.sin(2 * np.pi * STEPS / 11), np.full(len(STEPS), 0.1**2)
+    variances[::10] = np.inf
+    steps = tremor + noise(0, 0.1)
+    steps[::10] = 1e6
+    filtered = exceeding_noise(steps, variances)
+    assert np.abs(filtered.signal).max() < 2
+    nothing = exceeding_noise(steps, np.full(len(STEPS), np.inf))
+    assert not nothing.signal.any()
+    assert not nothing.std.any()
