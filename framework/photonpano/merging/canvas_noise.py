@@ -46,8 +46,8 @@ class CanvasNoise:
             return replace(cls._corrected(capture, trajectory, span, canvas), averaging=averaging)
         # The grey source equalises the colours, which are rendered without it.
         colours = [cls._corrected(each, trajectory, span, canvas) for each in list(capture.colours().values())[:_RGB]]
-        factors = (_stacked([getattr(each, name) for each in colours]) for name in ("slope", "offset", "share"))
-        return cls(capture.response, *factors, max(each.reduction for each in colours), averaging)
+        slope, offset, share = (_stacked([getattr(each, name) for each in colours]) for name in ("slope", "offset", "share"))
+        return cls(capture.response, slope, offset, share, max(each.reduction for each in colours), averaging)
 
     @classmethod
     def _corrected(cls, capture: Capture, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
@@ -60,17 +60,17 @@ class CanvasNoise:
         factors, valid = (slope, offset, capture.weights()), capture.valid
         means = [float(each[valid].mean()) for each in factors]
         if max(np.ptp(each[valid]) for each in factors) < _EVEN:
-            return cls(capture.response, *means)
+            return cls(capture.response, means[0], means[1], means[2])
         reduction = max(1.0, max(canvas.shape) / _LARGEST_PX)
         height, width = (int(np.ceil(side / reduction)) for side in canvas.shape)
         instants = np.unique(np.linspace(span.start, span.stop - 1, min(len(span), _INSTANTS)).round())
         coarse = replace(canvas, height=height, width=width, transform=rescaling(1 / reduction) @ canvas.transform)
-        sums, share = laid(coarse, capture.camera, trajectory.at(instants), factors, valid)
-        on_canvas = (
-            np.asarray(np.where(share > 0, total / np.maximum(share, np.float32(1e-6)), mean), np.float32)
+        sums, known = laid(coarse, capture.camera, trajectory.at(instants), factors, valid)
+        slope, offset, share = (
+            np.asarray(np.where(known > 0, total / np.maximum(known, np.float32(1e-6)), mean), np.float32)
             for total, mean in zip(sums, means, strict=True)
         )
-        return cls(capture.response, *on_canvas, reduction)
+        return cls(capture.response, slope, offset, share, reduction)
 
     def std(self, flux: FluxImage, weight: FluxImage, top: int = 0, left: int = 0) -> FluxImage:
         """Return the standard deviation of the flux, (h, w) or (h, w, 3), of a part of the canvas from `top`, `left` on."""
