@@ -322,7 +322,7 @@ def main(trial: Path, number: int = 20, seed: int = 0, at_once: int = 2, writing
         run(load_spec(study.folder / "scan.yaml"))  # so that those forked from this process find the machine code loaded
         more = {"races": {"at_once": at_once}, "resumes": {"writing": writing}}.get(str(trial), {})
         if "writing" in more:
-            mock.patch("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0).start()
+            mock.patch("photonpano.pipeline.checkpoints.store.FLUSH_S", 0.0).start()
         wrong = TRIALS[str(trial)](study.folder, number, seed, **more)
     print(*wrong, sep="\n")
     return bool(wrong)

@@ -28,7 +28,7 @@ class Killed(BaseException):
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write every result at once, so that a run can be killed after each."""
-    monkeypatch.setattr("photonpano.pipeline.checkpoints.kept.FLUSH_S", 0.0)
+    monkeypatch.setattr("photonpano.pipeline.checkpoints.store.FLUSH_S", 0.0)
 
 
 @pytest.fixture(scope="module")
