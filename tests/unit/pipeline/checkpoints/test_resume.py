@@ -104,7 +104,7 @@ def test_resumed_run_repeats_nothing_that_was_kept(plan_of: Callable[..., Plan],
         with pytest.raises(Killed):
             run(killed)
     monkeypatch.setattr(DirectLocator, "register", repeats)
-    for step in ("motion.registration.starting_motion", "residuals.refinement.measure", "merging.merge_renderer.accumulate"):
+    for step in ("motion.registration.starting_motion", "residuals.refinement.measure", "merging.panorama.accumulate"):
         monkeypatch.setattr(f"photonpano.{step}", repeats)
     run(killed, resume=True)
 
