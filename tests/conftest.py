@@ -7,6 +7,7 @@ import importlib.util
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run import RunResult
 from photonpano.testing import KnownMotion, MemorySource
+from photonpano_simulator import scenes
 
 settings.register_profile("suite", max_examples=50, deadline=None)  # the machine may be busy
 settings.load_profile("suite")
@@ -223,6 +225,14 @@ def write_video(tmp_path: Path) -> Callable[..., Path]:
         return tmp_path / name
 
     return write
+
+
+@pytest.fixture(scope="session", autouse=True)
+def streets_drawn_once() -> Iterator[None]:
+    """Draw each street once: many tests simulate the same one, and drawing it takes longer than a small run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("photonpano_simulator.scenes.street", lru_cache(maxsize=16)(scenes.street))
+        yield
 
 
 @pytest.fixture
