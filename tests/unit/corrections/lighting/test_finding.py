@@ -11,6 +11,8 @@ from photonpano.contracts.protocols import WeightedSource
 from photonpano.corrections import Vignette, divided_by
 from photonpano.corrections.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
 from photonpano.corrections.lighting.finding import flicker_frequency, gain_of_frames
+from photonpano.corrections.lighting.flicker import _smoothed
+from photonpano.corrections.lighting.gains import SeenCells
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging.light import gain_image
@@ -209,3 +211,16 @@ def test_camera_that_stands_still_is_refused(recorded: Callable[..., MemorySourc
     expected = r"^corrections: flat-field: photons and motion determine 0% of the variance of the gain, and 50% are needed;"
     with pytest.raises(InputError, match=expected):
         measure_pixel_gain(recorded(True, still), still, Context())
+
+
+def test_phase_of_flicker_is_found_from_half_a_period() -> None:
+    """Where a place is in view for less than a period, the waves of cosine and sine are not orthogonal there."""
+    n_times, amplitudes = 20, (0.3, -0.2)
+    phase = np.pi * np.arange(n_times) / n_times
+    waves = np.stack([np.ones(n_times), np.cos(phase), np.sin(phase)])
+    cells, times = np.repeat(np.arange(9), n_times), np.tile(np.arange(n_times), 9)
+    photons = 1e6 * (1 + amplitudes[0] * waves[1, times] + amplitudes[1] * waves[2, times])
+    spans = tuple(FrameSpan(each, each + 1) for each in range(n_times))
+    seen = SeenCells(spans, cells, times, photons, np.full(len(cells), 1e6), (3, 3), np.eye(3))
+    found = _smoothed(seen, waves, np.ones(n_times), np.ones(9))
+    assert [float(each[1, 1]) for each in found] == pytest.approx(amplitudes, abs=0.02)

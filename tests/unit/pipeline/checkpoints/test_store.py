@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, Located, NotLocated, Panorama
+from photonpano import FrameSpan, Group, Located, NotLocated, Panorama, parse_spec
 from photonpano.motion.diagnosis import Contrast
 from photonpano.motion.registration import Registered
 from photonpano.motion.tracking import Place
+from photonpano.pipeline.checkpoints.fingerprint import differences, run_fingerprint
 from photonpano.pipeline.checkpoints.records import digest, packed, unpacked
 from photonpano.pipeline.checkpoints.store import Kept, Store, finished
+from photonpano.record.fingerprint import CaptureRecord
 from photonpano.values import Decision, Edge
 
 RNG = np.random.default_rng(0)
@@ -259,3 +261,19 @@ def test_log_repeats_decisions_unless_they_are_taken_again(store: Store, written
     later.append(first)
     log.finish()
     assert later[1:] == [first, second]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("run", {"seed": 1}), ("graph", {"skips": [1]}), ("source", {"use": "simulator", "with": {"flux": 0.7}}), ("levels", 3)],
+    ids=["seed", "graph", "source", "levels"],
+)
+def test_fingerprint_tells_what_results_depend_on(key: str, value: object) -> None:
+    spec = {"version": 1, "source": {"use": "simulator"}, "levels": 2}
+    capture = CaptureRecord(files=[], frames_sha256="", pixels_sha256="")
+    one, same, other = (
+        run_fingerprint(parse_spec(each), capture, (8, 8))
+        for each in (spec, spec | {"run": {"threads": 1}}, spec | {key: value})
+    )
+    assert differences(one, same) == []
+    assert len(differences(one, other)) == 1
