@@ -213,10 +213,10 @@ def test_camera_that_stands_still_is_refused(recorded: Callable[..., MemorySourc
         measure_pixel_gain(recorded(True, still), still, Context())
 
 
-def test_phase_of_flicker_is_found_from_half_a_period() -> None:
+def test_phase_of_flicker_is_found_from_a_third_of_a_period() -> None:
     """Where a place is in view for less than a period, the waves of cosine and sine are not orthogonal there."""
     n_times, amplitudes = 20, (0.3, -0.2)
-    phase = np.pi * np.arange(n_times) / n_times
+    phase = 2 * np.arange(n_times) / n_times
     waves = np.stack([np.ones(n_times), np.cos(phase), np.sin(phase)])
     cells, times = np.repeat(np.arange(9), n_times), np.tile(np.arange(n_times), 9)
     photons = 1e6 * (1 + amplitudes[0] * waves[1, times] + amplitudes[1] * waves[2, times])
