@@ -109,6 +109,11 @@ def _out_of_range(found: NDArray[Any], asked: Asked) -> object:
     return (lowest < 0 or highest > asked.highest) and (asked.what, asked.highest, lowest if lowest < 0 else highest)
 
 
+def _not_finite(found: FluxImage, asked: Asked) -> object:
+    number = found.size - int(np.count_nonzero(np.isfinite(found)))
+    return number > 0 and (asked.what, number, found.size)
+
+
 # Facts of the following three: what was asked for.
 READ: Contract[NDArray[Any]] = Contract(
     [
@@ -129,7 +134,8 @@ IMAGE: Contract[FluxImage] = Contract(
             lambda found, asked: (
                 not (is_real(found, "f") and found.shape == asked.shape) and (asked.what, asked.shape, shown(found))
             ),
-        )
+        ),
+        ("{}() returns finite numbers, masked pixels included; {} of {} pixels are NaN or infinite", _not_finite),
     ]
 )
 TRUTH: Contract[Mapping[str, NDArray[np.generic]]] = Contract(

@@ -200,6 +200,13 @@ def test_sources_of_colours_name_the_plugin_too(source: Any, memory_source: type
             np.ones((4, 6), np.uint32),
             "corrected() returns (4, 6) of float32, got (4, 6) of uint32",
         ),
+        (
+            "corrected",
+            (np.ones((4, 6), np.uint32), 3),
+            "correcting",
+            np.where(np.arange(24).reshape(4, 6) < 2, np.float32(np.nan), np.float32(1)),
+            "corrected() returns finite numbers, masked pixels included; 2 of 24 pixels are NaN or infinite",
+        ),
         ("truth", (), "truth()", [1], "truth() returns a mapping of arrays by name, got a list"),
         (
             "sharp_view",

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 INTERVAL_S = 10.0  # time between two lines of progress
 _LEAST_S = 1.0  # minimum age of a stage that is printed
+_TOLD_FROM = 0.05  # share of a stage that is done before the time left is told
 _IN_NOTEBOOK = "JPY_PARENT_PID"  # set in notebooks, whose terminal prints control characters
 
 
@@ -131,7 +132,9 @@ class _Stage:
 
     def __str__(self) -> str:
         done, seconds = self._done, time.monotonic() - self._start
-        left = f", about {duration(seconds * (self._total - done) / done)} left" if 0 < done < self._total else ""
+        # The first units take longer than the others: loops are compiled.
+        is_known = _TOLD_FROM * self._total <= done < self._total
+        left = f", about {duration(seconds * (self._total - done) / done)} left" if is_known else ""
         return f"{self._title}: {count(done)} of {count(self._total)} {self._unit} after {duration(seconds)}{left}"
 
     def finished(self) -> str:
