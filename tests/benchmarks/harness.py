@@ -296,11 +296,15 @@ def table(head: Sequence[str], rows: Iterable[Iterable[object]]) -> list[str]:
 
 
 def chosen(words: Sequence[str], names: Iterable[str]) -> list[str]:
-    """Return the names that contain one of some words; all without words."""
-    found = [name for name in names if not words or any(word in name for word in words)]
-    if not found:
-        raise SystemExit(f"nothing is called {' or '.join(words)}")
-    return found
+    """Return the names that are one of some words, or contain a word that is no name itself; all without words."""
+    names = list(names)
+    found: set[str] = set() if words else set(names)
+    for word in words:
+        meant = {word} & set(names) or {name for name in names if word in name}
+        if not meant:
+            raise SystemExit(f"nothing is called {word}; there are {', '.join(names)}")
+        found |= meant
+    return [name for name in names if name in found]
 
 
 def filled(text: str, name: str, lines: Iterable[str]) -> str:
