@@ -91,7 +91,8 @@ def _add_squares(shape: tuple[int, int], matrix: NDArray[np.float64], lens: Lens
     low, right, bottom = -_ROUNDING, width - 1 + _ROUNDING, height - 1 + _ROUNDING
     for y in range(len(grid.q)):
         image_row(matrix, lens, grid, y, u, v)
-        row, count = grid.total[y], grid.coverages[0, y]
+        x = slice(grid.left, grid.left + len(u))
+        row, count = grid.total[grid.top + y, x], grid.coverages[0, grid.top + y, x]
         for t in range(len(row)):
             if u[t] >= low and u[t] <= right and v[t] >= low and v[t] <= bottom:
                 a, b = u[t] - np.floor(u[t]), v[t] - np.floor(v[t])

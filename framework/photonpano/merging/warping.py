@@ -36,7 +36,7 @@ class Texture(NamedTuple):
     zero: float
 
     @classmethod
-    def of(cls, image: NDArray[np.float32]) -> Texture:
+    def of(cls, image: Pixels) -> Texture:
         """Return the texture of an (h, w) image of finite values."""
         low, high = min(0.0, float(image.min(initial=0))), float(image.max(initial=0))
         scale = 2.0 ** np.ceil(np.log2((high - low) / _LEVELS)) if high > low else 1.0
@@ -92,15 +92,19 @@ def _add_squares(image: NDArray[np.float32], side: int, averages: NDArray[np.flo
 
 
 class Grid(NamedTuple):
-    """Sums on a grid, and the rays of its pixels: see `Canvas`.
+    """Sums on a grid, and the rays of the pixels of a box of it: see `Canvas`.
+
+    Sums are those of all of the grid, for loops over slices of them would not be vectorised.
 
     Attributes:
-        p: (W,) of the columns, relative to that of the middle one, for float32 is not exact enough for thousands of pixels.
-        s: (W,) of the columns, likewise.
-        p0: of the middle column.
+        p: (w,) of the columns of the box, relative to `p0`, for float32 is not exact enough for thousands of pixels.
+        s: (w,) of the columns, relative to `s0`.
+        p0: of the middle column of the grid.
         s0: of the middle column.
-        q: (H,) of the rows.
-        r: (H,) of the rows.
+        q: (h,) of the rows of the box.
+        r: (h,) of the rows.
+        top: first row of the box.
+        left: first column.
         total: (H, W) float32 sums of counts.
         coverages: (P, H, W) float32 sums of what was seen.
     """
@@ -111,27 +115,25 @@ class Grid(NamedTuple):
     s0: float
     q: NDArray[np.float64]
     r: NDArray[np.float64]
+    top: int
+    left: int
     total: NDArray[np.float32]
     coverages: NDArray[np.float32]
 
     @classmethod
     def zeros(cls, canvas: Canvas, number: int) -> Grid:
-        """Return no sums on a canvas, with some coverages."""
+        """Return no sums on a canvas, which is the box, with some coverages."""
         (p, s), middle = canvas.columns(), canvas.width // 2
         p0, s0 = float(p[middle]), float(s[middle])
         coverages = np.zeros((number, *canvas.shape), np.float32)
         columns = (p - p0).astype(np.float32), (s - s0).astype(np.float32)
-        return cls(*columns, p0, s0, *canvas.rows(), np.zeros(canvas.shape, np.float32), coverages)
+        return cls(*columns, p0, s0, *canvas.rows(), 0, 0, np.zeros(canvas.shape, np.float32), coverages)
 
     def parts(self, footprint: Footprint) -> list[Grid]:
-        """Return views of the parts that a frame may touch."""
+        """Return the same sums, with the boxes that a frame may touch."""
         down, boxes = slice(footprint.rows.start, footprint.rows.stop), footprint.columns if footprint.rows else ()
-        across = [slice(columns.start, columns.stop) for columns in boxes]
-        rows = self._replace(q=self.q[down], r=self.r[down])
-        return [
-            rows._replace(p=self.p[x], s=self.s[x], total=self.total[down, x], coverages=self.coverages[:, down, x])
-            for x in across
-        ]
+        rows, across = self._replace(q=self.q[down], r=self.r[down], top=down.start), [slice(x.start, x.stop) for x in boxes]
+        return [rows._replace(p=self.p[x], s=self.s[x], left=x.start) for x in across]
 
 
 def add_warped(counts: Texture, seen: Texture | None, amounts: FloatArray, footprint: Footprint, grid: Grid) -> None:
@@ -158,8 +160,8 @@ def image_row(
     Args:
         matrix: (3, 3), rays to homogeneous ideal coordinates.
         lens: from these to pixels.
-        grid: W columns.
-        row: of the grid.
+        grid: its box has W columns.
+        row: of the box.
         u: (W,) output, x; -9 behind the camera and beyond the lens.
         v: (W,) output, y.
     """
@@ -205,7 +207,7 @@ def _add_warped(
     grid: Grid,
 ) -> None:
     """Add an image and its share of each pixel, which is that of `seen`, or 1 for a `whole` image."""
-    rows, columns = grid.total.shape
+    rows, columns = len(grid.q), len(grid.p)
     u, v, share = np.empty(columns, np.float32), np.empty(columns, np.float32), np.empty(columns, np.float32)
     places, texels = np.empty(columns, np.uint32), np.empty(columns, np.uint64)
     for y in range(rows):
@@ -215,14 +217,15 @@ def _add_warped(
             continue
         a, b, at, into = u[first:last], v[first:last], places[first:last], texels[: last - first]
         _read(counts, at, into)
-        _add_interpolated(counts, into, a, b, grid.total[y, first:last])
+        row, x = grid.top + y, slice(grid.left + first, grid.left + last)
+        _add_interpolated(counts, into, a, b, grid.total[row, x])
         weight = share[first:last]
         if not whole:
             weight[:] = 0
             _read(seen, at, into)
             _add_interpolated(seen, into, a, b, weight)
         for k in range(len(amounts)):
-            amount, coverage = np.float32(amounts[k]), grid.coverages[k, y, first:last]
+            amount, coverage = np.float32(amounts[k]), grid.coverages[k, row, x]
             for t in range(len(weight)):
                 coverage[t] += amount * weight[t]
 
