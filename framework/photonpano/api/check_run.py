@@ -58,7 +58,7 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
     with opened_run(Path(run_folder), catalog) as opened, one_thread_inside():
         record, plan = opened.record, opened.plan
         context = Context(thread_count(plan.run.threads), usual(progress))
-        fit = MotionFit(opened.source, opened.motion, plan.render.tolerance_px, int(plan.run.memory), context)
+        fit = MotionFit(opened.source, opened.motion, int(plan.run.memory), context)
         explained = fit.explained()
     verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
     unknown = []

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from photonpano.capture.pixels import Gather
 from photonpano.capture.plugin_source import PluginSource
 from photonpano.contracts.protocols import Closing
+from photonpano.photometry import MAX_FRAMES, packed_counts
 from photonpano.values import BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, StreamInfo
 
 if TYPE_CHECKING:
@@ -90,9 +91,17 @@ class Capture(Closing):
         counts: Counts = self._gathered(self.source.counts(self._read(span)))
         return counts
 
+    def chunk(self, span: FrameSpan) -> Counts:
+        """Sum the frames of a span: (H, W) uint32, or uint8 if it is cheaper and holds the sum."""
+        if not self.is_packed or len(span) > MAX_FRAMES:
+            return self.counts(span)
+        packed, width = self.source.packed(self._read(span)), self.source.info.width
+        counts: Counts = self._gathered(packed_counts(packed, width, small=True))
+        return counts
+
     def chunks(self, spans: Iterable[FrameSpan]) -> Iterator[Counts]:
-        """Yield the sum of the frames of each span: (H, W) uint32. Reads a span when its sum is asked for."""
-        return map(self.counts, spans)
+        """Yield the sum of the frames of each span, see `chunk`. Reads a span when its sum is asked for."""
+        return map(self.chunk, spans)
 
     def frames(self, span: FrameSpan) -> Frames:
         """Return the frames of a span one by one: (n, H, W)."""
@@ -111,13 +120,13 @@ class Capture(Closing):
         The correction is linear, so that the average is right; the result may be negative.
 
         Args:
-            counts: (H, W), from `counts`.
+            counts: (H, W), from `counts` or `chunk`.
             n_frames: number of frames in the sum.
 
         Returns:
-            (H, W) float32; `counts` itself, uint32, if there is nothing to correct.
+            (H, W) float32; `counts` itself if there is nothing to correct.
         """
-        summed: Any = counts
+        summed: Any = np.asarray(counts, np.uint32) if self.steps else counts
         for step in self.steps:
             summed = step(summed, n_frames)
         corrected: FluxImage = summed

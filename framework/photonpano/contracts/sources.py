@@ -99,8 +99,9 @@ RESPONSE: Contract[Response] = Contract(
 
 
 def _no_integers(found: object, asked: Asked) -> object:
-    kind = f"an array of {found.dtype}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
-    return not is_real(found, "uib") and (asked.what, kind)
+    if is_real(found, "uib"):
+        return None
+    return asked.what, f"an array of {found.dtype}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
 
 
 def _out_of_range(found: NDArray[Any], asked: Asked) -> object:

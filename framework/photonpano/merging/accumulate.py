@@ -83,7 +83,7 @@ def accumulate(
         advance: called with numbers of frames that are done; first with that of all chunks off the grid.
         in_order: sums runs of chunks at once, each on the part of the grid that it covers, and yields the sums in order. They
             do not depend on how many are under way. By default, there is one run.
-        counts_of: returns the uncorrected sum of the frames of a span, such as a `CountsCache`; `source.counts` by default.
+        counts_of: returns the uncorrected sum of a span, such as a `CountsCache`; `chunk` of the capture by default.
     """
     advance = advance or (lambda _: None)
     capture = capture_of(source)
@@ -94,7 +94,7 @@ def accumulate(
         visible = _visible(capture, chunks, canvas)
         if off_grid := _frames(chunks) - _frames([chunk for chunk, _ in visible]):
             advance(off_grid)
-        counts, coverages = _sum_on(capture, terms, counts_of or capture.counts, canvas, visible, advance)
+        counts, coverages = _sum_on(capture, terms, counts_of or capture.chunk, canvas, visible, advance)
     else:
         number = 1 if terms is None else terms.number
         counts, coverages = np.zeros(shape, np.float32), np.zeros((number, *shape), np.float32)
@@ -149,7 +149,7 @@ def _sum_of_run(source: Capture, terms: LightTerms | None, canvas: Canvas, chunk
     columns = [each for at in footprints for each in at.columns]
     left, right = min(each.start for each in columns), max(each.stop for each in columns)
     part = canvas.part(left, top, bottom - top, right - left)
-    counts, coverages = _sum_on(source, terms, source.counts, part, _visible(source, chunks, part), lambda _: None)
+    counts, coverages = _sum_on(source, terms, source.chunk, part, _visible(source, chunks, part), lambda _: None)
     return _Part((slice(top, bottom), slice(left, right)), counts, coverages, _frames(chunks))
 
 

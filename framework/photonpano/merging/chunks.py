@@ -11,6 +11,7 @@ from threading import Lock
 
 import numpy as np
 
+from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.geometry import BLOCK_FRAMES, steps_px
 from photonpano.values import Counts, FrameSpan, Homography
@@ -76,14 +77,14 @@ class CountsCache:
     """Caches the sums of frames that overlapping groups share; drops the least recently used. Safe from several threads."""
 
     def __init__(self, source: Source, capacity_bytes: int) -> None:
-        self._source = source
+        self._capture = capture_of(source)
         height, width = source.info.frame_shape
         self._max_sums = max(1, capacity_bytes // (4 * height * width))
         self._sums: OrderedDict[FrameSpan, Future[Counts]] = OrderedDict()
         self._lock = Lock()
 
     def __call__(self, span: FrameSpan) -> Counts:
-        """Return the sum of the frames of a span: (H, W) uint32, read-only.
+        """Return the sum of the frames of a span, read-only: see `Capture.chunk`.
 
         If several threads ask for one span at once, the first computes it and the others wait.
         """
@@ -98,7 +99,7 @@ class CountsCache:
         if cached is not None:
             return cached.result()
         try:
-            counts = self._source.counts(span)
+            counts = self._capture.chunk(span)
             counts.flags.writeable = False
         except BaseException as error:
             future.set_exception(error)

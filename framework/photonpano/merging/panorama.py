@@ -226,13 +226,11 @@ def render_panorama(
     context: Context,
     bytes_per_pixel: int = BYTES_PER_PIXEL,
     view: View | None = None,
-    ready: tuple[Canvas, Panorama] | None = None,
 ) -> RenderedPanorama:
     """Render the frames of a span, in tiles if the panorama exceeds the memory, in bytes.
 
     `write_tile` is called with each tile, its flux and weight, and the whole canvas. `bytes_per_pixel` is what the renderer
-    takes in one colour. What is `ready` was rendered of the same frames along the same motion, on its canvas; it is used if
-    that is the same.
+    takes in one colour.
 
     Raises:
         ExtentError: no frame shows the extent.
@@ -245,10 +243,7 @@ def render_panorama(
     tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
     gathered, noise = Thumbnail(canvas, reduction), CanvasNoise.of(source, trajectory, span, canvas)
     dynamic_range = DynamicRange(noise)
-    if ready is not None and len(tiles) == 1 and ready[0].same_as(canvas):
-        rendered = iter([ready[1]])
-    else:
-        rendered = render_tiles(renderer, source, trajectory, span, tiles, options.tolerance_px, context)
+    rendered = render_tiles(renderer, source, trajectory, span, tiles, options.tolerance_px, context)
     for tile, images in zip(tiles, rendered, strict=True):
         part = composed(images, source)
         write_tile(tile, part, canvas)

@@ -6,16 +6,17 @@ row takes three loops that the compiler vectorises: places in the image, one wor
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 from photonpano.geometry import Canvas
-from photonpano.geometry.sampling import Pixels
 from photonpano.merging.footprints import Footprint, Lens
 from photonpano.values import FloatArray
+
+Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint32] | NDArray[np.float32]
 
 _LEVELS = 65535  # highest level of a texture
 _BEHIND = 1e-6  # rays with less depth than this are behind the camera
@@ -36,18 +37,21 @@ class Texture(NamedTuple):
     zero: float
 
     @classmethod
-    def of(cls, image: Pixels) -> Texture:
+    def of(cls, image: Image) -> Texture:
         """Return the texture of an (h, w) image of finite values."""
-        low, high = min(0.0, float(image.min(initial=0))), float(image.max(initial=0))
-        scale = 2.0 ** np.ceil(np.log2((high - low) / _LEVELS)) if high > low else 1.0
-        zero = np.ceil(-low / scale)
+        scale, zero = 1.0, 0.0
+        if image.dtype != np.uint8:
+            image = np.ascontiguousarray(image, np.float32)
+            low, high = min(0.0, float(image.min(initial=0))), float(image.max(initial=0))
+            scale = 2.0 ** np.ceil(np.log2((high - low) / _LEVELS)) if high > low else 1.0
+            zero = np.ceil(-low / scale)
         texels = np.empty((image.shape[0] + 1, image.shape[1] + 1), np.uint64)
         _fill(texels, image, 1 / scale, zero)
         return cls(texels, scale, zero)
 
 
 @compiled
-def _fill(texels: NDArray[np.uint64], image: NDArray[np.float32], levels: float, zero: float) -> None:
+def _fill(texels: NDArray[np.uint64], image: NDArray[np.uint8] | NDArray[np.float32], levels: float, zero: float) -> None:
     """Fill the texels of an image; `levels` is their number in 1."""
     height, width = image.shape
     row = np.full(width + 2, np.uint32(zero))
@@ -57,7 +61,7 @@ def _fill(texels: NDArray[np.uint64], image: NDArray[np.float32], levels: float,
     for y in range(height + 1):
         pixels, inner = image[min(y, height - 1)], row[1 : width + 1]
         for x in range(width):
-            inner[x] = np.uint32(np.int32(min(pixels[x] * factor + rounded, most)))
+            inner[x] = np.uint32(np.int32(min(np.float32(pixels[x]) * factor + rounded, most)))
         if y == height:
             row[:] = np.uint32(zero)
         left, right, into = row[: width + 1], row[1:], texels[y]
@@ -68,13 +72,12 @@ def _fill(texels: NDArray[np.uint64], image: NDArray[np.float32], levels: float,
         above, pairs = pairs, above
 
 
-def average_squares(image: Pixels, side: int) -> NDArray[np.float32]:
+def average_squares(image: Image, side: int) -> Image:
     """Average squares of pixels, (h, w) to (ceil(h / side), ceil(w / side)); the image is padded with 0 to whole squares."""
-    pixels = np.ascontiguousarray(image, np.float32)
     if side == 1:
-        return pixels
+        return image
     averages = np.zeros((-(-image.shape[0] // side), -(-image.shape[1] // side)), np.float32)
-    _add_squares(pixels, side, averages)
+    _add_squares(np.ascontiguousarray(image, np.float32), side, averages)
     return averages
 
 

@@ -1,7 +1,7 @@
 """Camera responses and flux estimation, similarity of images, tone curves, and sums of packed bits."""
 
 from photonpano.photometry.noise import FluxRange, debiased, flux_std, frame_variance, measurable_range, saturated
-from photonpano.photometry.packed import BitOrder, packed_along_width, packed_counts, reversed_bits
+from photonpano.photometry.packed import MAX_FRAMES, BitOrder, packed_along_width, packed_counts, reversed_bits
 from photonpano.photometry.pictures import (
     Tone,
     WhiteBalance,
@@ -25,6 +25,7 @@ from photonpano.photometry.similarity import (
 )
 
 __all__ = [
+    "MAX_FRAMES",
     "BinaryResponse",
     "BinarySumResponse",
     "BitOrder",

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
 
-MAX_FRAMES = 255  # frames of a block, so that a count fits into a byte
 _BYTES = 2048  # bytes of a frame that are summed at a time, so that all rows of the sum fit into the level 1 cache
 _WORDS = _BYTES // 8
 _ROWS = 12  # rows of a stage: eight of input, three of counter, and the carry, of eight times the weight
@@ -20,12 +19,12 @@ _STAGES = 3  # stages, which count ones, eights and sixty-fours
 
 
 @compiled
-def add_counts(packed: NDArray[np.uint8], n_frames: int, little: bool, counts: NDArray[np.uint32]) -> None:
+def add_counts(packed: NDArray[np.uint8], n_frames: int, little: bool, counts: NDArray[np.uint8] | NDArray[np.uint32]) -> None:
     """Add packed frames to the counts of their pixels.
 
     Args:
         packed: (n B,) bytes of n frames, one after the other.
-        n_frames: n, at most `MAX_FRAMES`.
+        n_frames: n, at most 255, so that a count fits into a byte.
         little: whether the first pixel of a byte is its lowest bit, and not its highest.
         counts: (8 B,), which is increased.
     """
@@ -108,9 +107,9 @@ def _clear(target: NDArray[np.generic]) -> None:
 
 
 @compiled
-def _increase(counts: NDArray[np.uint32], by: NDArray[np.uint8]) -> None:
+def _increase(counts: NDArray[np.uint8] | NDArray[np.uint32], by: NDArray[np.uint8]) -> None:
     for pixel in range(len(counts)):
-        counts[pixel] += np.uint32(by[pixel])
+        counts[pixel] += by[pixel]
 
 
 @compiled

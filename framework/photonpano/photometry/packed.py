@@ -12,10 +12,18 @@ from photonpano.values import Counts
 # Whether the first of eight pixels is the highest bit of their byte or the lowest, as in `numpy.packbits`.
 BitOrder: TypeAlias = Literal["big", "little"]
 
+MAX_FRAMES = 255  # most frames whose sum fits into a byte
 _BLOCK_BYTES = 1024**2  # bytes of frames that are summed at a time: about the cache of a core
 
 
-def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None = None, bit_order: BitOrder = "big") -> Counts:
+def packed_counts(
+    packed: NDArray[np.uint8],
+    width: int,
+    counts: Counts | None = None,
+    bit_order: BitOrder = "big",
+    *,
+    small: bool = False,
+) -> Counts:
     """Sum bit-packed frames, pixel by pixel, in little memory beyond the result.
 
     Args:
@@ -24,9 +32,10 @@ def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None =
         width: W, columns of a frame; the bits beyond it are ignored.
         counts: (H, W) uint32 to add the sum to; None for zeros.
         bit_order: which bit of a byte is its first pixel.
+        small: whether the sum of up to 255 frames is given as uint8, which takes less time and memory.
 
     Returns:
-        (H, W) uint32: `counts` if it was given.
+        (H, W) uint32 or uint8: `counts` if it was given.
 
     Raises:
         ValueError: an array has another type or shape.
@@ -35,15 +44,15 @@ def packed_counts(packed: NDArray[np.uint8], width: int, counts: Counts | None =
         raise ValueError(
             f"packed frames of width {width} must be uint8 (n, H, {-(-width // 8)}), got {packed.dtype} {packed.shape}"
         )
-    from photonpano.photometry.bits import MAX_FRAMES, add_counts
+    from photonpano.photometry.bits import add_counts
 
     n_frames, height, row_bytes = packed.shape
     if counts is None:
-        counts = np.zeros((height, width), dtype=np.uint32)
+        counts = np.zeros((height, width), np.uint8 if small and n_frames <= MAX_FRAMES else np.uint32)  # type: ignore[assignment]
     elif counts.dtype != np.uint32 or counts.shape != (height, width) or not counts.flags.c_contiguous:
         raise ValueError(f"counts must be contiguous uint32 {(height, width)}, got {counts.dtype} {counts.shape}")
     whole = width == 8 * row_bytes
-    padded = counts if whole else np.zeros((height, 8 * row_bytes), dtype=np.uint32)
+    padded = counts if whole else np.zeros((height, 8 * row_bytes), counts.dtype)
     step = min(MAX_FRAMES, max(8, _BLOCK_BYTES // max(1, height * row_bytes)))
     for start in range(0, n_frames, step):
         block = np.ascontiguousarray(packed[start : start + step])

@@ -21,7 +21,6 @@ from photonpano.errors import ExtentError, InputError, OutputError, ProjectionEr
 from photonpano.execution.context import Context
 from photonpano.execution.threads import InOrder
 from photonpano.geometry import Canvas
-from photonpano.merging import MergeRenderer
 from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.merging.footprints import by_homographies
 from photonpano.merging.panorama import RenderedPanorama, render_panorama
@@ -43,12 +42,10 @@ def render_into(
     vignette: Vignette | None,
     motion: FrameMotion,
     context: Context,
-    ready: tuple[Canvas, Panorama] | None = None,
 ) -> tuple[RenderedPanorama, list[Decision]]:
     """Render the panorama, and write it, its motion, and what its capture was divided by. For errors, see `run`.
 
-    `source` is divided by the vignette and in its light. `ready` is the merge of all frames along this motion, where it is
-    known. Returns the panorama, and the decisions of renderer and exporters.
+    `source` is divided by the vignette and in its light. Returns the panorama, and the decisions of renderer and exporters.
     """
     decisions: list[Decision] = []
     renderer = build_renderer(plan, source, decisions, context.in_order)
@@ -65,7 +62,6 @@ def render_into(
             context,
             renderer.bytes_per_pixel,
             view_of(motion, source, plan.render.projection, level=plan.render.horizon == "level"),
-            ready if renderer.merges else None,
         )
     renderer.require_seen(panorama.coverage_share)
     folder.write_results(panorama, motion)
@@ -100,11 +96,6 @@ class AttributedRenderer:
     origin: str
     bytes_per_pixel: int
     any_canvas: bool = True
-
-    @property
-    def merges(self) -> bool:
-        """Whether it renders what the residuals were measured against: the merge of all frames."""
-        return isinstance(self.component, MergeRenderer)
 
     def render(
         self,

@@ -107,8 +107,7 @@ def make_panorama(run: BegunRun) -> None:
         source, context = state.view
         explained = refine(state, build_refiners(plan, source, journal))
         verdict = judge(explained, state.results, journal)
-        merged = explained.canvas, explained.panorama
-        panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context, merged)
+        panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context)
         run.observers.rendered(panorama.canvas, panorama.seconds)
         if plan.output.keep == "exposures":
             with folder.writing():

@@ -91,8 +91,7 @@ class State:
     @cached_property
     def fit(self) -> MotionFit:
         """How well the motion explains the photons; `CanvasTooLargeError` or `LocationError` if the panorama has no canvas."""
-        render, memory = self.plan.render, int(self.plan.run.memory)
-        return MotionFit(self.view.source, self.motion, render.tolerance_px, memory, self.view.context)
+        return MotionFit(self.view.source, self.motion, int(self.plan.run.memory), self.view.context)
 
 
 def model_of(plan: Plan) -> MotionModel:

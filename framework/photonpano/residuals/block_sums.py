@@ -70,7 +70,7 @@ def sample_places(
 
 @compiled
 def add_block_sums(
-    counts: NDArray[np.float32] | NDArray[np.int32],
+    counts: NDArray[np.float32] | NDArray[np.uint8],
     dark: NDArray[np.float32],
     n_frames: float,
     mean: NDArray[np.float32],
@@ -143,7 +143,7 @@ def add_block_sums(
 
 @compiled
 def add_pixel_sums(
-    counts: NDArray[np.float32] | NDArray[np.int32],
+    counts: NDArray[np.float32] | NDArray[np.uint8],
     n_frames: float,
     mean: NDArray[np.float32],
     residual: NDArray[np.float32],

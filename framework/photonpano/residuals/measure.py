@@ -214,12 +214,12 @@ class _Colour:
         masked = None if capture.valid.all() else np.where(capture.valid, np.float32(0), np.float32(np.nan))
         return cls(capture, prediction, masked, corrected, dark, np.maximum(dark, 0), slope)
 
-    def counted(self, raw: Counts, n_frames: int) -> NDArray[np.float32] | NDArray[np.int32]:
+    def counted(self, raw: Counts, n_frames: int) -> NDArray[np.float32] | NDArray[np.uint8]:
         """Return the counts of a span, corrected, NaN where masked: (H, W)."""
-        # Signed integers become floats at no cost in the loop.
-        signed = np.ascontiguousarray(raw, np.uint32).view(np.int32)
-        counts: Any = signed if self.corrected is None else self.corrected(raw, n_frames)
-        found: NDArray[np.float32] | NDArray[np.int32] = counts if self.masked is None else counts + self.masked
+        counts: Any = raw if self.corrected is None else self.corrected(raw, n_frames)
+        if counts.dtype != np.uint8:
+            counts = np.ascontiguousarray(counts, np.float32)
+        found: NDArray[np.float32] | NDArray[np.uint8] = counts if self.masked is None else counts + self.masked
         return found
 
     def noise_beside(self, mean: FluxImage) -> FluxImage:
@@ -250,7 +250,7 @@ def _measured(
     frames_seen = max(predictions.frames_seen / len(colours), 1.0)
     images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
     for index, (span, homography) in enumerate(zip(spans, homographies, strict=True)):
-        raw = capture.counts(span)
+        raw = capture.chunk(span)
         sums[:] = 0
         for colour in colours:
             counts = colour.counted(raw, len(span))

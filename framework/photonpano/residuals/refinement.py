@@ -35,6 +35,9 @@ _STANDS_OUT = 30.0
 # The measured steps of three spans bound the error of frames that are at most one span away from one.
 _BOUND_SPANS, _NEAR_SPANS = 3, 1.0
 
+# Motion within which frames are summed for the panorama of the residuals. Of its blur, the part across the noise of single
+# pixels is smoothed away anyway; 0.125 px takes four times as long, and the residuals are the same to 1 %.
+TOLERANCE_PX = 0.5
 _DARK = -0.5  # spans that are darker than predicted by half of the light or more show too little to be measured
 # A motion is worse if the scatter of the shifts grows by this factor, or the reduced chi-square of the photons by this much.
 _WORSE_RATIO, _WORSE_MISFIT = 1.05, 0.01
@@ -149,12 +152,10 @@ class Refinement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explained:
-    """The refined motion, and the residuals of the photons from the panorama along it."""
+    """The refined motion, and the residuals of the photons from a panorama along it."""
 
     motion: FrameMotion  # of every frame; its expected error covers what the residuals show
-    # rendered along the motion, for the residuals; in colour, with an image for each colour of the filter array
-    panorama: Panorama
-    canvas: Canvas  # of the panorama
+    canvas: Canvas  # of the panorama that the residuals were measured against
     residuals: Residuals  # observed minus predicted photons
     ratio: float  # see `residual_ratio`
     refinements: tuple[Refinement, ...]  # what each refiner did
@@ -171,15 +172,15 @@ class MotionFit:
         ratio: see `residual_ratio`.
     """
 
-    def __init__(self, source: Source, motion: FrameMotion, tolerance_px: float, memory: int, context: Context) -> None:
-        """Measure the residuals; frames are summed where the motion stays within `tolerance_px`. `memory` is in bytes.
+    def __init__(self, source: Source, motion: FrameMotion, memory: int, context: Context) -> None:
+        """Measure the residuals. `memory` is in bytes.
 
         Raises:
             CanvasTooLargeError: the panorama is far larger than what fits into the memory.
             LocationError: frames reach the horizon of the reference plane.
         """
         self.motion = motion
-        self._source, self._tolerance_px, self._memory, self._context = source, tolerance_px, memory, context
+        self._source, self._memory, self._context = source, memory, context
         given = motion.homographies, motion.span
         self.residuals: Residuals = context.checkpoints.once("residuals", self._measured, *given)
         self.ratio = residual_ratio(self.residuals)
@@ -198,9 +199,9 @@ class MotionFit:
 
     @cached_property
     def panorama(self) -> Panorama:
-        """The panorama along the motion."""
+        """The panorama along the motion; in colour, with an image for each colour of the filter array."""
         motion = self.motion
-        return render(self._source, motion.trajectory, motion.span, self.canvas, self._tolerance_px, self._context)
+        return render(self._source, motion.trajectory, motion.span, self.canvas, TOLERANCE_PX, self._context)
 
     @cached_property
     def predictions(self) -> Predictions:
@@ -217,7 +218,7 @@ class MotionFit:
         std_px, residuals = self.motion.std_px, self.residuals
         std_px = np.hypot(bounded_std_px(std_px, residuals), unexplained_px(residuals, len(std_px)))
         motion = replace(self.motion, std_px=std_px)
-        return Explained(motion, self.panorama, self.canvas, residuals, self.ratio, tuple(refinements))
+        return Explained(motion, self.canvas, residuals, self.ratio, tuple(refinements))
 
     def _measured(self) -> Residuals:
         return measure(self.motion.span, self.predictions, self._context)

@@ -34,7 +34,7 @@ def cuts_of(street: np.ndarray) -> Callable[..., tuple[Cut, ...]]:
         everywhere, std_px = np.ones(N_FRAMES, dtype=bool), np.full(N_FRAMES, 0.05)
         trajectory, span = FrameTrajectory(homographies), FrameSpan(0, N_FRAMES)
         motion = FrameMotion(trajectory, span, homographies, everywhere, std_px, N_FRAMES // 2, SHAPE)
-        return find_cuts(source, MotionFit(source, motion, 0.25, 2**30, Context()), Context(2))
+        return find_cuts(source, MotionFit(source, motion, 2**30, Context()), Context(2))
 
     return cuts_of
 
@@ -104,7 +104,7 @@ def test_long_tremor_is_searched_without_keeping_its_sums(street: np.ndarray, mo
         homographies, everywhere = np.tile(np.eye(3), (n_frames, 1, 1)), np.ones(n_frames, dtype=bool)
         span, std_px = FrameSpan(0, n_frames), np.full(n_frames, 0.05)
         motion = FrameMotion(FrameTrajectory(homographies), span, homographies, everywhere, std_px, 0, (48, 64))
-        look = MotionFit(source, motion, 0.25, 2**30, Context())
+        look = MotionFit(source, motion, 2**30, Context())
         tracemalloc.start()
         try:
             assert find_cuts(source, look, Context()) == ()
