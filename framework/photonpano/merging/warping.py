@@ -19,6 +19,10 @@ from photonpano.values import FloatArray
 Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint32] | NDArray[np.float32]
 
 _LEVELS = 65535  # highest level of a texture
+# Pixels of a frame from one exact place to the next: of 8, places between are right to 0.01 px through a strong lens.
+NODES_PX = (64, 32, 16, 8)
+_FOLDED = 8.0  # places that lie further apart than this, in px for a pixel, are on two sides of a pole or a horizon
+_STEPS = np.arange(max(NODES_PX), dtype=np.float32)  # converting integers in the loop would take longer than the rest of it
 _BEHIND = 1e-6  # rays with less depth than this are behind the camera
 
 
@@ -231,6 +235,61 @@ def _add_warped(
             amount, coverage = np.float32(amounts[k]), grid.coverages[k, row, x]
             for t in range(len(weight)):
                 coverage[t] += amount * weight[t]
+
+
+@compiled
+def sample(
+    image: Texture,
+    nearest: NDArray[np.float32],
+    nodes: NDArray[np.float32],
+    step: int,
+    period: tuple[float, float],
+    into: NDArray[np.float32],
+) -> None:
+    """Sample two images at the pixels of a frame, the first linearly, the second at the nearest pixel: (2, H, W).
+
+    Args:
+        image: (h, w) pixels.
+        nearest: (h + 2, w + 1), the second image, with a row of zeros on either side and a column of them before.
+        nodes: (y, x, 2) places in the images of every `step`th pixel; places between are interpolated linearly. Nothing is
+            sampled where they are further apart than `_FOLDED` px a pixel.
+        step: one of `NODES_PX`.
+        period: first column of a turn, and columns of a full turn, by which places are brought onto the images; infinite ones
+            if they are no turn.
+        into: output; 0 beside the images.
+    """
+    height, width = into.shape[1:]
+    n_nodes, stride = nodes.shape[1], np.int32(image.texels.shape[1])
+    u, v = np.empty(n_nodes * step, np.float32), np.empty(n_nodes * step, np.float32)
+    places, share = np.empty(len(u), np.uint32), np.empty(len(u), np.float32)
+    words, flat, half = np.empty(width, np.uint64), nearest.reshape(-1), np.float32(0.5)
+    first, turn, far, nowhere = np.float32(period[0]), np.float32(period[1]), np.float32(_FOLDED * step), np.float32(-9)
+    for y in range(height):
+        above, below, part = nodes[y // step], nodes[y // step + 1], np.float32(y % step) / np.float32(step)
+        for k in range(n_nodes - 1):
+            x0, y0 = above[k, 0] + part * (below[k, 0] - above[k, 0]), above[k, 1] + part * (below[k, 1] - above[k, 1])
+            x1 = above[k + 1, 0] + part * (below[k + 1, 0] - above[k + 1, 0])
+            y1 = above[k + 1, 1] + part * (below[k + 1, 1] - above[k + 1, 1])
+            if abs(x1 - x0) + abs(y1 - y0) + abs(below[k, 0] - above[k, 0]) + abs(below[k, 1] - above[k, 1]) < far:
+                dx, dy = (x1 - x0) / np.float32(step), (y1 - y0) / np.float32(step)
+            else:  # NaN, too
+                x0, y0, dx, dy = nowhere, nowhere, np.float32(0), np.float32(0)
+            along, across = u[k * step : (k + 1) * step], v[k * step : (k + 1) * step]
+            for t in range(len(along)):
+                along[t], across[t] = x0 + _STEPS[t] * dx, y0 + _STEPS[t] * dy
+        if turn < np.inf:
+            for t in range(width):
+                u[t] -= turn * np.floor((u[t] - first) / turn)
+        a, b, at = u[:width], v[:width], places[:width]
+        _places(a, b, image.texels.shape, at, share)
+        _read(image, at, words)
+        value, known = into[0, y], into[1, y]
+        value[:] = np.float32(0)
+        _add_interpolated(image, words, a, b, value)
+        for t in range(width):
+            at[t] = np.uint32(at[t] + np.uint32(np.int32(a[t] + half) + stride * np.int32(b[t] + half)))
+        for t in range(width):
+            known[t] = flat[np.uint64(at[t])]
 
 
 @compiled

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.compiling import compiled
-from photonpano.geometry.sampling import run_from, sample_run, visible_columns
 
 BLOCK_PX = 16  # side of a block, px
 # Sums of a block. With residual r, predicted count m, its gradient (gx, gy) along x and y, and the variance v of r: gx gx / v,
@@ -26,65 +25,22 @@ def n_blocks(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 @compiled
-def sample_view(
-    mean: NDArray[np.float32], precision: NDArray[np.float32], to_canvas: NDArray[np.float64], into: NDArray[np.float32]
-) -> None:
-    """Sample two images of a canvas at the pixels of a frame: (2, h, w); NaN where the canvas ends.
-
-    The mean is interpolated linearly. The precision, which only weights, is that of the nearest pixel.
-    """
-    height, width = into.shape[1:]
-    for y in range(height):
-        first, last = visible_columns(to_canvas, y, 0.0, mean.shape[1] - 1.0, 0.0, mean.shape[0] - 1.0, width)
-        into[:, y, :first] = np.nan
-        into[:, y, last:] = np.nan
-        x = first
-        while x < last:
-            run = run_from(to_canvas, x, y, last - x, mean.shape[0], mean.shape[1])
-            sample_run(mean, run, into[0, y, x : x + run.size])
-            row = precision[run.top + int(run.b0 > 0.5)]
-            left = run.left + int(run.a0 > 0.5)
-            into[1, y, x : x + run.size] = row[left : left + run.size]
-            x += run.size
-
-
-@compiled
-def sample_places(
-    mean: NDArray[np.float32], precision: NDArray[np.float32], places: NDArray[np.float32], into: NDArray[np.float32]
-) -> None:
-    """Sample two images at (h, w, 2) places, as `sample_view` does: (2, h, w); NaN where the images end."""
-    right, bottom = np.float32(mean.shape[1] - 1), np.float32(mean.shape[0] - 1)
-    for y in range(into.shape[1]):
-        for t in range(into.shape[2]):
-            u, v = places[y, t, 0], places[y, t, 1]
-            if not (u >= 0 and u <= right and v >= 0 and v <= bottom):
-                into[0, y, t] = into[1, y, t] = np.nan
-                continue
-            left, top = min(int(u), mean.shape[1] - 2), min(int(v), mean.shape[0] - 2)
-            a, b = u - np.float32(left), v - np.float32(top)
-            upper = mean[top, left] + a * (mean[top, left + 1] - mean[top, left])
-            lower = mean[top + 1, left] + a * (mean[top + 1, left + 1] - mean[top + 1, left])
-            into[0, y, t] = upper + b * (lower - upper)
-            into[1, y, t] = precision[top + int(b > 0.5), left + int(a > 0.5)]
-
-
-@compiled
 def add_block_sums(
     counts: NDArray[np.float32] | NDArray[np.uint8],
     dark: NDArray[np.float32],
     n_frames: float,
     mean: NDArray[np.float32],
-    precision: NDArray[np.float32],
+    variance: NDArray[np.float32],
     sums: NDArray[np.float32],
 ) -> None:
     """Add the sums of a span to blocks. The border pixels of a frame are left out, for they have no gradient.
 
     Args:
         counts: (H, W) summed counts, NaN for masked pixels.
-        dark: (H, W) variance of the count of a frame beside that of `precision`, such as that of dark counts.
+        dark: (H, W) variance of the count of a frame beside that of its photons, such as that of dark counts.
         n_frames: frames of the span.
-        mean: (H, W) expected count of a frame, NaN where unknown.
-        precision: (H, W) 1 / variance of the count of a frame; 0 or NaN where unknown.
+        mean: (H, W) expected count of a frame.
+        variance: (H, W) variance of the photons of a frame; 0 where it and the mean, also of a neighbour, are not known.
         sums: (h, w, 12), see `n_blocks`; added to.
     """
     height, width = mean.shape
@@ -93,26 +49,22 @@ def add_block_sums(
     zero, one = np.float32(0), np.float32(1)
     for y in range(1, height - 1):
         row, above, below = mean[y], mean[y - 1], mean[y + 1]
-        lit, weights, extra = counts[y], precision[y], dark[y]
+        lit, variances, extra = counts[y], variance[y], dark[y]
         for block in range((width + BLOCK_PX - 1) // BLOCK_PX):
             start, stop = max(1, block * BLOCK_PX), min(width - 1, (block + 1) * BLOCK_PX)
             size = stop - start
             here, left, right = row[start:stop], row[start - 1 : stop - 1], row[start + 1 : stop + 1]
             up, down = above[start:stop], below[start:stop]
-            k, p, e = lit[start:stop], weights[start:stop], extra[start:stop]
+            k, q, e = lit[start:stop], variances[start:stop], extra[start:stop]
             xx = xy = yy = xr = yr = xm = ym = mm = mr = rr = vv = ms = zero
             for t in range(size):
                 m, gx, gy = here[t] * n, (right[t] - left[t]) * half, (down[t] - up[t]) * half
                 r = np.float32(k[t]) - m
-                w = p[t] / (n * (one + e[t] * p[t]))
-                seen = gx + gy + r
-                ok = seen == seen and w > zero
-                w = w if ok else zero
+                ok = r == r and q[t] > zero
+                v = n * (q[t] + e[t]) if ok else zero
+                w = one / v if ok else zero
                 m = m if ok else zero
-                gx = gx if ok else zero
-                gy = gy if ok else zero
                 r = r if ok else zero
-                v = one / w if ok else zero
                 wx, wy, wm = w * gx, w * gy, w * m
                 xx += wx * gx
                 xy += wx * gy
@@ -146,20 +98,21 @@ def add_pixel_sums(
     counts: NDArray[np.float32] | NDArray[np.uint8],
     n_frames: float,
     mean: NDArray[np.float32],
+    variance: NDArray[np.float32],
     residual: NDArray[np.float32],
     total: NDArray[np.float32],
 ) -> None:
-    """Add residuals and expected counts to the sums (H, W) of each pixel; unknown pixels are NaN in `counts` or `mean`.
+    """Add residuals and expected counts to the sums (H, W) of each pixel; not known are NaN counts, and those of variance 0.
 
-    `counts` are summed over `n_frames`, `mean` is the expected count of one.
+    `counts` are summed over `n_frames`, mean and variance are those of one.
     """
     n, zero = np.float32(n_frames), np.float32(0)
     for y in range(mean.shape[0]):
-        k, m, residuals, totals = counts[y], mean[y], residual[y], total[y]
+        k, m, q, residuals, totals = counts[y], mean[y], variance[y], residual[y], total[y]
         for t in range(len(k)):
             expected = m[t] * n
             r = np.float32(k[t]) - expected
-            known = r == r
+            known = r == r and q[t] > zero
             residuals[t] += r if known else zero
             totals[t] += expected if known else zero
 

@@ -242,6 +242,7 @@ def _measured(
     row, column = np.mgrid[: grid[0], : grid[1]]
     middle = np.stack([_middles(column, width), _middles(row, height)], axis=-1)
     lever = middle - corners(shape).mean(axis=0)
+    ideal = first.ideal(middle)
     colours = [_Colour.of(*part) for part in predictions.parts]
     capture = colours[0].capture
     normal, gradient, misfit = np.zeros((len(spans), 5, 5)), np.zeros((len(spans), 5)), np.zeros(len(spans))
@@ -257,10 +258,10 @@ def _measured(
             colour.prediction.view(homography, images, span)
             add_block_sums(counts, colour.noise_beside(images[0]), float(len(span)), images[0], images[1], sums)
             if index % _PIXEL_STRIDE == 0:
-                add_pixel_sums(counts, float(len(span)), images[0], total.pixel_residual, total.pixel_mean)
+                add_pixel_sums(counts, float(len(span)), images[0], images[1], total.pixel_residual, total.pixel_mean)
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
         own = min(0.5, len(span) / frames_seen)
-        cells = first.cells(homography, middle)
+        cells = first.cells(homography, middle, ideal)
         misfit[index] = fold(sums, lever, *cells, 1 - own, normal[index], gradient[index], total)
     return (normal, gradient, misfit), total
 

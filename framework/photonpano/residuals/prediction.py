@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 from photonpano.capture import Capture, capture_of
 from photonpano.contracts.protocols import Source, Trajectory
-from photonpano.geometry import Camera, Canvas, corners
+from photonpano.geometry import Camera, Canvas
 from photonpano.merging.light import gain_image
+from photonpano.merging.warping import NODES_PX, Texture, sample
 from photonpano.photometry import frame_variance
-from photonpano.residuals.block_sums import sample_places, sample_view
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Panorama, Response
 
 _BLUR_PX = 0.7  # standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture
 _INTERPOLATION_PX2 = 1 / 6  # variance of the kernel of one linear interpolation, averaged over the fractions of a pixel
 _MANY_FRAMES = 1e4  # of a mean count that is exact
+_NODES_ERROR_PX = 0.005  # error of places that are interpolated between exact ones
 _MARGIN = 4  # columns with which a full turn is continued on each side: more than the smoothing reaches
-_STRAIGHT_RUN_PX = 64  # from this length of straight runs on, the compiled interpolation is faster than OpenCV's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,18 +32,20 @@ class Prediction:
     """
 
     canvas: Canvas  # of the panorama
-    # (H, W) float32, expected count of a frame; NaN where the panorama was not seen. Of a full turn, it has `margin` columns
-    # more on each side, which continue on the other side.
-    mean: FluxImage
-    precision: FluxImage  # (H, W) float32, 1 / variance of the count of a frame; 0 where the panorama was not seen
+    # expected count of a frame, an image (H, W). Of a full turn, it has `margin` columns more on each side, which continue on
+    # the other side.
+    mean: Texture
+    # (H + 2, W + 1) float32, variance of the count of a frame, in a border of zeros; 0 where the panorama, or a place up to two
+    # pixels away, was not seen
+    variance: FluxImage
     trajectory: Trajectory
     frame_shape: tuple[int, int]  # (height, width) of a frame
     frames_seen: float  # frames that saw a place of the panorama, the median over its pixels
     response: Response  # of the camera
     light: Light | None = None  # the gain of each frame; None in steady light
-    # (H, W, 3) homogeneous ideal pixels of the pixels of a frame; None if homographies map them to the panorama
-    ideal: FloatArray | None = None
+    camera: Camera | None = None  # whose lens distorts; None if none does
     margin: int = 0  # see `mean`
+    _kept_nodes: dict[int, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -68,16 +70,18 @@ class Prediction:
         blur = np.float32(_BLUR_PX**2 + _INTERPOLATION_PX2)
         sharp = np.maximum(flux - blur / 2 * cv2.Laplacian(flux, cv2.CV_32F, ksize=1), 0)
         mean = response.mean_count(np.asarray(sharp, np.float32))
-        mean[~inside] = np.nan
-        precision = np.asarray(1 / frame_variance(flux, response, response.mean_count), np.float32)
-        precision[~inside] = 0
+        # The gradient at a place is that of interpolated pixels up to two away.
+        reach, border = np.ones((5, 5), np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
+        known = cv2.erode(inside.astype(np.uint8), reach, **border).astype(np.bool_)
+        variance = np.where(known, frame_variance(flux, response, response.mean_count), np.float32(0))
+        variance = np.pad(variance.astype(np.float32, copy=False), ((1, 1), (1, 0)))
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
-        remapped = not canvas.planar or (camera is not None and camera.distorts)
-        ideal = _ideal(frame_shape, camera) if remapped else None
-        return cls(canvas, mean, precision, trajectory, frame_shape, frames_seen, response, light, ideal, margin)
+        texture = Texture.of(np.where(inside, mean, np.float32(0)))
+        lens = camera if camera is not None and camera.distorts else None
+        return cls(canvas, texture, variance, trajectory, frame_shape, frames_seen, response, light, lens, margin)
 
     def view(self, homography: Homography, into: NDArray[np.float32], span: FrameSpan | None = None) -> None:
-        """Sample mean and precision at the pixels of a frame into (2, H, W) float32, NaN where the panorama was not seen.
+        """Sample mean and variance at the pixels of a frame into (2, H, W) float32; the variance is 0 where they are not known.
 
         `homography` maps frame pixels to reference pixels; `span` is of the frames whose light is predicted, None for the mean.
         """
@@ -86,39 +90,60 @@ class Prediction:
             self._relight(into, gain_image(self.light, span, homography, self.frame_shape))
 
     def _relight(self, images: NDArray[np.float32], gain: FluxImage) -> None:
-        """Replace mean and precision by those at `gain` times the flux."""
-        mean, precision = images
-        known = np.isfinite(mean) & (precision > 0)
-        flux = self.response.flux(np.where(known, mean, np.float32(0)), _MANY_FRAMES)
+        """Replace mean and variance by those at `gain` times the flux."""
+        mean, variance = images
+        flux = self.response.flux(mean, _MANY_FRAMES)
         lit = np.asarray(gain * flux, np.float32)
-        mean[:] = np.where(known, self.response.mean_count(lit), np.float32(np.nan))
+        mean[:] = self.response.mean_count(lit)
         before, after = (frame_variance(each, self.response, self.response.mean_count) for each in (flux, lit))
-        precision *= before / after
+        variance *= after / before
 
     def _sample(self, homography: Homography, into: NDArray[np.float32]) -> None:
-        if self.ideal is not None:
-            places = self.canvas.pixels(self.ideal @ (self.canvas.plane_to_rays @ homography).T)
-            places[..., 0] += self.margin
-            sample_places(self.mean, self.precision, places.astype(np.float32), into)
-            return
-        to_canvas = np.ascontiguousarray(self.canvas.transform @ homography)
-        if self._straight(to_canvas):
-            sample_view(self.mean, self.precision, to_canvas, into)
-            return
-        height, width = self.frame_shape
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        for image, place in zip((self.mean, self.precision), into, strict=True):
-            cv2.warpPerspective(image, to_canvas, (width, height), place, flags, cv2.BORDER_CONSTANT, float("nan"))
+        step = min(NODES_PX)
+        if self._homographic:
+            depth = self.canvas.transform[2:] @ homography
+            bend = abs(depth[0, 0]) + abs(depth[0, 1])
+            step = next((each for each in NODES_PX if each**2 / 4 * bend < _NODES_ERROR_PX * abs(depth[0, 2])), step)
+        places = self._places(homography, self._nodes(step))
+        period, first = self.canvas.period_px, 0.0
+        if period is not None:
+            # Neighbours are on the same turn.
+            middle = places[places.shape[0] // 2, places.shape[1] // 2, 0]
+            places[..., 0] -= period * np.round((places[..., 0] - middle) / period)
+            first = min(-0.5, (self.canvas.width - 1 - period) / 2) + self.margin
+        places[..., 0] += self.margin
+        sample(self.mean, self.variance, places.astype(np.float32), step, (first, period or np.inf), into)
 
-    def cells(self, homography: Homography, pixels: FloatArray) -> tuple[FloatArray, Homography]:
+    @property
+    def _homographic(self) -> bool:
+        """Whether homographies map pixels of a frame to the panorama."""
+        return self.canvas.planar and self.camera is None
+
+    def _nodes(self, step: int) -> FloatArray:
+        """Return the homogeneous ideal pixels of every `step`th pixel along y and x, and of one beyond the last: (h, w, 3)."""
+        if step not in self._kept_nodes:
+            y, x = (np.arange(-(-length // step) + 1.0) * step for length in self.frame_shape)
+            self._kept_nodes[step] = self.ideal(np.stack(np.meshgrid(x, y), axis=-1))
+        return self._kept_nodes[step]
+
+    def ideal(self, pixels: FloatArray) -> FloatArray:
+        """Return the homogeneous ideal pixels of pixels (..., 2) of a frame: (..., 3)."""
+        ideal = pixels if self.camera is None else self.camera.ideal(pixels)
+        return np.concatenate([ideal, np.ones((*pixels.shape[:-1], 1))], axis=-1)
+
+    def _places(self, homography: Homography, ideal: FloatArray) -> FloatArray:
+        """Return where homogeneous ideal pixels lie on the panorama: (..., 2); NaN behind a plane."""
+        return self.canvas.pixels(ideal @ (self.canvas.plane_to_rays @ homography).T)
+
+    def cells(self, homography: Homography, pixels: FloatArray, ideal: FloatArray) -> tuple[FloatArray, Homography]:
         """Return pixels of a frame, (h, w, 2), and the (3, 3) map from them to pixels of the panorama.
 
-        Where no homography maps them, the places on the panorama are returned for the pixels, and the identity.
+        Where no homography maps them, the places on the panorama are returned for the pixels, and the identity. `ideal` are
+        the homogeneous ideal pixels, from `ideal`.
         """
-        if self.ideal is None:
+        if self._homographic:
             return pixels, self.canvas.transform @ homography
-        y, x = np.rint(np.moveaxis(pixels, -1, 0)[::-1]).astype(int)
-        places = self.canvas.pixels(self.ideal[y, x] @ (self.canvas.plane_to_rays @ homography).T)
+        places = self._places(homography, ideal)
         return np.where(np.isfinite(places), places, -1e6), np.eye(3)
 
     def predicted(self, instant: float) -> tuple[FluxImage, FluxImage]:
@@ -126,20 +151,8 @@ class Prediction:
         images = np.empty((2, *self.frame_shape), np.float32)
         frame = max(0, round(float(instant)))
         self.view(self.trajectory.at([instant])[0], images, FrameSpan(frame, frame + 1))
-        mean, precision = images
-        known = np.isfinite(mean) & (precision > 0)
-        mean[~known] = np.nan
-        return mean, np.divide(1, precision, out=np.full_like(precision, np.nan), where=known)
-
-    def _straight(self, to_canvas: Homography) -> bool:
-        """Return whether neighbours on a row of the frame lie at neighbours on the canvas, over long runs."""
-        x, y = corners(self.frame_shape).T
-        depth = to_canvas[2, 0] * x + to_canvas[2, 1] * y + to_canvas[2, 2]
-        u = (to_canvas[0, 0] * x + to_canvas[0, 1] * y + to_canvas[0, 2]) / depth
-        v = (to_canvas[1, 0] * x + to_canvas[1, 1] * y + to_canvas[1, 2]) / depth
-        along = np.abs(to_canvas[0, 0] / depth - u * to_canvas[2, 0] / depth - 1)
-        across = np.abs(to_canvas[1, 0] / depth - v * to_canvas[2, 0] / depth)
-        return bool(max(along.max(), across.max()) < 1 / _STRAIGHT_RUN_PX)
+        images[:, images[1] <= 0] = np.nan
+        return images[0], images[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,14 +208,6 @@ def _continued(panorama: Panorama, margin: int) -> Panorama:
         return panorama
     flux, weight = (np.pad(each, ((0, 0), (margin, margin)), mode="wrap") for each in (panorama.flux, panorama.weight))
     return Panorama(flux, weight, panorama.canvas)
-
-
-def _ideal(frame_shape: tuple[int, int], camera: Camera | None) -> FloatArray:
-    """Return the homogeneous ideal pixels of the pixels of a frame: (H, W, 3)."""
-    y, x = np.mgrid[: frame_shape[0], : frame_shape[1]]
-    pixels = np.stack([x, y], axis=-1).astype(np.float64)
-    ideal = pixels if camera is None else camera.ideal(pixels)
-    return np.concatenate([ideal, np.ones((*frame_shape, 1))], axis=-1)
 
 
 def _smoothed(image: FluxImage) -> FluxImage:

@@ -70,7 +70,7 @@ def test_steps_are_the_tremor_that_the_motion_lacks() -> None:
     # The panorama is blurred by the tremor, too, which makes it seem smaller.
     assert 0.7 < slope < 1.1
     assert residual_ratio(found) > 2
-    assert unexplained_px(found, FRAMES).mean() == pytest.approx(0.4 / np.sqrt(2), rel=0.35)
+    assert unexplained_px(found, FRAMES).mean() == pytest.approx(0.4 / np.sqrt(2), rel=0.4)
     assert bounded_std_px(np.full(FRAMES, 10.0), found).min() == 10
 
 
