@@ -164,7 +164,7 @@ def worse_in_light(proposed: MotionFit, before: MotionFit) -> str:
     Where the light explains the brightness of the frames, the scatter of the shifts does not count: groups blur the panorama of
     level 1 by a tremor, and the steps against it are wrong by much more than their noise.
     """
-    return "" if proposed.misfit < _EXPLAINED * before.misfit else proposed.worse_than(before)
+    return "" if proposed.reduced_chi2 < _EXPLAINED * before.reduced_chi2 else proposed.worse_than(before)
 
 
 def later_levels(state: State, journal: list[Decision]) -> Proposal:

@@ -83,8 +83,8 @@ def head_of(record: RunRecord) -> dict[str, Any]:
 def _unexplained(record: RunRecord, explained: Explained, panorama: RenderedPanorama) -> dict[str, Any]:
     residuals, canvas = explained.residuals, panorama.canvas
     return {
-        "misfit": float(residuals.misfit.mean()),
-        "misfit_over_panorama": residual_figures.misfit_over_panorama(residuals, explained.canvas, canvas),
+        "reduced_chi2": float(residuals.reduced_chi2.mean()),
+        "chi2_over_panorama": residual_figures.chi2_over_panorama(residuals, explained.canvas, canvas),
         "over_sensor": residual_figures.over_sensor(residuals),
         "shifts_are_drawn": residual_figures.significant_shifts(residuals) is not None,
         "shifts_over_time": residual_figures.shifts_over_time(residuals, record["source"]["frame_rate_hz"]),

@@ -1,4 +1,4 @@
-"""Figures of the residuals: maps of the misfit, brightness and shifts over the sensor, spectra."""
+"""Figures of the residuals: maps of the reduced chi-square, brightness and shifts over the sensor, spectra."""
 
 from __future__ import annotations
 
@@ -39,29 +39,29 @@ SMALLEST_SHIFT_PX = 0.06  # shifts of blocks are drawn if their root mean square
 _FEWEST_BLOCKS = 16  # minimum number of blocks per square of the panorama
 _FEWEST_SPANS = 16  # minimum number of spans for a spectrum
 _WINDOW_SPANS = 512  # maximum window of the spectrum
-_MISFIT_RANGE = (0.5, 2.0)  # minimum colour range of the misfit, widened by larger values
-_MISFIT_TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_CHI2_RANGE = (0.5, 2.0)  # minimum colour range of the reduced chi-square, widened by larger values
+_REDUCED_CHI2_TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _FLICKER_PIXELS = 200  # approximate longer side of flicker maps
 _FLICKERS = 0.2  # minimum amplitude with a phase, relative to the largest amplitude
 _GAIN_RANGE_PERCENT = 5.0  # minimum colour range of the brightness, to both sides
 
 
-def misfit_over_panorama(residuals: Residuals, measured: Canvas, canvas: Canvas) -> str:
-    """Draw the misfit of each place of the panorama.
+def chi2_over_panorama(residuals: Residuals, measured: Canvas, canvas: Canvas) -> str:
+    """Draw the reduced chi-square of each place of the panorama.
 
     On its canvas, or on the one on which the residuals were `measured` if that has another projection.
     """
     same = same_projection(measured, canvas)
     shape, onto = (canvas.shape, canvas.transform) if same else (measured.shape, measured.transform)
-    misfit, (left, top, right, bottom) = misfit_cells(residuals, measured, onto)
+    reduced_chi2, (left, top, right, bottom) = chi2_cells(residuals, measured, onto)
     with map_figure(*shape, side_in=BAR_IN) as (figure, axes):
         axes.set_facecolor(LINE)
         extent = left, right, bottom, top
-        image = axes.imshow(misfit, **_misfit_colours(residuals), extent=extent, interpolation="nearest")
+        image = axes.imshow(reduced_chi2, **_chi2_colours(residuals), extent=extent, interpolation="nearest")
         axes.set_xlim(-0.5, shape[1] - 0.5)
         axes.set_ylim(shape[0] - 0.5, -0.5)
-        _add_colour_bar(axes, image, "misfit")
-        return svg_of(figure, "misfit-panorama")
+        _add_colour_bar(axes, image, "reduced chi-square")
+        return svg_of(figure, "chi2-panorama")
 
 
 def same_projection(one: Canvas, other: Canvas) -> bool:
@@ -69,27 +69,27 @@ def same_projection(one: Canvas, other: Canvas) -> bool:
     return one.projection == other.projection and one.horizon is other.horizon
 
 
-def misfit_cells(residuals: Residuals, measured: Canvas, onto: FloatArray) -> tuple[Any, tuple[float, float, float, float]]:
-    """Return the misfit over the panorama, masked where it was seen too briefly, and its box.
+def chi2_cells(residuals: Residuals, measured: Canvas, onto: FloatArray) -> tuple[Any, tuple[float, float, float, float]]:
+    """Return the reduced chi-square over the panorama, masked where it was seen too briefly, and its box.
 
     The box is left, top, right, bottom in the pixels of the canvas with the transform `onto`.
     """
-    misfit = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_misfit))
-    rows, columns = misfit.shape
+    reduced_chi2 = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_chi2))
+    rows, columns = reduced_chi2.shape
     edges = [[-0.5, -0.5], [columns * BLOCK_PX - 0.5, rows * BLOCK_PX - 0.5]]
     (left, top), (right, bottom) = apply(onto @ inverse(measured.transform), edges)
-    return misfit, (float(left), float(top), float(right), float(bottom))
+    return reduced_chi2, (float(left), float(top), float(right), float(bottom))
 
 
 def over_sensor(residuals: Residuals) -> str:
-    """Draw the misfit and the brightness of the blocks of the sensor, and their shifts if these are significant."""
+    """Draw the reduced chi-square and the brightness of the blocks of the sensor, and their shifts if these are significant."""
     height, width = residuals.frame_shape
     shifts = significant_shifts(residuals)
     with maps_figure(height, width, 2 if shifts is None else 3) as (figure, maps):
-        extent = extent_of(*(BLOCK_PX * n_blocks for n_blocks in residuals.block_misfit.shape))
-        misfit = np.ma.masked_invalid(residuals.block_misfit)
-        image = maps[0].imshow(misfit, **_misfit_colours(residuals), extent=extent, interpolation="nearest")
-        _add_colour_bar(maps[0], image, "misfit")
+        extent = extent_of(*(BLOCK_PX * n_blocks for n_blocks in residuals.block_chi2.shape))
+        reduced_chi2 = np.ma.masked_invalid(residuals.block_chi2)
+        image = maps[0].imshow(reduced_chi2, **_chi2_colours(residuals), extent=extent, interpolation="nearest")
+        _add_colour_bar(maps[0], image, "reduced chi-square")
         gain = np.ma.masked_invalid(100 * _brightness(residuals))
         limit = max(_GAIN_RANGE_PERCENT, float(np.abs(gain).max())) if gain.count() else _GAIN_RANGE_PERCENT
         image = maps[1].imshow(gain, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
@@ -194,14 +194,14 @@ def significant_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray] | 
     return places, field[known]
 
 
-def _misfit_colours(residuals: Residuals) -> dict[str, Any]:
-    """Return one scale of colours for all maps of the misfit: logarithmic, as noise is near 1 and a moving thing at 100."""
+def _chi2_colours(residuals: Residuals) -> dict[str, Any]:
+    """Return one logarithmic scale of colours for all maps of it, as noise is near 1 and a moving thing at 100."""
     from matplotlib.colors import LogNorm
 
-    drawn = np.r_[residuals.cell_misfit[residuals.cell_count >= _FEWEST_BLOCKS], residuals.block_misfit.ravel()]
+    drawn = np.r_[residuals.cell_chi2[residuals.cell_count >= _FEWEST_BLOCKS], residuals.block_chi2.ravel()]
     drawn = drawn[np.isfinite(drawn)]
     high = float(np.quantile(drawn, 0.99)) if len(drawn) else 0.0
-    return {"cmap": "inferno", "norm": LogNorm(_MISFIT_RANGE[0], max(_MISFIT_RANGE[1], high))}
+    return {"cmap": "inferno", "norm": LogNorm(_CHI2_RANGE[0], max(_CHI2_RANGE[1], high))}
 
 
 def _brightness(residuals: Residuals) -> FloatArray:
@@ -221,7 +221,7 @@ def _noise_px(information: FloatArray) -> FloatArray:
 def _add_colour_bar(axes: Axes, image: Any, label: str, numbers: str = "{x:.3g}") -> None:
     bar = add_colour_bar(axes, image, label, numbers)
     if image.norm.vmin > 0:
-        bar.set_ticks([tick for tick in _MISFIT_TICKS if image.norm.vmin <= tick <= image.norm.vmax])
+        bar.set_ticks([tick for tick in _REDUCED_CHI2_TICKS if image.norm.vmin <= tick <= image.norm.vmax])
         bar.ax.minorticks_off()
 
 

@@ -21,7 +21,7 @@ from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
 from photonpano.report.figures import centre_of, instants_of, places_on
 from photonpano.report.preview import still_exposure
-from photonpano.report.residual_figures import misfit_cells, same_projection
+from photonpano.report.residual_figures import chi2_cells, same_projection
 from photonpano.residuals.refinement import Explained, distance_to_nearest
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
@@ -52,7 +52,7 @@ def viewer_data(
         "size": [panorama.canvas.width, panorama.canvas.height],
         "linear": linear_data(balanced(panorama.thumbnail.flux, balance), white),
         "picture": None if (render.get("tone") or "srgb") == "srgb" else jpeg_uri(shrunk(panorama.picture, VIEW_PIXELS)),
-        "maps": [*panorama_maps(panorama, source), *_misfit_map(explained, panorama.canvas)],
+        "maps": [*panorama_maps(panorama, source), *_chi2_map(explained, panorama.canvas)],
         "path": path_data(motion, panorama),
         "rate": record["source"]["frame_rate_hz"],
         "glimpses": glimpses(source, int(np.median(spans)), white),
@@ -113,12 +113,12 @@ def panorama_maps(panorama: RenderedPanorama, source: Source) -> list[dict[str, 
     ]
 
 
-def _misfit_map(explained: Explained, canvas: Canvas) -> list[dict[str, Any]]:
+def _chi2_map(explained: Explained, canvas: Canvas) -> list[dict[str, Any]]:
     if not same_projection(explained.canvas, canvas):
         return []
-    misfit, (left, top, right, bottom) = misfit_cells(explained.residuals, explained.canvas, canvas.transform)
+    reduced_chi2, (left, top, right, bottom) = chi2_cells(explained.residuals, explained.canvas, canvas.transform)
     box = [round(float(side) + 0.5, 2) for side in (left, top, right, bottom)]
-    return [_map("Misfit", misfit.filled(np.nan), "(1 is photon noise)", box, "inferno")]
+    return [_map("Reduced chi-square", reduced_chi2.filled(np.nan), "(1 is photon noise)", box, "inferno")]
 
 
 def _map(

@@ -15,7 +15,7 @@ BLOCK_PX = 16  # side of a block, px
 # gx gy / v, gy gy / v, gx r / v, gy r / v, gx m / v, gy m / v, m m / v, m r / v, r, v, m.
 GXX, GXY, GYY, GX_R, GY_R, GX_M, GY_M, M_M, M_R, R, V, M = range(12)
 N_SUMS = 12
-# A block with a smaller variance than this, in counts squared, is left out of the misfit: it is not normally distributed.
+# A block with a smaller variance than this, in counts squared, is not normally distributed, and is left out of chi-square.
 _FEWEST_PHOTONS = 1.0
 
 
@@ -121,9 +121,9 @@ class Totals(NamedTuple):
     """Sums over spans that `fold` adds to: (h, w) for blocks of the sensor, (H', W') for squares of the panorama."""
 
     blocks: NDArray[np.float64]  # (h, w, 12) sums over time
-    block_misfit: NDArray[np.float64]  # squared residuals of blocks / their variance
+    block_chi2: NDArray[np.float64]  # squared residuals of blocks / their variance
     block_count: NDArray[np.float64]  # number of blocks in these sums
-    cell_misfit: NDArray[np.float64]  # the same, by the square of the panorama that a block falls on
+    cell_chi2: NDArray[np.float64]  # the same, by the square of the panorama that a block falls on
     cell_count: NDArray[np.float64]  # number of blocks in these sums
     cell_noise: NDArray[np.float64]  # variance of the residuals, relative to the squared prediction
     pixel_residual: NDArray[np.float32]  # (H, W) residuals of each pixel: see `add_pixel_sums`
@@ -195,17 +195,17 @@ def fold(
                 totals.blocks[y, x, s] += cell[s]
             if cell[V] < _FEWEST_PHOTONS:
                 continue
-            misfit = float(cell[R]) ** 2 / (float(cell[V]) * variance_share)
-            total += misfit
+            reduced_chi2 = float(cell[R]) ** 2 / (float(cell[V]) * variance_share)
+            total += reduced_chi2
             n += 1
-            totals.block_misfit[y, x] += misfit
+            totals.block_chi2[y, x] += reduced_chi2
             totals.block_count[y, x] += 1
             px, py = middle[y, x]
             depth = to_canvas[2, 0] * px + to_canvas[2, 1] * py + to_canvas[2, 2]
             i = int(np.floor((to_canvas[1, 0] * px + to_canvas[1, 1] * py + to_canvas[1, 2]) / depth / BLOCK_PX))
             j = int(np.floor((to_canvas[0, 0] * px + to_canvas[0, 1] * py + to_canvas[0, 2]) / depth / BLOCK_PX))
-            if 0 <= i < totals.cell_misfit.shape[0] and 0 <= j < totals.cell_misfit.shape[1]:
-                totals.cell_misfit[i, j] += misfit
+            if 0 <= i < totals.cell_chi2.shape[0] and 0 <= j < totals.cell_chi2.shape[1]:
+                totals.cell_chi2[i, j] += reduced_chi2
                 totals.cell_count[i, j] += 1
                 totals.cell_noise[i, j] += float(cell[V]) * variance_share / float(cell[M]) ** 2
     return total / n if n > 0 else 1.0

@@ -58,13 +58,13 @@ class Residuals:
     # as fractions
     normal: FloatArray
     gradient: FloatArray  # (S, 5) right-hand sides of these equations
-    misfit: FloatArray  # (S,) mean over the blocks of a span of squared residual / variance, expected to be 1
+    reduced_chi2: FloatArray  # (S,) mean over the blocks of a span of squared residual / variance, expected to be 1
     blocks: FloatArray  # (h, w, 12) sums over time, for each block of the sensor: see `block_sums`
-    block_misfit: FloatArray  # (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen
+    block_chi2: FloatArray  # (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen
     pixel_gain: FluxImage  # (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted
     pixel_mean: FluxImage  # (H, W) predicted photons of each pixel, in one of four spans
     # (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was seen
-    cell_misfit: FloatArray
+    cell_chi2: FloatArray
     cell_count: FloatArray  # (H', W') number of blocks that fell on each square
     # (H', W') mean over these blocks of variance / squared prediction: the squared relative noise of a block
     cell_noise: FloatArray
@@ -126,7 +126,7 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
             total = part if total is None else total.plus(part)
             advance(sum(map(len, spans[batch])))
     assert total is not None
-    normal, gradient, misfit = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
+    normal, gradient, reduced_chi2 = (np.concatenate(arrays) for arrays in zip(*results, strict=True))
     with np.errstate(divide="ignore", invalid="ignore"):
         pixel_gain = np.where(total.pixel_mean > 0, 1 + total.pixel_residual / total.pixel_mean, np.float32(np.nan))
         return Residuals(
@@ -134,12 +134,12 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
             np.array([each.centre for each in spans]),
             normal,
             gradient,
-            misfit,
+            reduced_chi2,
             total.blocks,
-            total.block_misfit / total.block_count,
+            total.block_chi2 / total.block_count,
             np.asarray(pixel_gain, np.float32),
             total.pixel_mean,
-            total.cell_misfit / total.cell_count,
+            total.cell_chi2 / total.cell_count,
             total.cell_count,
             total.cell_noise / total.cell_count,
             predictions.frames_seen,
@@ -245,7 +245,7 @@ def _measured(
     ideal = first.ideal(middle)
     colours = [_Colour.of(*part) for part in predictions.parts]
     capture = colours[0].capture
-    normal, gradient, misfit = np.zeros((len(spans), 5, 5)), np.zeros((len(spans), 5)), np.zeros(len(spans))
+    normal, gradient, reduced_chi2 = np.zeros((len(spans), 5, 5)), np.zeros((len(spans), 5)), np.zeros(len(spans))
     total = Totals.zeros(shape, first.canvas.shape)
     # A pixel adds to the image of its colour, which fewer frames have seen.
     frames_seen = max(predictions.frames_seen / len(colours), 1.0)
@@ -262,8 +262,8 @@ def _measured(
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
         own = min(0.5, len(span) / frames_seen)
         cells = first.cells(homography, middle, ideal)
-        misfit[index] = fold(sums, lever, *cells, 1 - own, normal[index], gradient[index], total)
-    return (normal, gradient, misfit), total
+        reduced_chi2[index] = fold(sums, lever, *cells, 1 - own, normal[index], gradient[index], total)
+    return (normal, gradient, reduced_chi2), total
 
 
 def _middles(index: np.ndarray, length: int) -> FloatArray:

@@ -28,7 +28,7 @@ _SMOOTH_SPANS = 25  # the ratio is that of motion faster than this many spans
 _LOCAL_SPANS = 33  # the size is averaged over this many spans
 # Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations.
 _SIGNIFICANT = 3.0
-_MISFIT = 3.0  # a span also stands out if the mean squared residual / variance of its blocks exceeds this
+_REDUCED_CHI2 = 3.0  # a span also stands out if the mean squared residual / variance of its blocks exceeds this
 # A single span stands out if the sum of its four squared steps, over their variances, exceeds this. Noise does so once in
 # 200,000 spans.
 _STANDS_OUT = 30.0
@@ -40,7 +40,7 @@ _BOUND_SPANS, _NEAR_SPANS = 3, 1.0
 TOLERANCE_PX = 0.5
 _DARK = -0.5  # spans that are darker than predicted by half of the light or more show too little to be measured
 # A motion is worse if the scatter of the shifts grows by this factor, or the reduced chi-square of the photons by this much.
-_WORSE_RATIO, _WORSE_MISFIT = 1.05, 0.01
+_WORSE_RATIO, _WORSE_CHI2 = 1.05, 0.01
 
 
 def residual_ratio(residuals: Residuals) -> float:
@@ -112,11 +112,11 @@ def distance_to_nearest(instants: FloatArray, frames: NDArray[np.integer]) -> Fl
 
 
 def standing_out(residuals: Residuals) -> BoolArray:
-    """Return which spans show a step, or a misfit, that noise does not explain: (S,)."""
+    """Return which spans show a step, or a reduced chi-square, that noise does not explain: (S,)."""
     steps, variances = _series(residuals)
     with np.errstate(invalid="ignore"):
         excess = np.nansum(np.where(np.isfinite(variances), steps**2 / variances, 0), axis=1)
-    return np.asarray((excess > _STANDS_OUT) | (residuals.misfit > _MISFIT))
+    return np.asarray((excess > _STANDS_OUT) | (residuals.reduced_chi2 > _REDUCED_CHI2))
 
 
 def _series(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
@@ -209,9 +209,9 @@ class MotionFit:
         return Predictions.of(self._source, self.panorama, self.canvas, self.motion.trajectory, self.motion.frame_shape)
 
     @property
-    def misfit(self) -> float:
+    def reduced_chi2(self) -> float:
         """Mean reduced chi-square of the photons."""
-        return float(self.residuals.misfit.mean())
+        return float(self.residuals.reduced_chi2.mean())
 
     def explained(self, refinements: Sequence[Refinement] = ()) -> Explained:
         """Return the motion with an expected error that covers the residuals, and what else a verdict needs."""
@@ -225,9 +225,9 @@ class MotionFit:
 
     def worse_than(self, other: MotionFit) -> str:
         """Return how this motion explains the photons worse than another one, as a clause; empty if it does not."""
-        before, misfit = other.misfit, self.misfit
-        if misfit > before + _WORSE_MISFIT:
-            return f"the misfit of the photons grew from {before:.3g} to {misfit:.3g}"
+        before, reduced_chi2 = other.reduced_chi2, self.reduced_chi2
+        if reduced_chi2 > before + _WORSE_CHI2:
+            return f"the reduced chi-square of the photons grew from {before:.3g} to {reduced_chi2:.3g}"
         if self.ratio > _WORSE_RATIO * other.ratio:
             return f"the scatter of the shifts grew from {other.ratio:.3g} to {self.ratio:.3g} times the photon noise"
         return ""

@@ -134,13 +134,13 @@ def _fast_motion(run: _Run) -> _Found:
 )
 def _photons(run: _Run) -> _Found | None:
     residuals = run.explained.residuals
-    misfit = float(residuals.misfit.mean())
+    reduced_chi2 = float(residuals.reduced_chi2.mean())
     sums = residuals.blocks.sum(axis=(0, 1))
     per_span = sums / max(len(residuals.spans), 1)
     n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
     # The squared residual of a block beyond its variance, as a part of its photons.
-    contrast = float(np.sqrt(max(misfit - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
-    return _Found(misfit, f"on average by {contrast:.0%} of the light") if contrast > MAX_CONTRAST else None
+    contrast = float(np.sqrt(max(reduced_chi2 - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
+    return _Found(reduced_chi2, f"on average by {contrast:.0%} of the light") if contrast > MAX_CONTRAST else None
 
 
 @_doubtful_above(
@@ -152,8 +152,8 @@ def _moving(run: _Run) -> _Found | None:
     residuals = run.explained.residuals
     counted = residuals.cell_count >= _MIN_BLOCKS
     expected = 1 + _STANDARD_DEVIATIONS * np.sqrt(2 / np.maximum(residuals.cell_count, 1))
-    contrast = np.sqrt(np.maximum(residuals.cell_misfit - 1, 0) * residuals.cell_noise)
-    changing = counted & (residuals.cell_misfit > np.maximum(expected, 1.5)) & (contrast > 0.05)
+    contrast = np.sqrt(np.maximum(residuals.cell_chi2 - 1, 0) * residuals.cell_noise)
+    changing = counted & (residuals.cell_chi2 > np.maximum(expected, 1.5)) & (contrast > 0.05)
     if not changing.any():
         return None
     return _Found(float(changing.sum() / counted.sum()), _box(changing, "px of the panorama"))

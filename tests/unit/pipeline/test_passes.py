@@ -97,9 +97,11 @@ def test_single_level_is_located_again_if_the_capture_was_corrected_since(
     assert ran == [(located, first.trajectory)]
 
 
-@pytest.mark.parametrize(("misfit", "worse"), [(1.5, ""), (2.9, "the scatter grew")])
-def test_scatter_of_steps_counts_only_if_light_does_not_lower_misfit(misfit: float, worse: str) -> None:
-    proposed, before = (SimpleNamespace(misfit=each, worse_than=lambda _: "the scatter grew") for each in (misfit, 3.0))
+@pytest.mark.parametrize(("reduced_chi2", "worse"), [(1.5, ""), (2.9, "the scatter grew")])
+def test_scatter_of_steps_counts_only_if_light_does_not_lower_chi2(reduced_chi2: float, worse: str) -> None:
+    proposed, before = (
+        SimpleNamespace(reduced_chi2=each, worse_than=lambda _: "the scatter grew") for each in (reduced_chi2, 3.0)
+    )
     assert worse_in_light(proposed, before) == worse
 
 
@@ -173,7 +175,7 @@ def test_motion_that_explains_photons_worse_is_kept_out_with_warning(run: Callab
     [warning] = refinement_warnings(after.refinements)
     assert re.sub(r"\d+(\.\d+)?", "N", warning) == (
         "the motion of the refiner 'odd' is not used, since it explains the photons worse: "
-        "the misfit of the photons grew from N to N"
+        "the reduced chi-square of the photons grew from N to N"
     )
     assert refinement_record(refinement)["kept_out"] == refinement.kept_out
 

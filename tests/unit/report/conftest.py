@@ -71,12 +71,12 @@ def make_residuals(n_frames: int = N_FRAMES, tremor_px: float = 0.0, period: flo
         instants=instants,
         normal=np.repeat(information[None], len(spans), axis=0),
         gradient=steps @ information,
-        misfit=np.ones(len(spans)),
+        reduced_chi2=np.ones(len(spans)),
         blocks=blocks,
-        block_misfit=rng.normal(1, 0.05, grid),
+        block_chi2=rng.normal(1, 0.05, grid),
         pixel_gain=np.ones(FRAME_SHAPE, np.float32),
         pixel_mean=np.full(FRAME_SHAPE, 1e4, np.float32),
-        cell_misfit=rng.normal(1, 0.1, cells),
+        cell_chi2=rng.normal(1, 0.1, cells),
         cell_count=np.full(cells, 300.0),
         cell_noise=np.full(cells, 0.01),
         frames_seen=4000.0,
@@ -140,7 +140,7 @@ def tremor() -> Residuals:
 
 @pytest.fixture(scope="session")
 def explained(motion: FrameMotion, panorama: RenderedPanorama, residuals: Residuals) -> Explained:
-    return Explained(motion, panorama.thumbnail, panorama.canvas, residuals, 1.0123, ())
+    return Explained(motion, panorama.canvas, residuals, 1.0123, ())
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ class End:
 
     @property
     def explained(self) -> Explained:
-        return Explained(self.motion, self.panorama.thumbnail, self.panorama.canvas, self.residuals, 1.0, ())
+        return Explained(self.motion, self.panorama.canvas, self.residuals, 1.0, ())
 
     def refined(self) -> Refined | None:
         refiner = ShortSpansRefiner(ShortSpansConfig(), self.motion.frame_shape, 96_800.0)

@@ -25,7 +25,7 @@ def no_figures(monkeypatch):
     """Leave out the figures, whose drawing takes a second, where a test is about the words."""
     for name in ("path_over_time", "path_on_panorama", "coverage_map", "stage_times"):
         monkeypatch.setattr(figures, name, lambda *_: "")
-    for name in ("misfit_over_panorama", "over_sensor", "shifts_over_time"):
+    for name in ("chi2_over_panorama", "over_sensor", "shifts_over_time"):
         monkeypatch.setattr(residual_figures, name, lambda *_: "")
 
 

@@ -19,7 +19,7 @@ CANVAS = Canvas(300, 1240, np.eye(3))
 
 def test_figures_use_colour_variables_of_page(residuals):
     for svg in (
-        residual_figures.misfit_over_panorama(residuals, CANVAS, CANVAS),
+        residual_figures.chi2_over_panorama(residuals, CANVAS, CANVAS),
         residual_figures.over_sensor(residuals),
         residual_figures.shifts_over_time(residuals, None),
     ):
@@ -92,12 +92,12 @@ def test_figures_draw_residuals_of_a_single_span_that_saw_nothing(residuals):
         normal=0 * residuals.normal[:1],
         gradient=residuals.gradient[:1],
         blocks=0 * residuals.blocks,
-        block_misfit=residuals.block_misfit * np.nan,
-        cell_misfit=residuals.cell_misfit * np.nan,
+        block_chi2=residuals.block_chi2 * np.nan,
+        cell_chi2=residuals.cell_chi2 * np.nan,
         cell_count=0 * residuals.cell_count,
     )
     for svg in (
-        residual_figures.misfit_over_panorama(nothing, CANVAS, CANVAS),
+        residual_figures.chi2_over_panorama(nothing, CANVAS, CANVAS),
         residual_figures.over_sensor(nothing),
         residual_figures.shifts_over_time(nothing, 100.0),
     ):

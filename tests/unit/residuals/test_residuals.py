@@ -49,9 +49,9 @@ def residuals_of(tremor_px: float = 0.0, threads: int = 1) -> Residuals:
 
 def test_measure_finds_photon_noise_along_true_motion() -> None:
     found = residuals_of()
-    assert found.misfit.mean() == pytest.approx(1, abs=0.1)
+    assert found.reduced_chi2.mean() == pytest.approx(1, abs=0.1)
     assert residual_ratio(found) == pytest.approx(1, abs=0.2)
-    assert np.nanmean(found.block_misfit) == pytest.approx(1, abs=0.1)
+    assert np.nanmean(found.block_chi2) == pytest.approx(1, abs=0.1)
     gains, stds = found.gains()
     assert (gains / stds).std() == pytest.approx(1, abs=0.15)
     assert unexplained_px(found, FRAMES).max() < 0.05
@@ -98,7 +98,7 @@ def test_bounded_std_px_of_frames_that_show_nothing_stays_as_it_was() -> None:
 
 def test_measure_does_not_depend_on_threads() -> None:
     one, two = residuals_of(), residuals_of(threads=3)
-    for name in ("normal", "gradient", "misfit", "blocks", "block_misfit", "pixel_gain", "cell_misfit"):
+    for name in ("normal", "gradient", "reduced_chi2", "blocks", "block_chi2", "pixel_gain", "cell_chi2"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name), name)
 
 
@@ -140,7 +140,7 @@ def turned(distortion: tuple[float, ...]) -> tuple[Camera, FloatArray, MemorySou
 
 
 def turning(distortion: tuple[float, ...], projection: str) -> tuple[FloatArray, FloatArray]:
-    """Return the misfit of the turn, and the mean flux of the panorama over that of the scene."""
+    """Return the reduced chi-square of the turn, and the mean flux of the panorama over that of the scene."""
     camera, turns, frames = turned(distortion)
     source, span = seen_through(frames, camera), FrameSpan(0, N)
     trajectory = FrameTrajectory(camera.homographies(turns))
@@ -151,15 +151,15 @@ def turning(distortion: tuple[float, ...], projection: str) -> tuple[FloatArray,
     (p, s), (q, r) = canvas.columns(), canvas.rows()
     rays = np.stack([np.outer(r, p), np.repeat(q[:, None], len(p), axis=1), np.outer(r, s)], axis=-1)
     seen = panorama.weight > 40
-    return residuals.misfit, panorama.flux[seen] / flux_of(rays)[seen]
+    return residuals.reduced_chi2, panorama.flux[seen] / flux_of(rays)[seen]
 
 
 @pytest.mark.parametrize("projection", ["cylindrical", "spherical"])
 @pytest.mark.parametrize("distortion", [(0, 0, 0, 0), (-0.1, 0.02, 0.002, 0)], ids=["pinhole", "lens"])
 def test_panorama_explains_frames_of_a_full_turn(projection: str, distortion: tuple[float, ...]) -> None:
-    misfit, ratio = turning(distortion, projection)
-    assert misfit.mean() == pytest.approx(1, abs=0.06)
-    assert misfit.max() < 3.5, "no span, not one at the seam either, is badly predicted"
+    reduced_chi2, ratio = turning(distortion, projection)
+    assert reduced_chi2.mean() == pytest.approx(1, abs=0.06)
+    assert reduced_chi2.max() < 3.5, "no span, not one at the seam either, is badly predicted"
     assert ratio.mean() == pytest.approx(1, abs=0.01)
 
 

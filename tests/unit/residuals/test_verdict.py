@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Panorama
+from photonpano import FrameSpan
 from photonpano.geometry import Canvas, FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.graph import Evidence
@@ -40,12 +40,12 @@ def noise() -> Residuals:
         instants=np.array([span.centre for span in spans]),
         normal=np.repeat(information[None], N_SPANS, axis=0),
         gradient=steps @ information,
-        misfit=rng.normal(1, 0.1, N_SPANS),
+        reduced_chi2=rng.normal(1, 0.1, N_SPANS),
         blocks=blocks,
-        block_misfit=rng.normal(1, 0.05, grid),
+        block_chi2=rng.normal(1, 0.05, grid),
         pixel_gain=rng.normal(1, 0.03, SHAPE).astype(np.float32),
         pixel_mean=np.full(SHAPE, 1000, np.float32),
-        cell_misfit=rng.normal(1, 0.1, cells),
+        cell_chi2=rng.normal(1, 0.1, cells),
         cell_count=np.full(cells, 200.0),
         cell_noise=np.full(cells, 0.01),
         frames_seen=1000.0,
@@ -68,7 +68,7 @@ def explained(noise: Residuals) -> Explained:
         SHAPE,
     )
     image = np.ones(SHAPE, np.float32)
-    return Explained(motion, Panorama(image, image, np.eye(3)), Canvas(*image.shape, np.eye(3)), noise, 1.05, ())
+    return Explained(motion, Canvas(*image.shape, np.eye(3)), noise, 1.05, ())
 
 
 Made = dict[str, Any]
@@ -127,14 +127,14 @@ def left_of_radial(shape: tuple[int, ...]) -> float:
     [
         pytest.param(
             # 2 variances of 100 photons beyond the noise: sqrt(200) of 100 photons.
-            lambda found: {"misfit": found.misfit + 2},
+            lambda found: {"reduced_chi2": found.reduced_chi2 + 2},
             "the panorama does not explain the photons",
             pytest.approx(3, abs=0.05),
             "on average by 14% of the light",
-            id="misfit",
+            id="reduced chi-square",
         ),
         pytest.param(
-            lambda found: squares(found, cell_misfit=9),
+            lambda found: squares(found, cell_chi2=9),
             "parts of the panorama change over time",
             pytest.approx(24 / 300),
             "mostly x 160 to 256, y 32 to 96 in px of the panorama",
@@ -187,11 +187,14 @@ def test_residuals_beyond_noise_are_the_only_reason(
     "change",
     [
         pytest.param(lambda _: {}, id="photon noise"),
-        # With 10,000 times the photons, a misfit of 1.5 is 0.07 % of the light.
-        pytest.param(lambda found: {"misfit": found.misfit + 0.5, "blocks": 1e4 * found.blocks}, id="misfit of little light"),
-        # A misfit of 9 where the noise is 1 % of the light is a change by 3 %.
-        pytest.param(lambda found: squares(found, cell_misfit=9, cell_noise=1e-4), id="place that hardly changes"),
-        pytest.param(lambda found: squares(found, cell_misfit=9, cell_count=3), id="place that few blocks saw"),
+        # With 10,000 times the photons, a reduced chi-square of 1.5 is 0.07 % of the light.
+        pytest.param(
+            lambda found: {"reduced_chi2": found.reduced_chi2 + 0.5, "blocks": 1e4 * found.blocks},
+            id="reduced chi-square of little light",
+        ),
+        # A reduced_chi2 of 9 where the noise is 1 % of the light is a change by 3 %.
+        pytest.param(lambda found: squares(found, cell_chi2=9, cell_noise=1e-4), id="place that hardly changes"),
+        pytest.param(lambda found: squares(found, cell_chi2=9, cell_count=3), id="place that few blocks saw"),
         pytest.param(lambda found: shifted(found, 0.5 + 0.05 * np.arange(found.blocks.shape[1])), id="shift and zoom"),
         # Along a pan, a row of blocks sees the same edges all the time, always at the same fraction of a pixel.
         pytest.param(lambda found: shifted(found, 0, 0.08 * (-1) ** np.arange(8)[:, None]), id="shifts row by row"),
@@ -277,7 +280,7 @@ def test_decisions_are_doubtful(explained: Explained, decisions: list[Decision],
 
 def test_several_reasons_are_listed_in_the_order_of_the_table(explained: Explained) -> None:
     residuals = replace(
-        explained.residuals, pixel_gain=explained.residuals.pixel_gain + 7, misfit=explained.residuals.misfit + 2
+        explained.residuals, pixel_gain=explained.residuals.pixel_gain + 7, reduced_chi2=explained.residuals.reduced_chi2 + 2
     )
     found = [reason.what for reason in judge(replace(explained, residuals=residuals, ratio=5.0), ()).reasons]
     assert [what.split()[0] for what in found] == ["the", "the", "single"]
