@@ -30,32 +30,35 @@ class Texture(NamedTuple):
     """An image made ready for interpolation: a place takes one word of memory instead of four pixels.
 
     Attributes:
-        texels: (h + 1, w + 1) uint64. That at (x, y) holds the pixels (x - 1, y - 1), (x, y - 1), (x - 1, y) and (x, y), the
-            first in its lowest bits, as levels of 16 bits; pixels outside of the image are 0.
+        texels: (h + 1, w + 1) uint64, or uint32 for an image of bytes. That at (x, y) holds the pixels (x - 1, y - 1),
+            (x, y - 1), (x - 1, y) and (x, y), the first in its lowest bits, as levels of 16 or 8 bits; pixels outside of the
+            image are 0.
         scale: value of a level, a power of two. Whole numbers up to 65,535 are exact, others to 1 / 65,535 of their range.
         zero: level of 0.
     """
 
-    texels: NDArray[np.uint64]
+    texels: NDArray[np.uint32] | NDArray[np.uint64]
     scale: float
     zero: float
 
     @classmethod
     def of(cls, image: Image) -> Texture:
         """Return the texture of an (h, w) image of finite values."""
-        scale, zero = 1.0, 0.0
-        if image.dtype != np.uint8:
-            image = np.ascontiguousarray(image, np.float32)
-            low, high = min(0.0, float(image.min(initial=0))), float(image.max(initial=0))
-            scale = 2.0 ** np.ceil(np.log2((high - low) / _LEVELS)) if high > low else 1.0
-            zero = np.ceil(-low / scale)
-        texels = np.empty((image.shape[0] + 1, image.shape[1] + 1), np.uint64)
-        _fill(texels, image, 1 / scale, zero)
+        shape = image.shape[0] + 1, image.shape[1] + 1
+        if image.dtype == np.uint8:
+            small = np.empty(shape, np.uint32)
+            _fill_bytes(small, image)
+            return cls(small, 1.0, 0.0)
+        pixels, texels = np.ascontiguousarray(image, np.float32), np.empty(shape, np.uint64)
+        low, high = min(0.0, float(pixels.min(initial=0))), float(pixels.max(initial=0))
+        scale = 2.0 ** np.ceil(np.log2((high - low) / _LEVELS)) if high > low else 1.0
+        zero = np.ceil(-low / scale)
+        _fill(texels, pixels, 1 / scale, zero)
         return cls(texels, scale, zero)
 
 
 @compiled
-def _fill(texels: NDArray[np.uint64], image: NDArray[np.uint8] | NDArray[np.float32], levels: float, zero: float) -> None:
+def _fill(texels: NDArray[np.uint64], image: NDArray[np.float32], levels: float, zero: float) -> None:
     """Fill the texels of an image; `levels` is their number in 1."""
     height, width = image.shape
     row = np.full(width + 2, np.uint32(zero))
@@ -65,7 +68,7 @@ def _fill(texels: NDArray[np.uint64], image: NDArray[np.uint8] | NDArray[np.floa
     for y in range(height + 1):
         pixels, inner = image[min(y, height - 1)], row[1 : width + 1]
         for x in range(width):
-            inner[x] = np.uint32(np.int32(min(np.float32(pixels[x]) * factor + rounded, most)))
+            inner[x] = np.uint32(np.int32(min(pixels[x] * factor + rounded, most)))
         if y == height:
             row[:] = np.uint32(zero)
         left, right, into = row[: width + 1], row[1:], texels[y]
@@ -73,6 +76,25 @@ def _fill(texels: NDArray[np.uint64], image: NDArray[np.uint8] | NDArray[np.floa
             pairs[x] = left[x] | (right[x] << np.uint32(16))
         for x in range(width + 1):
             into[x] = np.uint64(above[x]) | (np.uint64(pairs[x]) << np.uint64(32))
+        above, pairs = pairs, above
+
+
+@compiled
+def _fill_bytes(texels: NDArray[np.uint32], image: NDArray[np.uint8]) -> None:
+    """Fill the texels of an image of bytes."""
+    height, width = image.shape
+    row, above, pairs = np.zeros(width + 2, np.uint32), np.zeros(width + 1, np.uint32), np.zeros(width + 1, np.uint32)
+    for y in range(height + 1):
+        pixels, inner = image[min(y, height - 1)], row[1 : width + 1]
+        for x in range(width):
+            inner[x] = np.uint32(pixels[x])
+        if y == height:
+            row[:] = np.uint32(0)
+        left, right, into = row[: width + 1], row[1:], texels[y]
+        for x in range(width + 1):
+            pairs[x] = left[x] | (right[x] << np.uint32(8))
+        for x in range(width + 1):
+            into[x] = above[x] | (pairs[x] << np.uint32(16))
         above, pairs = pairs, above
 
 
@@ -216,7 +238,8 @@ def _add_warped(
     """Add an image and its share of each pixel, which is that of `seen`, or 1 for a `whole` image."""
     rows, columns = len(grid.q), len(grid.p)
     u, v, share = np.empty(columns, np.float32), np.empty(columns, np.float32), np.empty(columns, np.float32)
-    places, texels = np.empty(columns, np.uint32), np.empty(columns, np.uint64)
+    places, texels = np.empty(columns, np.uint32), np.empty(columns, counts.texels.dtype)
+    texels_seen = np.empty(columns, seen.texels.dtype)
     for y in range(rows):
         image_row(matrix, lens, grid, y, u, v)
         first, last = _places(u, v, counts.texels.shape, places, share)
@@ -229,8 +252,8 @@ def _add_warped(
         weight = share[first:last]
         if not whole:
             weight[:] = 0
-            _read(seen, at, into)
-            _add_interpolated(seen, into, a, b, weight)
+            _read(seen, at, texels_seen[: last - first])
+            _add_interpolated(seen, texels_seen[: last - first], a, b, weight)
         for k in range(len(amounts)):
             amount, coverage = np.float32(amounts[k]), grid.coverages[k, row, x]
             for t in range(len(weight)):
@@ -329,7 +352,7 @@ def _places(
 
 
 @compiled
-def _read(texture: Texture, places: NDArray[np.uint32], into: NDArray[np.uint64]) -> None:
+def _read(texture: Texture, places: NDArray[np.uint32], into: NDArray[np.uint32] | NDArray[np.uint64]) -> None:
     texels = texture.texels.reshape(-1)
     for t in range(len(into)):
         into[t] = texels[np.uint64(places[t])]
@@ -337,13 +360,25 @@ def _read(texture: Texture, places: NDArray[np.uint32], into: NDArray[np.uint64]
 
 @compiled
 def _add_interpolated(
-    texture: Texture, texels: NDArray[np.uint64], a: NDArray[np.float32], b: NDArray[np.float32], into: NDArray[np.float32]
+    texture: Texture,
+    texels: NDArray[np.uint32] | NDArray[np.uint64],
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    into: NDArray[np.float32],
 ) -> None:
     """Add texels interpolated at the fractions a along x and b along y."""
-    levels, low, high = texels.view(np.uint32), np.uint32(0xFFFF), np.uint32(16)
+    words, low, high, byte = texels.view(np.uint32), np.uint32(0xFFFF), np.uint32(16), np.uint32(0xFF)
     scale, zero = np.float32(texture.scale), np.float32(texture.scale * texture.zero)
+    if texels.itemsize == 4:
+        for t in range(len(into)):
+            word = words[t]
+            p, q = np.float32(np.int32(word & byte)), np.float32(np.int32((word >> np.uint32(8)) & byte))
+            r, s = np.float32(np.int32((word >> high) & byte)), np.float32(np.int32(word >> np.uint32(24)))
+            upper, lower = p + a[t] * (q - p), r + a[t] * (s - r)
+            into[t] += upper + b[t] * (lower - upper)
+        return
     for t in range(len(into)):
-        above, below = levels[np.uint64(2) * np.uint64(t)], levels[np.uint64(2) * np.uint64(t) + np.uint64(1)]
+        above, below = words[np.uint64(2) * np.uint64(t)], words[np.uint64(2) * np.uint64(t) + np.uint64(1)]
         p, q = np.float32(np.int32(above & low)), np.float32(np.int32(above >> high))
         r, s = np.float32(np.int32(below & low)), np.float32(np.int32(below >> high))
         upper, lower = p + a[t] * (q - p), r + a[t] * (s - r)

@@ -67,8 +67,7 @@ def explained(noise: Residuals) -> Explained:
         N_FRAMES // 2,
         SHAPE,
     )
-    image = np.ones(SHAPE, np.float32)
-    return Explained(motion, Canvas(*image.shape, np.eye(3)), noise, 1.05, ())
+    return Explained(motion, Canvas(*SHAPE, np.eye(3)), noise, 1.05, ())
 
 
 Made = dict[str, Any]
