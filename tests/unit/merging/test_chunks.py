@@ -184,7 +184,7 @@ def interpolated(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int]
 def warped(image: np.ndarray, to_image: np.ndarray, shape: tuple[int, int], seen: np.ndarray | None = None) -> Grid:
     """Warp an image, and its share of each pixel times 3, onto a grid of zeros."""
     grid, footprint = Grid.zeros(Canvas(*shape, np.eye(3)), 1), Footprint(1, to_image, range(shape[0]), (range(shape[1]),))
-    textures = [None if each is None else Texture.of(each.astype(np.float32)) for each in (image, seen)]
+    textures = [None if each is None else Texture.of(each) for each in (image, seen)]
     add_warped(textures[0], textures[1], np.array([3.0]), footprint, grid)
     return grid
 
@@ -219,9 +219,9 @@ def test_places_on_a_wide_grid_are_exact_to_a_thousandth_of_a_pixel() -> None:
     np.testing.assert_allclose(grid.total[5, inside], 0.5 * np.arange(40_200)[inside] + 0.005 - 20_000.25, atol=0.01)
 
 
-@pytest.mark.parametrize("largest", [1, 7, 65_535], ids=str)
-def test_texture_keeps_whole_numbers(largest: int) -> None:
-    image = np.random.default_rng(1).integers(0, largest + 1, (9, 14)).astype(np.uint32)
+@pytest.mark.parametrize(("largest", "kind"), [(1, np.uint8), (255, np.uint8), (7, np.uint32), (65_535, np.uint32)], ids=str)
+def test_texture_keeps_whole_numbers(largest: int, kind: type[np.unsignedinteger]) -> None:
+    image = np.random.default_rng(1).integers(0, largest + 1, (9, 14)).astype(kind)
     image[0, 0] = largest
     np.testing.assert_array_equal(warped(image, np.eye(3), (9, 14)).total, image)
 

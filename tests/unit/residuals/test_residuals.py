@@ -13,13 +13,14 @@ from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging.canvas_plan import View, plan_canvas
 from photonpano.merging.panorama import render
+from photonpano.photometry import IntensityResponse
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import Residuals, measure
-from photonpano.residuals.prediction import Predictions
+from photonpano.residuals.prediction import Prediction, Predictions
 from photonpano.residuals.refinement import bounded_std_px, residual_ratio, unexplained_px
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, recorded
 from photonpano.testing.scenes import Scene
-from photonpano.values import FloatArray
+from photonpano.values import FloatArray, Panorama
 
 SHAPE = (48, 80)
 FRAMES = 800
@@ -161,6 +162,34 @@ def test_panorama_explains_frames_of_a_full_turn(projection: str, distortion: tu
     assert reduced_chi2.mean() == pytest.approx(1, abs=0.06)
     assert reduced_chi2.max() < 3.5, "no span, not one at the seam either, is badly predicted"
     assert ratio.mean() == pytest.approx(1, abs=0.01)
+
+
+LARGE = (254, 496)
+
+
+@pytest.mark.parametrize("projection", ["planar", "cylindrical", "spherical"])
+@pytest.mark.parametrize("distortion", [(0, 0, 0, 0), (-0.11, 0.03, 0, 0)], ids=["pinhole", "lens"])
+def test_prediction_lies_where_the_camera_looks(projection: str, distortion: tuple[float, ...]) -> None:
+    camera = Camera.of(430, LARGE, distortion)
+    turn = rotation_matrices(np.array([[0.03, 0.25, 0.1]]))
+    trajectory = FrameTrajectory(camera.homographies(np.concatenate([rotation_matrices(np.zeros((1, 3))), turn])))
+    canvas = plan_canvas(trajectory, FrameSpan(0, 2), LARGE, 1.0, 2**30, view=View(projection, camera=camera, turns=True))
+    homography = trajectory.at([1])[0]
+    y, x = np.mgrid[: LARGE[0], : LARGE[1]].astype(np.float64)
+    pixels = np.concatenate([camera.ideal(np.stack([x, y], axis=-1)), np.ones((*LARGE, 1))], axis=-1)
+    places = canvas.pixels(pixels @ (canvas.plane_to_rays @ homography).T)
+    for axis, size in enumerate((canvas.width, canvas.height)):
+        ramp = np.arange(size, dtype=np.float32) + 1
+        flux = np.ascontiguousarray(np.broadcast_to(ramp if axis == 0 else ramp[:, None], canvas.shape))
+        panorama = Panorama(flux, np.full(canvas.shape, 100, np.float32), canvas.transform)
+        prediction = Prediction.of(panorama, canvas, IntensityResponse(1.0, 0.0, 1e6, 0.0), trajectory, LARGE, camera=camera)
+        mean, variance = prediction.predicted(1)
+        known = np.isfinite(variance)
+        assert known.mean() > 0.9
+        error = np.abs(mean[known] - 1 - places[..., axis][known])
+        # 0.008 px are the levels of a texture. A plane is 1.6 times enlarged where the camera looks aside.
+        assert error.mean() < 0.009
+        assert error.max() < 0.045
 
 
 BENT = (96, 128)
