@@ -1,15 +1,14 @@
-"""Measure the time of each stage of a run, and its limits: the tables and the plot of docs/explanation/speed.md.
+"""Measure the time of runs and of their parts: the tables and the plot of docs/explanation/speed.md.
 
-    python tests/benchmarks/speed.py docs/explanation/speed.md [--frames 10000 30000 100000]
+    python tests/benchmarks/speed.py docs/explanation/speed.md [--frames 1000 10000 100000]
 
-Sums of frames are compared with `numpy.unpackbits`, merging with unpacking and warping every frame, both in the same process,
-so that ratios hold on any machine. Whole runs have three levels of groups of 500 frames and a panorama of scale 1. Simulating
-100,000 frames takes some minutes, and 2 GB of disk.
+Sums of frames are compared with `numpy.unpackbits`, warps with OpenCV's, merging with unpacking and warping every frame, and
+whole runs with a pass of numpy over the bytes of the capture, all on the same machine, so that ratios hold on any. Runs have
+all defaults. 100,000 frames take 2 GB of disk.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -39,7 +38,11 @@ from photonpano import FrameSpan, SourceContext
 from photonpano.capture.writing import truth_path
 from photonpano.contracts.protocols import Source
 from photonpano.evaluation import load_truth
-from photonpano.geometry import FrameTrajectory, inverse
+from photonpano.geometry import Camera, FrameTrajectory, inverse, rotation_matrices, translation
+from photonpano.merging.canvas_plan import View, plan_canvas
+from photonpano.merging.footprints import footprints_of
+from photonpano.merging.warping import Grid, Texture, add_warped
+from photonpano.values import FloatArray
 from photonpano_core.configs import MidpointConfig, PhotonMleConfig
 from photonpano_core.mergers.photon_mle import PhotonMleMerger
 from photonpano_core.resamplers import MidpointResampler
@@ -47,29 +50,35 @@ from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
 
 SHAPE = (254, 496)
 PX_A_FRAME = 0.02
+LONGEST_PX = 900  # of a path
 GROUP_SIZE = 500
 BLOCK_BYTES = 2**20
 THREADS = 2
+CAPTURES: dict[str, dict[str, Any]] = {"smooth": {}, "trembling": {"shake": {"rms_px": 3.0}}}
 
 
-def simulated(study: Study, n_frames: int) -> Path:
-    """Write a capture that moves by 0.02 px per frame, with its truth beside it."""
-    length_px = PX_A_FRAME * n_frames
-    width = max(2048, round(length_px))
+def simulated(study: Study, n_frames: int, kind: str) -> Path:
+    """Write a capture that moves by 0.02 px per frame or less, with its truth beside it."""
     capture = simulator(
-        scene={"kind": "street", "width": width, "height": width * 2 // 3},
-        path={"kind": "random-spline", "length_px": length_px},
+        scene={"kind": "street", "width": 2048, "height": 1365},
+        path={"kind": "random-spline", "length_px": min(PX_A_FRAME * n_frames, LONGEST_PX), **CAPTURES[kind]},
         flux=0.3,
         n_frames=n_frames,
         frame_shape=SHAPE,
     )
-    return in_child(study.capture, f"{n_frames}", capture).result
+    return in_child(study.capture, f"{kind}-{n_frames}", capture).result
 
 
 def spread(work: Callable[[int], object], items: range, threads: int) -> None:
     """Do work on all items in several threads."""
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, items))
+
+
+def repeated(work: Callable[[], object], number: int) -> None:
+    """Do work some times."""
+    for _ in range(number):
+        work()
 
 
 def sums(cube: Path) -> list[str]:
@@ -96,17 +105,55 @@ def sums(cube: Path) -> list[str]:
         return table(("Frames in a sum", "unpackbits", "one thread", "two threads"), rows)
 
 
-def reading(cube: Path) -> float:
-    """Return the rate at which all threads read a cube from the page cache, in bytes per second: the physical limit."""
-    size = cube.stat().st_size
-    blocks = range(size // BLOCK_BYTES)
+def summed_bytes(cube: Path) -> int:
+    """Return the sum of the bytes of a capture: a pass of numpy over them."""
+    frames = np.load(cube, mmap_mode="r").reshape(-1)
+    return sum(int(frames[start : start + BLOCK_BYTES].sum()) for start in range(0, len(frames), BLOCK_BYTES))
 
-    def read(index: int) -> object:
-        buffer = bytearray(BLOCK_BYTES)
-        with cube.open("rb", buffering=0) as file:
-            return os.preadv(file.fileno(), [buffer], index * BLOCK_BYTES)
 
-    return len(blocks) * BLOCK_BYTES / least(spread, read, blocks, THREADS).seconds
+def warps() -> list[str]:
+    """Return the table of warps of one frame, one thread, and of OpenCV's for the same map."""
+    counts = np.random.default_rng(0).poisson(1, SHAPE).astype(np.uint8)
+    lens = Camera.of(430, SHAPE, (-0.11, 0.03, 0, 0))
+
+    def homography(degrees: float) -> FloatArray:
+        middle = translation((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
+        return np.asarray(middle @ rotation_matrices(np.array([0, 0, np.radians(degrees)])) @ np.linalg.inv(middle))
+
+    def row(name: str, projection: str, degrees: float, camera: Camera | None = None, *, masked: bool = False) -> Sequence[str]:
+        moved = homography(degrees)
+        view = View(projection, camera=camera or Camera.of(430, SHAPE), turns=True)
+        canvas = plan_canvas(FrameTrajectory(moved[None]), FrameSpan(0, 1), SHAPE, 1.0, 2**30, view=view)
+        (at,) = footprints_of(canvas, camera, moved[None], SHAPE)
+        grid = Grid.zeros(canvas, 1)
+        seen_by = Texture.of(np.ones(SHAPE, np.float32)) if masked else None
+
+        def ours() -> object:
+            return add_warped(Texture.of(counts.astype(np.float32) if masked else counts), seen_by, np.ones(1), at, grid)
+
+        y, x = np.mgrid[: canvas.height, : canvas.width].astype(np.float32)
+        image = counts.astype(np.float32)
+
+        def remap() -> object:
+            return cv2.remap(image, x, y, cv2.INTER_LINEAR)
+
+        def warp() -> object:
+            return cv2.warpPerspective(image, moved, canvas.shape[::-1])
+
+        opencv = remap if camera or not canvas.planar else warp
+        times = [least(repeated, work, 100, times=5).seconds / 100 for work in (ours, opencv)]
+        rates = [f"{1e6 * each:.0f} us, {image.size / each / 1e6:.0f} Mpx/s" for each in times]
+        return name, rates[0], f"{rates[1]} (`{'remap' if opencv is remap else 'warpPerspective'}`)"
+
+    cv2.setNumThreads(1)
+    cases = [
+        ("homography, turned by 1 degree", "planar", 1.0),
+        ("homography, turned by 30 degrees", "planar", 30.0),
+        ("cylinder", "cylindrical", 1.0),
+        ("sphere, through a lens", "spherical", 1.0, lens),
+    ]
+    rows = [row(*case) for case in cases] + [row("homography, pixels masked", "planar", 1.0, masked=True)]
+    return table(("Warp of 254 x 496 px", "ours, counts and weights", "OpenCV, one image"), rows)
 
 
 def warped_one_by_one(source: Source, span: FrameSpan, to_grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,86 +205,63 @@ def merging(cube: Path) -> list[str]:
         return table(head, map(row, (0.25, 0.5, 1.0)))
 
 
-def whole(study: Study, cube: Path) -> dict[str, Any]:
-    """Run the pipeline in a process of its own, and return its record."""
-    spec = packed(cube, resample={"with": {"group_size": GROUP_SIZE}}, run={"threads": THREADS})
-    folder = in_child(study.run, "run", spec).result
-    return record_of(folder) | {"mean_px": scores_of(folder, cube).trajectory.mean_px}
+def row_of_run(study: Study, n_frames: int, kind: str, seconds: dict[str, dict[int, tuple[float, float]]]) -> Sequence[str]:
+    """Run all defaults in a process of its own, and return a row of the table of whole runs."""
+    cube = simulated(study, n_frames, kind)
+    once = least(summed_bytes, cube).processor_s
+    folder, whole, cpu_s, _ = in_child(study.run, kind, packed(cube, run={"threads": THREADS}))
+    record, error = record_of(folder), scores_of(folder, cube).trajectory.mean_px
+    seconds[kind][n_frames] = whole, cpu_s
+    cube.unlink()
+    figures = f"{whole:.1f} s", f"{cpu_s:.1f} s", f"{cpu_s / once:.0f}", f"{record['peak_memory_bytes'] / 2**20:.0f} MiB"
+    return f"{n_frames:,}", kind, *figures, f"{error:.3f} px", record["verdict"]["status"]
 
 
-def stages(record: dict[str, Any]) -> dict[str, float]:
-    """Return the seconds of a run by stage."""
-    names = ("merge", "locate", "interpolate")
-    found = {name: sum(level["seconds"].get(name, 0.0) for level in record["levels"]) for name in names}
-    found["panorama"] = record["panorama"]["seconds"]
-    found["other"] = record["seconds"] - sum(found.values())
-    return found
-
-
-def row_of_run(record: dict[str, Any], n_frames: int) -> Sequence[str]:
-    """Return a row of the table of whole runs."""
-    by_stage = stages(record)
-    shares = [f"{by_stage[name]:.1f} s" for name in ("merge", "locate", "panorama")]
-    other, memory_mib = by_stage["other"] + by_stage["interpolate"], record["peak_memory_bytes"] / 2**20
-    figures = f"{other:.1f} s", f"{memory_mib:.0f} MiB", f"{record['mean_px']:.3f} px"
-    return f"{n_frames:,}", f"{record['seconds']:.0f} s", *shares, *figures
-
-
-def limits(records: dict[int, dict[str, Any]], rate: float) -> list[str]:
-    """Return what the longest run is compared with, at a rate of reading in bytes per second, and how the time grows."""
-    longest = max(records)
-    passes = len(records[longest]["levels"]) + 1
-    once = longest * SHAPE[0] * SHAPE[1] / 8 / rate
-    lines = [
-        f"\nTo read the frames once in each of {passes} passes, {passes - 1} levels and the panorama, "
-        f"takes {passes * once:.1f} s of {longest:,} frames ({rate / 1e9:.1f} GB/s, two threads, from the page cache): "
-        f"the run takes {records[longest]['seconds'] / passes / once:.0f} times that."
+def growth(seconds: dict[str, dict[int, tuple[float, float]]]) -> list[str]:
+    """Return how the time of the processor grows."""
+    if any(len(found) < 2 for found in seconds.values()):
+        return []
+    exponents = [
+        f"{np.polyfit(np.log(list(found)), np.log([cpu_s for _, cpu_s in found.values()]), 1)[0]:.2f} ({kind})"
+        for kind, found in seconds.items()
     ]
-    if len(records) > 1:
-        exponent = np.polyfit(np.log(list(records)), np.log([record["seconds"] for record in records.values()]), 1)[0]
-        lines.append(f"\nTime grows with the number of frames to the power of {exponent:.2f}.")
+    lines = [f"\nCPU seconds grow with the number of frames to the power of {' and '.join(exponents)}."]
     print(*lines, sep="\n")
     return lines
 
 
-def plot(records: dict[int, dict[str, Any]], file: Path) -> None:
-    """Draw the time of each stage."""
+def plot(seconds: dict[str, dict[int, tuple[float, float]]], file: Path) -> None:
+    """Draw the time of runs against the number of frames."""
     figure, axes = plt.subplots(figsize=(7, 3.2), layout="constrained")
-    left = np.zeros(len(records))
-    labels = [f"{n_frames:,} frames" for n_frames in records]
-    colours = ("#1f5a94", "#8fb0cf", "#c8a26b", "#a8641e", "#999999")
-    for name, colour in zip(("merge", "locate", "interpolate", "panorama", "other"), colours, strict=True):
-        width = np.array([stages(record)[name] for record in records.values()])
-        axes.barh(labels, width, left=left, label=name, color=colour)
-        left += width
-    axes.invert_yaxis()
-    axes.set_xlabel("seconds, two threads")
-    axes.legend(frameon=False, ncols=5, loc="lower center", bbox_to_anchor=(0.45, 1.0))
+    for (kind, found), colour in zip(seconds.items(), ("#1f5a94", "#a8641e"), strict=True):
+        for (name, style), times in zip(
+            (("seconds", "-"), ("CPU seconds", "--")), zip(*found.values(), strict=True), strict=True
+        ):
+            axes.plot(list(found), times, style, marker="o", color=colour, label=f"{kind}: {name}")
+    axes.set(xscale="log", yscale="log", xlabel="frames of 254 x 496 px", ylabel="s, two threads")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
     figure.savefig(file, dpi=110)
+    plt.close(figure)
 
 
-RUNS = ("Frames", "Whole", "merge", "locate", "panorama", "other", "Peak memory", "Mean error")
+RUNS = ("Frames", "Capture", "Seconds", "CPU seconds", "of a pass of numpy", "Peak memory", "Mean error", "Verdict")
 
 
-def main(page: Path | None, frames: Sequence[int] = (10_000, 30_000, 100_000)) -> None:
+def main(page: Path | None, frames: Sequence[int] = (1_000, 10_000, 100_000)) -> None:
     """Measure everything on captures of several lengths, and write the page."""
-    records: dict[int, dict[str, Any]] = {}
-    tables: dict[str, list[str]] = {}
-    rate = 0.0
+    seconds: dict[str, dict[int, tuple[float, float]]] = {kind: {} for kind in CAPTURES}
+    tables = {"warps": warps()}
     with passing() as study:
-        for n_frames in frames:
-            cube = simulated(study, n_frames)
-            if not tables:
-                cv2.setNumThreads(1)
-                tables |= {"sums": sums(cube), "merging": merging(cube)}
-                rate = reading(cube)
-            records[n_frames] = whole(study, cube)
-            cube.unlink()
-    tables["runs"] = table(RUNS, (row_of_run(record, n_frames) for n_frames, record in records.items())) + limits(records, rate)
+        cube = simulated(study, min(10_000, max(frames)), "smooth")
+        tables |= {"sums": sums(cube), "merging": merging(cube)}
+        rows = (row_of_run(study, n_frames, kind, seconds) for n_frames in frames for kind in CAPTURES)
+        tables["runs"] = table(RUNS, rows)
+    tables["runs"] += growth(seconds)
     write_tables(page, tables)
     if page:
-        plot(records, IMAGES / "speed.png")
+        plot(seconds, IMAGES / "speed.png")
 
 
 if __name__ == "__main__":
-    command(main, "sums", "merging", "runs")
+    command(main, "warps", "sums", "merging", "runs")
