@@ -24,10 +24,13 @@ def binned_mean(source: Source, span: FrameSpan) -> FluxImage:
     binning = binning_of(source)
     height, width = (side // binning * binning for side in source.info.frame_shape)
     size = (width // binning, height // binning)
-    weights = weights_of(source)
-    valid = np.ones((height, width), np.float32) if weights is None else weights[:height, :width]
-    lit = capture_of(source).corrected_counts(span)[:height, :width] * valid
-    share, summed = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (valid, lit.astype(np.float32)))
+    capture = capture_of(source)
+    counts = np.asarray(capture.corrected(capture.chunk(span), len(span)), np.float32)[:height, :width]
+    weights = weights_of(capture)
+    if weights is None:
+        return np.asarray(cv2.resize(counts, size, interpolation=cv2.INTER_AREA) / np.float32(len(span)), np.float32)
+    valid = weights[:height, :width]
+    share, summed = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (valid, counts * valid))
     mean = np.full(share.shape, np.nan, dtype=np.float32)
     np.divide(summed, share * len(span), out=mean, where=share > 0)
     return mean
