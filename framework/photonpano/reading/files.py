@@ -222,7 +222,7 @@ class _OpenFile:
     """A file that is closed when neither the cache nor a thread that reads it refers to it."""
 
     def __init__(self, path: Path) -> None:
-        if reason := refusal(path):  # asked once: before each piece, it would take a fiftieth of a run
+        if reason := refusal(path):  # asked here, not before each of many small pieces
             raise InputError(reason)
         self.descriptor = os.open(path, os.O_RDONLY)
 
