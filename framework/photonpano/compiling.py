@@ -41,7 +41,9 @@ def compiled(function: Function) -> Function:
     zero gives one of them.
     """
     # No "nnan" and "ninf": NaN stands for pixels without a value.
-    dispatcher: Any = numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})(function)
+    fastmath = {"contract", "reassoc", "nsz"}
+    # Wrappers for C, which nobody calls, would take a twentieth of the time to compile.
+    dispatcher: Any = numba.njit(nogil=True, error_model="numpy", fastmath=fastmath, no_cfunc_wrapper=True)(function)
     dispatcher._cache = _Cache(function)
     return cast("Function", dispatcher)
 
