@@ -41,9 +41,7 @@ def compiled(function: Function) -> Function:
     zero gives one of them.
     """
     # No "nnan" and "ninf": NaN stands for pixels without a value.
-    fastmath = {"contract", "reassoc", "nsz"}
-    # Wrappers for C, which nobody calls, would take a twentieth of the time to compile.
-    dispatcher: Any = numba.njit(nogil=True, error_model="numpy", fastmath=fastmath, no_cfunc_wrapper=True)(function)
+    dispatcher: Any = numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})(function)
     dispatcher._cache = _Cache(function)
     return cast("Function", dispatcher)
 
