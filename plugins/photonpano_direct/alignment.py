@@ -233,7 +233,9 @@ def _parameters(homography: Homography) -> FloatArray:
 @compiled
 def _from_parameters(p: FloatArray) -> Homography:
     """Return the homography of p1..p8."""
-    homography = np.eye(3)
+    homography = np.zeros((3, 3))
+    for i in range(3):
+        homography[i, i] = 1
     for i in range(8):
         row, column = (i % 2, i // 2) if i < 6 else (2, i - 6)
         homography[row, column] += p[i]

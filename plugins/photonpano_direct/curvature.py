@@ -57,6 +57,10 @@ MOMENTS_X, MOMENTS_Y, _MOMENTS_OF_PRODUCTS = _X.reshape(8, 9), _Y.reshape(8, 9),
 PRIOR = np.diag(np.array([PRIOR_STD, PRIOR_STD, PRIOR_STD, PRIOR_STD, np.inf, np.inf, PRIOR_STD, PRIOR_STD]) ** -2.0)
 
 
+# Places of p1..p8 in a homography, column by column: [[1 + p1, p3, p5], [p2, 1 + p4, p6], [p7, p8, 1]].
+_ROWS, _COLUMNS = [0, 1, 0, 1, 0, 1, 2, 2], [0, 0, 1, 1, 2, 2, 0, 1]
+
+
 class Coordinates(NamedTuple):
     """Unit coordinates of an image of some shape."""
 
@@ -92,7 +96,7 @@ def curvatures(moving: Layer, buffers: Buffers, chance: float, floor: float) -> 
     for i in range(8):
         whitened[i, i] += 1
     values, vectors = np.linalg.eigh(whitened)
-    half = product(root, vectors)
+    half = product(root, transposed(vectors.T))  # in C order, for which `product` is compiled
     for i in range(8):
         for j in range(8):
             half[i, j] *= np.sqrt(max(values[j] - chance, floor))
@@ -125,10 +129,12 @@ def expected_px(information: FloatArray, basis: FloatArray, to_corners: FloatArr
         return 0.0
     # The trace of J (R R^T)^-1 J^T is the sum of the squares of R^-1 J^T.
     solve_lower(root, moves)
-    return float(np.sqrt((moves**2).sum() / 4))
+    squares = 0.0
+    for i in range(moves.shape[0]):
+        squares += dot(moves[i], moves[i])
+    return float(np.sqrt(squares / 4))
 
 
-@compiled
 def information_of(
     moving: Layer,
     buffers: Buffers,
@@ -146,26 +152,16 @@ def information_of(
     _, hessian = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
     # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights and positions
     # hardly change within the blur, so M needs only blurred gradients.
-    per_pixel = np.float32(pixels / weights)
-    for y in range(buffers.weight.shape[0]):
-        row = buffers.weight[y]
-        for t in range(len(row)):
-            row[t] *= row[t] * per_pixel
+    np.multiply(buffers.weight, buffers.weight, out=buffers.weight)
+    np.multiply(buffers.weight, np.float32(pixels / weights), out=buffers.weight)
     scatter, root = _hessian(moving.smoothed, moving.smoothed, buffers.weight), np.zeros((8, 8))
     if not cholesky(scatter, root):
         return PRIOR.copy(), np.inf
     solve_lower(root, hessian)
-    information = product(transposed(hessian), hessian)
-    for i in range(8):
-        for j in range(8):
-            information[i, j] = information[i, j] / max(1.0, noise_ratio) + PRIOR[i, j]
+    information = hessian.T @ hessian / max(1.0, noise_ratio) + PRIOR
     std_px = expected_px(information, np.eye(8), coordinates.to_corners)
     # From steps in unit coordinates of the template to p1..p8 of the homography, with h33 = 1.
-    to_parameters = np.empty((8, 8))
-    for k in range(8):
-        changed = product(homography, coordinates.generators[k])
-        for i in range(8):
-            row_i, column_i = (i % 2, i // 2) if i < 6 else (2, i - 6)
-            to_parameters[i, k] = changed[row_i, column_i] - homography[row_i, column_i] * changed[2, 2]
-    to_step = np.linalg.inv(to_parameters).astype(np.float64)
-    return product(transposed(to_step), product(information, to_step)), std_px if std_px > 0 else np.inf
+    changed = homography @ coordinates.generators
+    to_parameters = (changed - homography * changed[:, 2:, 2:])[:, _ROWS, _COLUMNS].T
+    to_step = np.linalg.inv(to_parameters)
+    return to_step.T @ information @ to_step, std_px if std_px > 0 else np.inf

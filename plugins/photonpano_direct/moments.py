@@ -121,7 +121,10 @@ def _compare(moving: Layer, fixed: Layer, homography: Homography, y: int, buffer
 @compiled
 def _across(width: int, half: float) -> Image:
     """Return the unit coordinates of the pixels of a row: (width,). To read them is faster than to compute them in loops."""
-    return ((np.arange(width) - (width - 1) / 2) / half).astype(np.float32)
+    across = np.empty(width, np.float32)
+    for x in range(width):
+        across[x] = (x - (width - 1) / 2) / half
+    return across
 
 
 @compiled

@@ -105,11 +105,11 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
     observers, read = Observers(plan.observers, plan.output.directory), [*capture_files(plan), *filter(None, [plan.file])]
     with (
         observers.watching(plan.document) as finished,
+        notify_on_first_compile(partial(progress.note, COMPILING)),
         open_source(plan) as source,
         run_folder(plan.output.directory, overwrite=overwrite, inputs=read) as folder,
         loading_figures(),
         one_thread_inside(),
-        notify_on_first_compile(partial(progress.note, COMPILING)),
     ):
         run = BegunRun(plan, source, folder, observers, progress, time.perf_counter())
         _require_photons(plan, source)

@@ -49,6 +49,13 @@ def reading(path: Path, otherwise: str | None = None) -> Iterator[None]:
     """
     if reason := refusal(path):
         raise InputError(reason)
+    with _errors_in_words(path, otherwise):
+        yield
+
+
+@contextmanager
+def _errors_in_words(path: Path, otherwise: str | None = None) -> Iterator[None]:
+    """Turn what reading raises into an `InputError`: see `reading`."""
     try:
         yield
     except FileNotFoundError as error:
@@ -197,7 +204,7 @@ class OpenFiles:
                 raise InputError(f"{path} is shorter than it should be; copy or record it again")
             target.reshape(-1)[:] = np.frombuffer(data, np.uint8)
             return
-        with reading(path):
+        with _errors_in_words(path):
             file = self._opened(path)
             left = target.reshape(-1).data
             while left:
@@ -215,6 +222,8 @@ class _OpenFile:
     """A file that is closed when neither the cache nor a thread that reads it refers to it."""
 
     def __init__(self, path: Path) -> None:
+        if reason := refusal(path):  # asked here, not before each of many small pieces
+            raise InputError(reason)
         self.descriptor = os.open(path, os.O_RDONLY)
 
     def __del__(self) -> None:

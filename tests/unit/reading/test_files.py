@@ -23,6 +23,7 @@ from photonpano.reading import (
     read_json,
     unpacked_content,
 )
+from photonpano.reading import files as files_of_captures
 
 
 def test_files_in_returns_natural_order(tmp_path: Path) -> None:
@@ -74,6 +75,15 @@ def test_missing_file_is_named_when_read(source: PackedFileSource, tmp_path: Pat
     with pytest.raises(InputError) as caught:
         source.counts(FrameSpan(13, 16))
     assert str(caught.value) == f"there is no file {tmp_path / '7.bin'}; check the path"
+
+
+def test_kind_of_a_file_is_asked_when_it_is_opened_only(source: PackedFileSource, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Path] = []
+    monkeypatch.setattr(files_of_captures, "refusal", lambda path: asked.append(path))
+    with source:
+        for frame in range(2):
+            source.counts(FrameSpan(frame, frame + 1))
+        assert [path.name for path in asked] == ["0.bin"]
 
 
 class Size(BaseModel):

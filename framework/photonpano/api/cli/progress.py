@@ -10,7 +10,8 @@ import time
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
-from photonpano.api.cli.verbosity import is_logged, is_quiet, is_verbose, log_shown
+from photonpano.api.cli.costs import StageCosts
+from photonpano.api.cli.verbosity import is_logged, is_quiet, is_verbose, log_shown, logger
 from photonpano.execution.context import Progress, Quiet
 from photonpano.text import count, duration
 
@@ -98,17 +99,18 @@ class Lines:
 
 
 class Logged:
-    """Writes stages and notes to the log, and shows them."""
+    """Writes stages and notes to the log, and shows them; adds up what the stages cost."""
 
     def __init__(self, shown: Progress) -> None:
         self._shown = shown
+        self._costs = StageCosts()
 
     @contextmanager
     def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
         """Write when the stage begins, and when it is done."""
         state = _Stage(title, total, unit)
         log_shown(logging.INFO, f"{title}: begins")
-        with self._shown.stage(title, total, unit) as advance:
+        with self._costs(title), self._shown.stage(title, total, unit) as advance:
             yield advance
         log_shown(logging.INFO, state.finished())
 
@@ -116,6 +118,11 @@ class Logged:
         """Write a line."""
         log_shown(logging.INFO, message)
         self._shown.note(message)
+
+    def log_costs(self) -> None:
+        """Log a table of what the stages cost so far."""
+        for line in self._costs.table().splitlines():
+            logger.info("%s", line)
 
 
 class _Stage:

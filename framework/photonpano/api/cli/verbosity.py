@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ import typer
 
 from photonpano import __version__
 
+STARTED_S = time.perf_counter()  # when the program began: this module is among the first that are imported
 logger = logging.getLogger("photonpano")
 SHOWN = f"{__name__}.shown"  # logger of messages that are on the screen already, for the log file alone
 _VERBOSE, _QUIET, _LOG = "verbose", "quiet", "log"
@@ -121,7 +123,10 @@ class _LogFile(logging.FileHandler):
             self._failed = True
 
 
-_MORE = "Say more on standard error: each decision with its reason and, without a terminal, each stage with its time."
+_MORE = (
+    "Say more on standard error: each decision with its reason; without a terminal, each stage with its time; and at the end a "
+    "table of what the stages took."
+)
 _TO_FILE = "Append stages, decisions, warnings and errors to a file, each with its time."
 _option = partial(typer.Option, callback=_keep, expose_value=False)
 
