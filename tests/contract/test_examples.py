@@ -27,6 +27,7 @@ GROUPS = {"resample.with.group_size": 50}
 UNREFINED = GROUPS | {"refine": "[]"}
 SHORT = UNREFINED | {"levels": 2}
 """For specs that leave the number of levels to its default: 3 show no more than 2."""
+CROPPED = {"corrections": "[{crop: {rows: [0, 80], columns: [0, 112]}}]"}
 SMALL_NIGHT = {
     "source.with.n_frames": 600,
     "source.with.frame_shape": "[128, 160]",
@@ -50,8 +51,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "naive-average": SHORT,
     "constant-groups": SHORT,
     "sliding-window": SHORT,
-    "super-resolution": SHORT,
-    "gradual-super-resolution": UNREFINED,
+    "super-resolution": SHORT | CROPPED,
+    "gradual-super-resolution": UNREFINED | CROPPED,
     "coarse-to-fine": UNREFINED,
     "keypoints": SHORT,
     "orb": SHORT,
@@ -59,7 +60,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "translation": UNREFINED,
     "smoothing-spline": GROUPS,
     "fallback": UNREFINED,
-    "kornia": UNREFINED,
+    "kornia": UNREFINED | {"light": "steady"},
     "chain": SHORT,
     "colmap": SHORT,
     "demo": GROUPS,
@@ -68,7 +69,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "visionsim": SHORT,
     "zarr": SHORT,
     "vanvleck": SHORT,
-    "cluster": SHORT,
+    "cluster": SHORT | {"run.executor.with.workers": 1, "light": "steady"},
     "dark-scene": SMALL_STREET | {"levels": 2, "source.with.flux": 0.2, "resample.with.group_size": 60},
     "hot-pixels": SMALL_STREET | {"levels": 2, "source.with.flux": 0.5, "resample.with.group_size": 60},
     "colour": SMALL_STREET | SHORT | {"resample.with.group_size": 60},
@@ -266,8 +267,8 @@ def test_example_of_a_real_capture_runs(examples, tmp_path, without_report):
 @pytest.mark.parametrize(
     ("name", "n_frames", "small", "pictures", "std"),
     [
-        ("poses", 480, {}, 16, 0.02),
-        ("stratified-poses", 240, {"source.with.n_frames": 240, "pose.with.group_size": 20}, 0, 0.01),
+        ("poses", 240, {"source.with.n_frames": 240, "pose.with.group_size": 15}, 16, 0.03),
+        ("stratified-poses", 240, {"source.with.n_frames": 240, "pose.with.group_size": 20, "pose.with.levels": 2}, 0, 0.01),
     ],
 )
 def test_example_of_poses_runs(examples, tmp_path, without_report, name, n_frames, small, pictures, std):
