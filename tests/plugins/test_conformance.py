@@ -62,7 +62,7 @@ TestPycolmapTwoView = of(LocatorConformance, "pycolmap-two-view", tolerance_px=0
 TestKorniaRegistrator = of(LocatorConformance, "kornia-registrator", tolerance_px=0.1)
 TestKorniaFeatures = of(LocatorConformance, "kornia-features", config={"max_keypoints": 400}, tolerance_px=0.3)
 TestKorniaFeaturesAdalam = of(
-    LocatorConformance, "kornia-features", config={"max_keypoints": 400, "matcher": "adalam"}, tolerance_px=0.3
+    LocatorConformance, "kornia-features", config={"max_keypoints": 200, "matcher": "adalam"}, tolerance_px=0.3
 )
 
 
