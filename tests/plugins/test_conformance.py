@@ -101,9 +101,9 @@ TestSuperResolution = of(RendererConformance, "super-resolution", scales=(2.0,))
 TestExr = of(ExporterConformance, "exr")
 TestHdr = of(ExporterConformance, "hdr")
 
-TestColmapAverages = of(PoseEstimatorConformance, "colmap-averages", config={"group_size": 20})
+TestColmapAverages = of(PoseEstimatorConformance, "colmap-averages", config={"group_size": 32})
 TestStratifiedPose = of(
-    PoseEstimatorConformance, "stratified-pose", config={"group_size": 20, "levels": 2}, tolerance=0.01, tolerance_deg=0.5
+    PoseEstimatorConformance, "stratified-pose", config={"group_size": 32, "levels": 2}, tolerance=0.01, tolerance_deg=0.5
 )
 
 TestThreads = of(ExecutorConformance, "threads")
