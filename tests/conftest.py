@@ -242,11 +242,13 @@ def streets_drawn_once() -> Iterator[None]:
 def plugins_found_once() -> Iterator[None]:
     """Find the installed plugins once: each spec and each command looks for them, which takes longer than to read a spec.
 
-    They are looked for anew where a test has others: in another folder of modules, disabled, or without their libraries.
+    They are looked for anew where a test has others: installed in another folder, disabled, or without their libraries.
     """
+    path = list(sys.path)
 
     def place() -> tuple[Any, ...]:
-        return [*sys.path], os.environ.get(DISABLE), importlib.util.find_spec
+        folders = [folder for folder in sys.path if folder in path or any(Path(folder).glob("*.dist-info"))]
+        return folders, os.environ.get(DISABLE), importlib.util.find_spec
 
     find, found, installed = registry.discover, registry.discover(), place()
     with pytest.MonkeyPatch.context() as patch:
