@@ -37,12 +37,11 @@ test: $(COMPLETE)
 	@$(BIN)/ruff check .
 	$(STEP) 'ruff format'
 	@$(BIN)/ruff format --check .
-	$(STEP) 'mypy, while the loops over pixels are compiled'
-	@$(BIN)/photonpano warm-up & $(BIN)/mypy; status=$$?; wait; exit $$status
 	$(STEP) 'import-linter'
 	@$(BIN)/lint-imports --no-logo
-	$(STEP) 'pytest'
-	@$(BIN)/pytest -n auto --dist worksteal --durations 40
+	$(STEP) 'mypy, and pytest as soon as the loops over pixels are compiled'
+	@$(BIN)/mypy & types=$$!; $(BIN)/photonpano warm-up && $(BIN)/pytest -n auto --dist worksteal --durations 40; status=$$?; \
+	wait $$types || { echo 'error: mypy found what it printed before the results of pytest'; status=1; }; exit $$status
 
 demo: $(RUNS)
 	@mkdir -p demo

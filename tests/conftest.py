@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib.util
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -20,6 +21,8 @@ from photonpano.execution import interrupts
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run import RunResult
+from photonpano.plugins import registry
+from photonpano.plugins.registry.discovery import DISABLE
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_simulator import scenes
 
@@ -232,6 +235,25 @@ def streets_drawn_once() -> Iterator[None]:
     """Draw each street once: many tests simulate the same one, and drawing it takes longer than a small run."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("photonpano_simulator.scenes.street", lru_cache(maxsize=16)(scenes.street))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def plugins_found_once() -> Iterator[None]:
+    """Find the installed plugins once: each spec and each command looks for them, which takes longer than to read a spec.
+
+    They are looked for anew where a test has others: installed in another folder, disabled, or without their libraries.
+    """
+    path = list(sys.path)
+
+    def place() -> tuple[Any, ...]:
+        folders = [folder for folder in sys.path if folder in path or any(Path(folder).glob("*.dist-info"))]
+        return folders, os.environ.get(DISABLE), importlib.util.find_spec
+
+    find, found, installed = registry.discover, registry.discover(), place()
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("photonpano.plugins.registry", "photonpano.specs.loading"):
+            patch.setattr(f"{module}.discover", lambda: found if place() == installed else find())
         yield
 
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("without_report")
 
 
 def spec_of(capture: Path) -> dict[str, Any]:
-    return {"version": 1, "source": {"use": "packed-npy", "with": {"path": str(capture)}}, "levels": 1}
+    return {"version": 1, "source": {"use": "packed-npy", "with": {"path": str(capture)}}, "levels": 1, "refine": []}
 
 
 @pytest.fixture(scope="module")

@@ -88,9 +88,9 @@ def test_constant_groups_are_less_accurate_without_refinement(run: Callable, err
 
 
 def test_naive_average_is_less_accurate(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
-    """Measured: 0.10 px, and 0.04 px with compensation; more levels do not help."""
+    """Measured: 0.099 px, and 0.037 px with compensation; more levels do not help."""
     naive = run("merge.with.compensate=false", levels=2)
-    assert error_px(naive.homographies) > 2 * error_px(three_levels)
+    assert error_px(naive.homographies) > 2.4 * error_px(three_levels)
 
 
 def test_half_size_first_level_suffices_for_second(run: Callable, error_px: Callable) -> None:

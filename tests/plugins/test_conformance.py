@@ -62,7 +62,7 @@ TestPycolmapTwoView = of(LocatorConformance, "pycolmap-two-view", tolerance_px=0
 TestKorniaRegistrator = of(LocatorConformance, "kornia-registrator", tolerance_px=0.1)
 TestKorniaFeatures = of(LocatorConformance, "kornia-features", config={"max_keypoints": 400}, tolerance_px=0.3)
 TestKorniaFeaturesAdalam = of(
-    LocatorConformance, "kornia-features", config={"max_keypoints": 400, "matcher": "adalam"}, tolerance_px=0.3
+    LocatorConformance, "kornia-features", config={"max_keypoints": 200, "matcher": "adalam"}, tolerance_px=0.3
 )
 
 
@@ -101,9 +101,9 @@ TestSuperResolution = of(RendererConformance, "super-resolution", scales=(2.0,))
 TestExr = of(ExporterConformance, "exr")
 TestHdr = of(ExporterConformance, "hdr")
 
-TestColmapAverages = of(PoseEstimatorConformance, "colmap-averages", config={"group_size": 20})
+TestColmapAverages = of(PoseEstimatorConformance, "colmap-averages", config={"group_size": 32})
 TestStratifiedPose = of(
-    PoseEstimatorConformance, "stratified-pose", config={"group_size": 20, "levels": 2}, tolerance=0.01, tolerance_deg=0.5
+    PoseEstimatorConformance, "stratified-pose", config={"group_size": 32, "levels": 2}, tolerance=0.01, tolerance_deg=0.5
 )
 
 TestThreads = of(ExecutorConformance, "threads")

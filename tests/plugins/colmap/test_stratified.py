@@ -209,9 +209,9 @@ def test_exposures_along_the_true_path_are_found_where_they_are() -> None:
 
 
 def test_exposures_without_anything_in_common_are_an_error() -> None:
-    source = MemorySource(np.random.default_rng(0).integers(0, 2, (80, *SHAPE)))
+    source = MemorySource(np.random.default_rng(0).integers(0, 2, (40, *SHAPE)))
     with ThreadPoolExecutor(2) as pool:
-        everywhere = np.ones(80, np.bool_)
+        everywhere = np.ones(40, np.bool_)
         merged = merge(source, resample(everywhere, 20), Scene(TRUE, everywhere, _seen_points()), MATRIX, pool)
         with pytest.raises(LocationError, match="no patch of one was found in another"):
             locate(merged.exposures, MATRIX, pool)

@@ -61,25 +61,26 @@ class Killing(Quiet):
 
 @pytest.fixture(scope="module")
 def spec(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The spec of a capture in a file, of 400 frames."""
+    """The spec of a capture in a file, of 200 frames."""
     capture = {
         "use": "simulator",
         "with": {
             "scene": {"kind": "street", "width": 400, "height": 300},
             "path": {"kind": "pan", "length_px": 30},
             "flux": 1,
-            "n_frames": 400,
-            "frame_shape": [96, 128],
+            "n_frames": 200,
+            "frame_shape": [64, 96],
         },
     }
     folder = tmp_path_factory.mktemp("capture")
 
     simulate(parse_spec({"version": 1, "source": capture}), folder / "cube.npy")
     source = {"use": "packed-npy", "with": {"path": str(folder / "cube.npy")}}
-    return {"version": 1, "source": source, "resample": {"with": {"group_size": 50}}, "levels": 2}
+    return {"version": 1, "source": source, "resample": {"with": {"group_size": 50}}, "levels": 2, "refine": []}
 
 
 @pytest.mark.filterwarnings("default")
+@pytest.mark.usefixtures("without_report")
 def test_same_bytes_and_decisions_as_on_threads_though_workers_are_killed(spec: dict[str, Any], tmp_path: Path) -> None:
     here = run(parse_spec(spec, output=tmp_path / "threads"))
     elsewhere = {"run": {"executor": {"use": "dask", "with": {"workers": 2}}}}

@@ -181,7 +181,7 @@ def test_damaged_file_raises_input_error_only(tmp_path: Path, write_video: Calla
     content, capture = path.read_bytes(), path.parent if kind in ("png", "tif") else path
     assert read(source, capture) == ""
     for number in range(SAMPLE):
-        path.write_bytes(damaged(content, random.Random(f"{kind} {number}")))
+        path.write_bytes(damaged(content, random.Random(f"{number} {kind}")))
         sentence = read(source, capture)
         assert not sentence or str(tmp_path) in sentence
 
