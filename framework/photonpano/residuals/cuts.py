@@ -2,42 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.contracts.protocols import Source
 from photonpano.execution.context import Context
-from photonpano.geometry import steps_px
+from photonpano.geometry import apply, corners, inverse, steps_px
+from photonpano.locating import shift_of_spectra
 from photonpano.merging import binned_mean, binning_of
+from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut
-from photonpano.motion.tracking.spans import DARK, SumTrack, span_image, track_sums
-from photonpano.residuals.refinement import MotionFit, standing_out
-from photonpano.values import FloatArray, FluxImage, FrameSpan, true_spans
+from photonpano.motion.tracking.spans import DARK, PEAK_PX, span_image, spectra_of
+from photonpano.residuals.prediction import Predictions
+from photonpano.residuals.refinement import MotionFit
+from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, true_spans
 
-# Sums searched on both sides of spans that stand out.
+# Change of the residual shift, and of the misfit, from one span to the second next where a jump is looked for.
+_SUDDEN_PX, _SUDDEN_MISFIT = 0.7, 2.0
+# Sums searched on both sides of such a place.
 _MARGIN = 20
 # Wanted noise of a shift between two sums, and its ratio to the noise of a shift against the panorama.
-_TRACK_NOISE_PX, _TRACK_RATIO = 0.25, 10.0
+_TRACK_NOISE_PX, _TRACK_RATIO = 0.35, 10.0
 # Fewest and most frames of a sum, and most motion within it.
-_SHORTEST, _LONGEST, _MOTION_PX = 4, 64, 4.0
-# Least size of an outlier, absolute and as a multiple of the median around it.
+_SHORTEST, _LONGEST, _MOTION_PX = 4, 64, 2.0
+# Least size of a jump, and of an outlier as a multiple of the median around it.
 _SMALLEST_PX, _OUTLIER = 1.0, 4.5
-# Sums on either side that this median takes.
+# Sums, or spans, on either side that this median takes.
 _LOCAL = 24
-# Fewest sums for this median.
+# Fewest of them for this median.
 _FEWEST = 6
-# Sums before and after a jump that make the template of the frames between.
+# Sums before and after a jump whose frames are compared with each other.
 _SIDE = 4
 # Standard deviation of the Gaussian that smooths the template, in binned px.
 _BLUR_PX = 0.7
+# A direction of the image has no information if its share in that of the best direction is below this.
+_INFORMED = 0.02
 # Parts into which a jump is divided, to compare it with fast motions.
 _STEPS = 8
 # Lengths of these fast motions, in frames.
 _SHORT_RAMP, _RAMPS = 4, (8, 16, 32, 64, 128)
-# Standard deviations by which a jump must be likelier than a motion of 8 frames or more. A motion of 4 must not be likelier.
+# Standard deviations by which a jump must be likelier than a smooth motion, in frames that are held out, and than one that takes
+# 8 frames or more. A motion of 4 must not be likelier.
 _SURE = 4.0
 # Least variance of a binned pixel.
 _NOISE_FLOOR = 1e-4
@@ -49,16 +59,16 @@ class _Outlier:
 
     before: int  # number of the sum before
     after: int  # number of the sum after
-    shift_px: FloatArray  # (2,) what is not explained, in binned px
     sigmas: float  # its size in standard deviations
 
 
 def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ...]:
     """Find the places where the image jumps.
 
-    Places come into question where spans stand out from the motion. There, sums of a few frames are tracked by phase
-    correlation, from frames alone. Where a shift is an outlier, each frame is compared with templates from before and after,
-    and a jump at each frame with fast motions: see `_located`.
+    Places come into question where the residuals change suddenly. There, sums of a few frames are tracked by phase correlation,
+    from frames alone. Where a shift is an outlier, a jump must explain frames on both sides, which have not suggested it,
+    better than a smooth motion does; then each frame between is compared with both sides, and a jump at each frame with fast
+    motions: see `_located`.
     """
     size = _size_of_sums(fit)
     suspect = _suspect(fit, _MARGIN * size)
@@ -66,20 +76,35 @@ def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ..
         return ()
     found: list[Cut] = []
     with context.progress.stage("cuts", sum(map(len, suspect)), "frames") as advance:
-        runs = [[each for each in span.blocks(size) if len(each) == size] for span in suspect]
-        for span, track in zip(suspect, track_sums(source, runs, context), strict=True):
-            if track is not None:
-                found += _cuts_along(source, track, size)
+        for span in suspect:
+            sums = [each for each in span.blocks(size) if len(each) == size]
+            track = _Track.of(sums, list(context.in_order(partial(_measured, source, fit.predictions), sums)))
+            found += _cuts_along(source, fit.motion, track, size)
             advance(len(span))
     return tuple(found)
 
 
 def _suspect(fit: MotionFit, margin: int) -> list[FrameSpan]:
-    """Return the frames up to `margin` frames from spans that stand out."""
-    spans, flags = fit.residuals.spans, np.zeros(len(fit.motion.located), dtype=bool)
-    for index in np.flatnonzero(standing_out(fit.residuals)):
-        flags[max(0, spans[index].start - margin) : spans[index].stop + margin] = True
+    """Return the frames up to `margin` frames from places where the residuals change suddenly, measured by those around."""
+    residuals, flags = fit.residuals, np.zeros(len(fit.motion.located), dtype=bool)
+    shifts, misfit = residuals.steps().steps[:, :2], residuals.misfit
+    # The frame of a jump lies in some span: those before and after it are compared.
+    changes = np.linalg.norm(shifts[2:] - shifts[:-2], axis=1)
+    for index, _ in [*_outstanding(changes, _SUDDEN_PX), *_outstanding(misfit[1:-1] - 1, _SUDDEN_MISFIT)]:
+        span = residuals.spans[index + 1]
+        flags[max(0, span.start - margin) : span.stop + margin] = True
     return true_spans(flags & fit.motion.located)
+
+
+def _outstanding(sizes: FloatArray, smallest: float) -> Iterator[tuple[int, float]]:
+    """Yield the numbers of sizes that are the largest around, and their ratio to the usual one, where they stand out."""
+    for index in np.flatnonzero(sizes > smallest).tolist():
+        if sizes[index] < sizes[max(0, index - 3) : index + 4].max():
+            continue
+        around = np.r_[sizes[max(0, index - _LOCAL) : max(0, index - 3)], sizes[index + 4 : index + _LOCAL + 1]]
+        usual = max(float(np.median(around)), smallest / _OUTLIER) if len(around) >= _FEWEST else np.inf
+        if sizes[index] > _OUTLIER * usual:
+            yield index, float(sizes[index] / usual)
 
 
 def _size_of_sums(fit: MotionFit) -> int:
@@ -91,45 +116,74 @@ def _size_of_sums(fit: MotionFit) -> int:
     return int(np.clip(np.ceil(wanted), _SHORTEST, _LONGEST))
 
 
-def _cuts_along(source: Source, track: SumTrack, size: int) -> Iterator[Cut]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Track:
+    """Sums of successive frames with light, and where they show the image."""
+
+    spans: Sequence[FrameSpan]  # (N,) of the sums, in order
+    places: FloatArray  # (N, 2) in binned px, beyond the motion that was found
+
+    @classmethod
+    def of(cls, spans: Sequence[FrameSpan], measured: Sequence[tuple[float, FloatArray]]) -> _Track:
+        """Leave out the sums that show nothing, given the light and the place of each."""
+        light = np.array([each for each, _ in measured])
+        lit = np.flatnonzero(light > DARK * np.median(light)) if len(light) else []
+        return cls([spans[index] for index in lit], np.array([measured[index][1] for index in lit]).reshape(-1, 2))
+
+    @property
+    def centres(self) -> FloatArray:
+        """(N,) instants, in frames."""
+        return np.array([span.centre for span in self.spans])
+
+
+def _measured(source: Source, predictions: Predictions, span: FrameSpan) -> tuple[float, FloatArray]:
+    """Return the mean light of a sum, and its shift (x, y) from the panorama, in binned px; 0 without texture."""
+    image = span_image(source, span)
+    height, width = (side * binning_of(source) for side in image.shape)
+    expected = cv2.resize(predictions.predicted(span.centre)[0][:height, :width], image.shape[::-1], interpolation=cv2.INTER_AREA)
+    unseen = ~np.isfinite(expected)
+    expected[unseen] = image[unseen]
+    seen, panorama = spectra_of([image, expected])
+    shift = shift_of_spectra(panorama, seen, image.shape, PEAK_PX, gaussian_peak=False)
+    return float(image.mean()), np.zeros(2) if shift is None else shift
+
+
+def _cuts_along(source: Source, motion: FrameMotion, track: _Track, size: int) -> Iterator[Cut]:
     """Yield the cuts along a track of sums of `size` frames."""
     for outlier in _outliers(track, size, _SMALLEST_PX / binning_of(source)):
+        held_out = _Sides.of(source, track, outlier)
+        path = held_out.informed(_Path.of(track, outlier, motion, binning_of(source)))
+        sigmas = held_out.proof(path, [replace(path, jump=np.zeros(2))])
+        if sigmas < _SURE or np.linalg.norm(path.jump) * binning_of(source) < _SMALLEST_PX:
+            continue
         between = FrameSpan(track.spans[outlier.before].start, track.spans[outlier.after].stop)
         dark = _dark_frames(source, between) if len(between) > 3.5 * size else None
         if dark is not None:
-            shift_px = outlier.shift_px * binning_of(source)
-            yield Cut((dark.start + dark.stop) // 2, shift_px, outlier.sigmas, dark)
-        elif (cut := _located(source, track, outlier)) is not None:
+            yield Cut((dark.start + dark.stop) // 2, path.jump * binning_of(source), outlier.sigmas, dark)
+        elif (cut := _located(source, between, held_out.template(path), path)) is not None:
             yield cut
 
 
-def _outliers(track: SumTrack, size: int, smallest: float) -> list[_Outlier]:
+def _outliers(track: _Track, size: int, smallest: float) -> list[_Outlier]:
     """Return the shifts that are outliers, each the largest around it.
 
     The frame of a jump lies in some sum, so that the shift from the sum before to that after is compared with the motion before
     and after. A shift between the two is that of a turn. Where sums without light lie between, the next sum is the one after.
     """
-    centres, velocities = track.centres, track.velocities
+    centres, places = track.centres, track.places
+    velocities = np.diff(places, axis=0) / np.diff(centres)[:, None]
     before = np.arange(1, len(centres) - 3)
     gap = centres[before + 1] - centres[before] > 1.5 * size
     after = before + np.where(gap, 1, 2)
     tracked = gap | (centres[after] - centres[before] <= 2.5 * size)
-    before, after, gap = before[tracked], after[tracked], gap[tracked]
+    before, after = before[tracked], after[tracked]
     frames = (centres[after] - centres[before])[:, None]
-    found = np.where(gap[:, None], track.next_px[before], track.second_px[before])
-    unexplained = _beyond(found, velocities[before - 1] * frames, velocities[after] * frames)
+    unexplained = _beyond(places[after] - places[before], velocities[before - 1] * frames, velocities[after] * frames)
     # Over a longer time, the motion may change by more.
     sizes = np.linalg.norm(unexplained, axis=1) * np.minimum(1, 2 * size / frames[:, 0])
-    outliers = []
-    for index in np.flatnonzero(sizes > smallest).tolist():
-        if sizes[index] < sizes[max(0, index - 3) : index + 4].max():
-            continue
-        around = np.r_[sizes[max(0, index - _LOCAL) : max(0, index - 3)], sizes[index + 4 : index + _LOCAL + 1]]
-        usual = max(float(np.median(around)), smallest / _OUTLIER) if len(around) >= _FEWEST else np.inf
-        if sizes[index] > _OUTLIER * usual:
-            sigmas = float(sizes[index] / usual)
-            outliers.append(_Outlier(int(before[index]), int(after[index]), unexplained[index], sigmas))
-    return outliers
+    return [
+        _Outlier(int(before[index]), int(after[index]), sigmas) for index, sigmas in _outstanding(sizes, smallest)
+    ]
 
 
 def _beyond(found: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
@@ -151,15 +205,85 @@ def _dark_frames(source: Source, span: FrameSpan) -> FrameSpan | None:
     return FrameSpan(span.start + longest.start, span.start + longest.stop)
 
 
-def _located(source: Source, track: SumTrack, outlier: _Outlier) -> Cut | None:
+@dataclass(frozen=True, slots=True)
+class _Sides:
+    """Frames before and after an outlier, beyond the sums that suggest it. Even ones make a template, odd ones are held out."""
+
+    instants: NDArray[np.integer]  # (T,) numbers of the frames
+    after: BoolArray  # (T,) which of them come after
+    images: FloatArray  # (T, h, w) their binned pixels
+    n_pixels: int  # whose mean a binned pixel is
+
+    @classmethod
+    def of(cls, source: Source, track: _Track, outlier: _Outlier) -> _Sides:
+        """Read the frames."""
+        numbers = [each for each in _beside(track, outlier) if each not in (outlier.before, outlier.after)]
+        spans = [track.spans[number] for number in numbers]
+        frames = [FrameSpan(frame, frame + 1) for span in spans for frame in range(span.start, span.stop)]
+        after = np.repeat(np.asarray(numbers) > outlier.after, [len(span) for span in spans])
+        images = np.array([span_image(source, frame) for frame in frames])
+        return cls(np.array([frame.start for frame in frames]), after, images, binning_of(source) ** 2)
+
+    @property
+    def _even(self) -> BoolArray:
+        return np.asarray(self.instants % 2 == 0)
+
+    def template(self, path: _Path) -> FluxImage:
+        """Return the mean of the even frames, taken back along a path: (h, w); NaN beyond their borders."""
+        return self._mean(path, self._even)
+
+    def proof(self, path: _Path, smooth: Sequence[_Path]) -> float:
+        """Return how much likelier the odd frames are along a path than along smooth ones, in standard deviations.
+
+        Each path makes its own template of the even frames.
+        """
+        paths = [path, *smooth]
+        templates = [self.template(each) for each in paths]
+        likelihoods = np.zeros(len(paths))
+        for index in np.flatnonzero(~self._even):
+            expected = [self._seen(template, each, index) for template, each in zip(templates, paths, strict=True)]
+            likelihoods += _log_likelihoods(self.images[index], np.array(expected), self.n_pixels)
+        return float(np.sqrt(2 * max(likelihoods[0] - likelihoods[1:].max(), 0.0)))
+
+    def informed(self, path: _Path) -> _Path:
+        """Return a path without what jumps along a direction in which one of the sides has no texture.
+
+        The product of gradients of two images with independent noise is the information of a shift, without that noise.
+        """
+        covariance = np.zeros((2, 2))
+        for side in (~self.after, self.after):
+            first, second = (self._gradient(self._mean(path, side & parity)) for parity in (self._even, ~self._even))
+            seen = np.isfinite(first + second).all(axis=0)
+            information = first[:, seen] @ second[:, seen].T
+            values, directions = np.linalg.eigh((information + information.T) / 2)
+            covariance += (directions / np.maximum(values, 1e-9)) @ directions.T
+        values, directions = np.linalg.eigh(covariance)
+        known = directions[:, values * _INFORMED <= values[0]]
+        return replace(path, jump=known @ (known.T @ path.jump))
+
+    def _gradient(self, image: FluxImage) -> FloatArray:
+        return np.array(np.gradient(image)[::-1])
+
+    def _mean(self, path: _Path, which: BoolArray) -> FluxImage:
+        moved = [
+            _moved(self.images[index], -path.at(self.instants[index], float(self.after[index]))) for index in np.flatnonzero(which)
+        ]
+        seen = np.isfinite(moved)
+        mean = np.where(seen, moved, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+        smooth = cv2.GaussianBlur(mean.astype(np.float32), (0, 0), _BLUR_PX)
+        return np.where(seen.any(axis=0), smooth, np.float32(np.nan))
+
+    def _seen(self, template: FluxImage, path: _Path, index: int) -> FluxImage:
+        return _moved(template, path.at(self.instants[index], float(self.after[index])))
+
+
+def _located(source: Source, between: FrameSpan, template: FluxImage, path: _Path) -> Cut | None:
     """Find the first frame after a jump; None if a fast motion explains the frames as well.
 
     The log likelihood of each frame is that of its residual from a template, seen from the path before the jump, from that
     after, and from positions between. A jump takes the image from the one to the other at once, a fast motion in some frames.
     """
-    path = _Path.of(track, outlier)
-    template = _template(source, track, outlier, path)
-    frames = range(track.spans[outlier.before].start, track.spans[outlier.after].stop)
+    frames = range(between.start, between.stop)
     likelihood = np.empty((len(frames), _STEPS + 1))
     for row, frame in enumerate(frames):
         image = binned_mean(source, FrameSpan(frame, frame + 1))
@@ -170,61 +294,49 @@ def _located(source: Source, track: SumTrack, outlier: _Outlier) -> Cut | None:
     short, *motions = (float(_likelihoods_of(likelihood, ramp).max()) for ramp in (_SHORT_RAMP, *_RAMPS))
     sigmas = np.sqrt(2 * max(float(jumps[at]) - max(motions), 0.0))
     cut = Cut(frames[at], path.jump * binning_of(source), float(sigmas))
-    return None if sigmas < _SURE or short > jumps[at] or cut.size_px < _SMALLEST_PX else cut
+    return None if sigmas < _SURE or short > jumps[at] else cut
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Path:
-    """A smooth path of the image with a jump: a cubic polynomial of time, and a step."""
+    """A path of the image with a jump: the motion that was found, a cubic polynomial of time beyond that, and a step."""
 
+    first: int  # the first of T frames
+    followed: FloatArray  # (T, 2) the motion that was found, in binned px
     middle: float  # the instant around which time is counted
     scale: float  # frames of a unit of time
     coefficients: FloatArray  # (4, 2) of the polynomial, in binned px
     jump: FloatArray  # (2,) the step
 
     @classmethod
-    def of(cls, track: SumTrack, outlier: _Outlier) -> _Path:
+    def of(cls, track: _Track, outlier: _Outlier, motion: FrameMotion, binning: int) -> _Path:
         """Fit the path to the sums on both sides of an outlier."""
-        before, after = outlier.before, outlier.after
-        across = track.next_px[before] if after == before + 1 else track.second_px[before]
         numbers = _beside(track, outlier)
-        places = [
-            -track.next_px[number:before].sum(axis=0) if number <= before else across + track.next_px[after:number].sum(axis=0)
-            for number in numbers
-        ]
         centres = track.centres[numbers]
-        middle = float(centres[[numbers.index(before), numbers.index(after)]].mean())
+        middle = float(track.centres[[outlier.before, outlier.after]].mean())
         scale = float(np.abs(centres - middle).max())
-        equations = np.column_stack([_powers((centres - middle) / scale), np.asarray(numbers) >= after])
-        solution = np.linalg.lstsq(equations, np.array(places))[0]
-        return cls(middle, scale, solution[:-1], solution[-1])
+        equations = np.column_stack([_powers((centres - middle) / scale), np.asarray(numbers) >= outlier.after])
+        solution = np.linalg.lstsq(equations, track.places[numbers])[0]
+        first, last = track.spans[numbers[0]], track.spans[numbers[-1]]
+        centre = corners(motion.frame_shape).mean(axis=0)[None]
+        homographies = motion.homographies[first.start : last.stop]
+        followed = apply(inverse(homographies), apply(homographies[len(homographies) // 2], centre))[:, 0] - centre
+        return cls(first.start, followed / binning, middle, scale, solution[:-1], solution[-1])
 
-    def at(self, instant: float, share: float) -> FloatArray:
-        """Return where the image is after a share of the jump: (2,) in binned px."""
-        return np.asarray(_powers(np.array([(instant - self.middle) / self.scale]))[0] @ self.coefficients + share * self.jump)
+    def at(self, frame: int, share: float) -> FloatArray:
+        """Return where the image is in a frame after a share of the jump: (2,) in binned px."""
+        beyond = _powers(np.array([(frame - self.middle) / self.scale]))[0] @ self.coefficients
+        return np.asarray(self.followed[frame - self.first] + beyond + share * self.jump)
 
 
 def _powers(times: FloatArray) -> FloatArray:
     return np.asarray(times[:, None] ** np.arange(4))
 
 
-def _beside(track: SumTrack, outlier: _Outlier) -> list[int]:
+def _beside(track: _Track, outlier: _Outlier) -> list[int]:
     """Return the numbers of the sums before and after an outlier."""
     first, last = max(0, outlier.before - _SIDE), min(len(track.spans), outlier.after + _SIDE + 1)
     return [*range(first, outlier.before + 1), *range(outlier.after, last)]
-
-
-def _template(source: Source, track: SumTrack, outlier: _Outlier, path: _Path) -> FluxImage:
-    """Average the sums on both sides of an outlier, taken back along the path: (h, w); NaN beyond their borders."""
-    moved = [
-        _moved(span_image(source, track.spans[number]), -path.at(track.spans[number].centre, float(number >= outlier.after)))
-        for number in _beside(track, outlier)
-        if number not in (outlier.before, outlier.after)
-    ]
-    seen = np.isfinite(moved)
-    mean = np.where(seen, moved, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
-    smooth = cv2.GaussianBlur(mean.astype(np.float32), (0, 0), _BLUR_PX)
-    return np.where(seen.any(axis=0), smooth, np.float32(np.nan))
 
 
 def _moved(image: FluxImage, shift: FloatArray) -> FluxImage:
