@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,7 +17,7 @@ from photonpano.locating import shift_of_spectra
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut
-from photonpano.motion.tracking.spans import DARK, PEAK_PX, span_image, spectra_of
+from photonpano.motion.tracking.spans import DARK, PEAK_PX, Spectrum, span_image, spectra_of
 from photonpano.residuals.prediction import Predictions
 from photonpano.residuals.refinement import MotionFit
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, true_spans
@@ -77,9 +77,8 @@ def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ..
     found: list[Cut] = []
     with context.progress.stage("cuts", sum(map(len, suspect)), "frames") as advance:
         for span in suspect:
-            sums = [each for each in span.blocks(size) if len(each) == size]
-            track = _Track.of(sums, list(context.in_order(partial(_measured, source, fit.predictions), sums)))
-            found += _cuts_along(source, fit.motion, track, size)
+            cuts = (cut for track in _tracks(source, fit, span, size, context) for cut in _cuts_along(source, track, size))
+            found += _without_doubles(cuts, size)
             advance(len(span))
     return tuple(found)
 
@@ -90,7 +89,7 @@ def _suspect(fit: MotionFit, margin: int) -> list[FrameSpan]:
     shifts, misfit = residuals.steps().steps[:, :2], residuals.misfit
     # The frame of a jump lies in some span: those before and after it are compared.
     changes = np.linalg.norm(shifts[2:] - shifts[:-2], axis=1)
-    for index, _ in [*_outstanding(changes, _SUDDEN_PX), *_outstanding(misfit[1:-1] - 1, _SUDDEN_MISFIT)]:
+    for index, _ in [*_outstanding(changes, _SUDDEN_PX), *_outstanding(np.abs(misfit[2:] - misfit[:-2]), _SUDDEN_MISFIT)]:
         span = residuals.spans[index + 1]
         flags[max(0, span.start - margin) : span.stop + margin] = True
     return true_spans(flags & fit.motion.located)
@@ -118,17 +117,12 @@ def _size_of_sums(fit: MotionFit) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Track:
-    """Sums of successive frames with light, and where they show the image."""
+    """Sums of successive frames with light, and where they show the image, in binned px."""
 
+    first: int  # the first of T frames
+    followed: FloatArray  # (T, 2) where the image is by the motion that was found
     spans: Sequence[FrameSpan]  # (N,) of the sums, in order
-    places: FloatArray  # (N, 2) in binned px, beyond the motion that was found
-
-    @classmethod
-    def of(cls, spans: Sequence[FrameSpan], measured: Sequence[tuple[float, FloatArray]]) -> _Track:
-        """Leave out the sums that show nothing, given the light and the place of each."""
-        light = np.array([each for each, _ in measured])
-        lit = np.flatnonzero(light > DARK * np.median(light)) if len(light) else []
-        return cls([spans[index] for index in lit], np.array([measured[index][1] for index in lit]).reshape(-1, 2))
+    beyond: FloatArray  # (N, 2) by how much it is elsewhere
 
     @property
     def centres(self) -> FloatArray:
@@ -136,8 +130,32 @@ class _Track:
         return np.array([span.centre for span in self.spans])
 
 
-def _measured(source: Source, predictions: Predictions, span: FrameSpan) -> tuple[float, FloatArray]:
-    """Return the mean light of a sum, and its shift (x, y) from the panorama, in binned px; 0 without texture."""
+def _tracks(source: Source, fit: MotionFit, span: FrameSpan, size: int, context: Context) -> tuple[_Track, _Track]:
+    """Return where sums of `size` frames show the image: against the panorama, and from each to the next.
+
+    The panorama has little noise, but was made along a motion that takes a large jump for a fast motion.
+    """
+    binning, middle = binning_of(source), corners(fit.motion.frame_shape).mean(axis=0)[None]
+    homographies = fit.motion.homographies[span.start : span.stop]
+    steps = apply(inverse(homographies[1:]) @ homographies[:-1], middle)[:, 0] - middle
+    followed = np.concatenate([np.zeros((1, 2)), steps.cumsum(axis=0)]) / binning
+    sums = [each for each in span.blocks(size) if len(each) == size]
+    light, beyond, chain, last = [], [], [np.zeros(2)], None
+    for image, spectrum, shift in context.in_order(partial(_compared, source, fit.predictions), sums):
+        light.append(float(image.mean()))
+        beyond.append(shift)
+        moved = None if last is None else shift_of_spectra(last, spectrum, image.shape, PEAK_PX, gaussian_peak=False)
+        chain.append(chain[-1] if moved is None else chain[-1] + moved)
+        if light[-1] > DARK * np.median(light):
+            last = spectrum
+    lit = np.flatnonzero(np.array(light) > DARK * np.median(light)).tolist() if light else []
+    spans = [sums[index] for index in lit]
+    against, along = (np.array([each[index] for index in lit]).reshape(-1, 2) for each in (beyond, chain[1:]))
+    return _Track(span.start, followed, spans, against), _Track(span.start, np.zeros_like(followed), spans, along)
+
+
+def _compared(source: Source, predictions: Predictions, span: FrameSpan) -> tuple[FluxImage, Spectrum, FloatArray]:
+    """Return a sum, its spectrum, and its shift from the panorama along the motion that was found, in binned px."""
     image = span_image(source, span)
     height, width = (side * binning_of(source) for side in image.shape)
     expected = cv2.resize(predictions.predicted(span.centre)[0][:height, :width], image.shape[::-1], interpolation=cv2.INTER_AREA)
@@ -145,14 +163,23 @@ def _measured(source: Source, predictions: Predictions, span: FrameSpan) -> tupl
     expected[unseen] = image[unseen]
     seen, panorama = spectra_of([image, expected])
     shift = shift_of_spectra(panorama, seen, image.shape, PEAK_PX, gaussian_peak=False)
-    return float(image.mean()), np.zeros(2) if shift is None else shift
+    return image, seen, np.zeros(2) if shift is None else shift
 
 
-def _cuts_along(source: Source, motion: FrameMotion, track: _Track, size: int) -> Iterator[Cut]:
+def _without_doubles(cuts: Iterable[Cut], size: int) -> list[Cut]:
+    """Keep the first of the cuts that lie within a sum of each other."""
+    kept: list[Cut] = []
+    for cut in cuts:
+        if all(abs(cut.frame - each.frame) > size for each in kept):
+            kept.append(cut)
+    return sorted(kept, key=lambda cut: cut.frame)
+
+
+def _cuts_along(source: Source, track: _Track, size: int) -> Iterator[Cut]:
     """Yield the cuts along a track of sums of `size` frames."""
     for outlier in _outliers(track, size, _SMALLEST_PX / binning_of(source)):
         held_out = _Sides.of(source, track, outlier)
-        path = held_out.informed(_Path.of(track, outlier, motion, binning_of(source)))
+        path = held_out.informed(_Path.of(track, outlier))
         sigmas = held_out.proof(path, [replace(path, jump=np.zeros(2))])
         if sigmas < _SURE or np.linalg.norm(path.jump) * binning_of(source) < _SMALLEST_PX:
             continue
@@ -170,7 +197,7 @@ def _outliers(track: _Track, size: int, smallest: float) -> list[_Outlier]:
     The frame of a jump lies in some sum, so that the shift from the sum before to that after is compared with the motion before
     and after. A shift between the two is that of a turn. Where sums without light lie between, the next sum is the one after.
     """
-    centres, places = track.centres, track.places
+    centres, places = track.centres, track.beyond
     velocities = np.diff(places, axis=0) / np.diff(centres)[:, None]
     before = np.arange(1, len(centres) - 3)
     gap = centres[before + 1] - centres[before] > 1.5 * size
@@ -302,26 +329,24 @@ class _Path:
     """A path of the image with a jump: the motion that was found, a cubic polynomial of time beyond that, and a step."""
 
     first: int  # the first of T frames
-    followed: FloatArray  # (T, 2) the motion that was found, in binned px
+    followed: FloatArray  # (T, 2) the motion that was found
     middle: float  # the instant around which time is counted
     scale: float  # frames of a unit of time
     coefficients: FloatArray  # (4, 2) of the polynomial, in binned px
     jump: FloatArray  # (2,) the step
 
     @classmethod
-    def of(cls, track: _Track, outlier: _Outlier, motion: FrameMotion, binning: int) -> _Path:
+    def of(cls, track: _Track, outlier: _Outlier) -> _Path:
         """Fit the path to the sums on both sides of an outlier."""
         numbers = _beside(track, outlier)
-        centres = track.centres[numbers]
+        centres, after = track.centres[numbers], np.asarray(numbers) >= outlier.after
         middle = float(track.centres[[outlier.before, outlier.after]].mean())
         scale = float(np.abs(centres - middle).max())
-        equations = np.column_stack([_powers((centres - middle) / scale), np.asarray(numbers) >= outlier.after])
-        solution = np.linalg.lstsq(equations, track.places[numbers])[0]
-        first, last = track.spans[numbers[0]], track.spans[numbers[-1]]
-        centre = corners(motion.frame_shape).mean(axis=0)[None]
-        homographies = motion.homographies[first.start : last.stop]
-        followed = apply(inverse(homographies), apply(homographies[len(homographies) // 2], centre))[:, 0] - centre
-        return cls(first.start, followed / binning, middle, scale, solution[:-1], solution[-1])
+        equations = np.column_stack([_powers((centres - middle) / scale), after])
+        # The template shows what the middle of the path sees.
+        followed = track.followed - track.followed[round(middle) - track.first]
+        solution = np.linalg.lstsq(equations, track.beyond[numbers] - track.beyond[outlier.before])[0]
+        return cls(track.first, followed, middle, scale, solution[:-1], solution[-1])
 
     def at(self, frame: int, share: float) -> FloatArray:
         """Return where the image is in a frame after a share of the jump: (2,) in binned px."""
