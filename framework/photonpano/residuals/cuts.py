@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,7 +15,6 @@ from photonpano.execution.context import Context
 from photonpano.geometry import apply, corners, inverse, steps_px
 from photonpano.locating import shift_of_spectra
 from photonpano.merging import binned_mean, binning_of
-from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut
 from photonpano.motion.tracking.spans import DARK, PEAK_PX, Spectrum, span_image, spectra_of
 from photonpano.residuals.prediction import Predictions
@@ -30,8 +29,9 @@ _MARGIN = 20
 _TRACK_NOISE_PX, _TRACK_RATIO = 0.35, 10.0
 # Fewest and most frames of a sum, and most motion within it.
 _SHORTEST, _LONGEST, _MOTION_PX = 4, 64, 2.0
-# Least size of a jump, and of an outlier as a multiple of the median around it.
-_SMALLEST_PX, _OUTLIER = 1.0, 4.5
+SMALLEST_PX = 1.0  # least size of a jump
+# Least size of an outlier, as a multiple of the median around it.
+_OUTLIER = 4.5
 # Sums, or spans, on either side that this median takes.
 _LOCAL = 24
 # Fewest of them for this median.
@@ -46,7 +46,7 @@ _INFORMED = 0.02
 _STEPS = 8
 # Lengths of these fast motions, in frames.
 _SHORT_RAMP, _RAMPS = 4, (8, 16, 32, 64, 128)
-# Standard deviations by which a jump must be likelier than a smooth motion, in frames that are held out, and than one that takes
+# Standard deviations by which a jump must be likelier than a smooth motion, in frames that are held out, and than a motion of
 # 8 frames or more. A motion of 4 must not be likelier.
 _SURE = 4.0
 # Least variance of a binned pixel.
@@ -77,10 +77,10 @@ def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ..
     found: list[Cut] = []
     with context.progress.stage("cuts", sum(map(len, suspect)), "frames") as advance:
         for span in suspect:
-            cuts = (cut for track in _tracks(source, fit, span, size, context) for cut in _cuts_along(source, track, size))
-            found += _without_doubles(cuts, size)
+            for track in _tracks(source, fit, span, size, context):
+                found += _cuts_along(source, track, size, found)
             advance(len(span))
-    return tuple(found)
+    return tuple(sorted(found, key=lambda cut: cut.frame))
 
 
 def _suspect(fit: MotionFit, margin: int) -> list[FrameSpan]:
@@ -158,7 +158,8 @@ def _compared(source: Source, predictions: Predictions, span: FrameSpan) -> tupl
     """Return a sum, its spectrum, and its shift from the panorama along the motion that was found, in binned px."""
     image = span_image(source, span)
     height, width = (side * binning_of(source) for side in image.shape)
-    expected = cv2.resize(predictions.predicted(span.centre)[0][:height, :width], image.shape[::-1], interpolation=cv2.INTER_AREA)
+    full = predictions.predicted(span.centre)[0][:height, :width]
+    expected = cv2.resize(full, image.shape[::-1], interpolation=cv2.INTER_AREA)
     unseen = ~np.isfinite(expected)
     expected[unseen] = image[unseen]
     seen, panorama = spectra_of([image, expected])
@@ -166,29 +167,24 @@ def _compared(source: Source, predictions: Predictions, span: FrameSpan) -> tupl
     return image, seen, np.zeros(2) if shift is None else shift
 
 
-def _without_doubles(cuts: Iterable[Cut], size: int) -> list[Cut]:
-    """Keep the first of the cuts that lie within a sum of each other."""
-    kept: list[Cut] = []
-    for cut in cuts:
-        if all(abs(cut.frame - each.frame) > size for each in kept):
-            kept.append(cut)
-    return sorted(kept, key=lambda cut: cut.frame)
-
-
-def _cuts_along(source: Source, track: _Track, size: int) -> Iterator[Cut]:
-    """Yield the cuts along a track of sums of `size` frames."""
-    for outlier in _outliers(track, size, _SMALLEST_PX / binning_of(source)):
+def _cuts_along(source: Source, track: _Track, size: int, known: Sequence[Cut]) -> list[Cut]:
+    """Return the cuts along a track of sums of `size` frames, beside those that are known."""
+    found: list[Cut] = []
+    for outlier in _outliers(track, size, SMALLEST_PX / binning_of(source)):
+        between = FrameSpan(track.spans[outlier.before].start, track.spans[outlier.after].stop)
+        if any(between.start <= cut.frame < between.stop for cut in known):
+            continue
         held_out = _Sides.of(source, track, outlier)
         path = held_out.informed(_Path.of(track, outlier))
-        sigmas = held_out.proof(path, [replace(path, jump=np.zeros(2))])
-        if sigmas < _SURE or np.linalg.norm(path.jump) * binning_of(source) < _SMALLEST_PX:
+        proof = held_out.proof(path, replace(path, jump=np.zeros(2)))
+        if proof < _SURE or np.linalg.norm(path.jump) * binning_of(source) < SMALLEST_PX:
             continue
-        between = FrameSpan(track.spans[outlier.before].start, track.spans[outlier.after].stop)
         dark = _dark_frames(source, between) if len(between) > 3.5 * size else None
         if dark is not None:
-            yield Cut((dark.start + dark.stop) // 2, path.jump * binning_of(source), outlier.sigmas, dark)
+            found.append(Cut((dark.start + dark.stop) // 2, path.jump * binning_of(source), outlier.sigmas, dark))
         elif (cut := _located(source, between, held_out.template(path), path)) is not None:
-            yield cut
+            found.append(cut)
+    return found
 
 
 def _outliers(track: _Track, size: int, smallest: float) -> list[_Outlier]:
@@ -208,9 +204,7 @@ def _outliers(track: _Track, size: int, smallest: float) -> list[_Outlier]:
     unexplained = _beyond(places[after] - places[before], velocities[before - 1] * frames, velocities[after] * frames)
     # Over a longer time, the motion may change by more.
     sizes = np.linalg.norm(unexplained, axis=1) * np.minimum(1, 2 * size / frames[:, 0])
-    return [
-        _Outlier(int(before[index]), int(after[index]), sigmas) for index, sigmas in _outstanding(sizes, smallest)
-    ]
+    return [_Outlier(int(before[index]), int(after[index]), sigmas) for index, sigmas in _outstanding(sizes, smallest)]
 
 
 def _beyond(found: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
@@ -236,7 +230,7 @@ def _dark_frames(source: Source, span: FrameSpan) -> FrameSpan | None:
 class _Sides:
     """Frames before and after an outlier, beyond the sums that suggest it. Even ones make a template, odd ones are held out."""
 
-    instants: NDArray[np.integer]  # (T,) numbers of the frames
+    frames: NDArray[np.integer]  # (T,) their numbers
     after: BoolArray  # (T,) which of them come after
     images: FloatArray  # (T, h, w) their binned pixels
     n_pixels: int  # whose mean a binned pixel is
@@ -253,24 +247,24 @@ class _Sides:
 
     @property
     def _even(self) -> BoolArray:
-        return np.asarray(self.instants % 2 == 0)
+        return np.asarray(self.frames % 2 == 0)
 
     def template(self, path: _Path) -> FluxImage:
-        """Return the mean of the even frames, taken back along a path: (h, w); NaN beyond their borders."""
+        """Return the mean of the even frames along a path: (h, w); NaN beyond their borders."""
         return self._mean(path, self._even)
 
-    def proof(self, path: _Path, smooth: Sequence[_Path]) -> float:
-        """Return how much likelier the odd frames are along a path than along smooth ones, in standard deviations.
+    def proof(self, path: _Path, smooth: _Path) -> float:
+        """Return how much likelier the odd frames are along a path than along a smooth one, in standard deviations.
 
-        Each path makes its own template of the even frames.
+        Each of both makes its own template of the even frames.
         """
-        paths = [path, *smooth]
-        templates = [self.template(each) for each in paths]
-        likelihoods = np.zeros(len(paths))
+        templates = [(self.template(each), each) for each in (path, smooth)]
+        likelihoods = np.zeros(2)
         for index in np.flatnonzero(~self._even):
-            expected = [self._seen(template, each, index) for template, each in zip(templates, paths, strict=True)]
-            likelihoods += _log_likelihoods(self.images[index], np.array(expected), self.n_pixels)
-        return float(np.sqrt(2 * max(likelihoods[0] - likelihoods[1:].max(), 0.0)))
+            frame, share = self.frames[index], float(self.after[index])
+            expected = np.array([_moved(template, each.at(frame, share)) for template, each in templates])
+            likelihoods += _log_likelihoods(self.images[index], expected, self.n_pixels)
+        return float(np.sqrt(2 * max(likelihoods[0] - likelihoods[1], 0.0)))
 
     def informed(self, path: _Path) -> _Path:
         """Return a path without what jumps along a direction in which one of the sides has no texture.
@@ -279,7 +273,7 @@ class _Sides:
         """
         covariance = np.zeros((2, 2))
         for side in (~self.after, self.after):
-            first, second = (self._gradient(self._mean(path, side & parity)) for parity in (self._even, ~self._even))
+            first, second = (_gradient(self._mean(path, side & parity)) for parity in (self._even, ~self._even))
             seen = np.isfinite(first + second).all(axis=0)
             information = first[:, seen] @ second[:, seen].T
             values, directions = np.linalg.eigh((information + information.T) / 2)
@@ -288,20 +282,19 @@ class _Sides:
         known = directions[:, values * _INFORMED <= values[0]]
         return replace(path, jump=known @ (known.T @ path.jump))
 
-    def _gradient(self, image: FluxImage) -> FloatArray:
-        return np.array(np.gradient(image)[::-1])
-
-    def _mean(self, path: _Path, which: BoolArray) -> FluxImage:
-        moved = [
-            _moved(self.images[index], -path.at(self.instants[index], float(self.after[index]))) for index in np.flatnonzero(which)
-        ]
+    def _mean(self, path: _Path, chosen: BoolArray) -> FluxImage:
+        """Average chosen frames, taken back along a path: (h, w); NaN beyond their borders."""
+        chosen_frames = zip(self.images[chosen], self.frames[chosen], self.after[chosen], strict=True)
+        moved = [_moved(image, -path.at(frame, float(after))) for image, frame, after in chosen_frames]
         seen = np.isfinite(moved)
         mean = np.where(seen, moved, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
         smooth = cv2.GaussianBlur(mean.astype(np.float32), (0, 0), _BLUR_PX)
         return np.where(seen.any(axis=0), smooth, np.float32(np.nan))
 
-    def _seen(self, template: FluxImage, path: _Path, index: int) -> FluxImage:
-        return _moved(template, path.at(self.instants[index], float(self.after[index])))
+
+def _gradient(image: FluxImage) -> FloatArray:
+    """Return the derivatives along x and y: (2, h, w)."""
+    return np.array(np.gradient(image)[::-1])
 
 
 def _located(source: Source, between: FrameSpan, template: FluxImage, path: _Path) -> Cut | None:
