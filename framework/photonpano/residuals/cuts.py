@@ -40,7 +40,7 @@ _FEWEST = 6
 _SIDE = 4
 # Standard deviation of the Gaussian that smooths the template, in binned px.
 _BLUR_PX = 0.7
-# A direction of the image has no information if its share in that of the best direction is below this.
+# Along a direction whose information is below this share of the best one, nothing is known of a jump.
 _INFORMED = 0.02
 # Parts into which a jump is divided, to compare it with fast motions.
 _STEPS = 8
@@ -65,10 +65,9 @@ class _Outlier:
 def find_cuts(source: Source, fit: MotionFit, context: Context) -> tuple[Cut, ...]:
     """Find the places where the image jumps.
 
-    Places come into question where the residuals change suddenly. There, sums of a few frames are tracked by phase correlation,
-    from frames alone. Where a shift is an outlier, a jump must explain frames on both sides, which have not suggested it,
-    better than a smooth motion does; then each frame between is compared with both sides, and a jump at each frame with fast
-    motions: see `_located`.
+    Places come into question where the residuals change suddenly. There, sums of a few frames are tracked by phase correlation.
+    Where a shift is an outlier, frames on both sides that have not suggested it must be likelier with a jump than with a smooth
+    motion. Then a jump at each frame between is compared with fast motions: see `_located`.
     """
     size = _size_of_sums(fit)
     suspect = _suspect(fit, _MARGIN * size)
@@ -146,7 +145,7 @@ def _tracks(source: Source, fit: MotionFit, span: FrameSpan, size: int, context:
         beyond.append(shift)
         moved = None if last is None else shift_of_spectra(last, spectrum, image.shape, PEAK_PX, gaussian_peak=False)
         chain.append(chain[-1] if moved is None else chain[-1] + moved)
-        if light[-1] > DARK * np.median(light):
+        if light[-1] > DARK * np.median(light[-_LOCAL:]):
             last = spectrum
     lit = np.flatnonzero(np.array(light) > DARK * np.median(light)).tolist() if light else []
     spans = [sums[index] for index in lit]
@@ -271,15 +270,16 @@ class _Sides:
 
         The product of gradients of two images with independent noise is the information of a shift, without that noise.
         """
-        covariance = np.zeros((2, 2))
+        covariance, best = np.zeros((2, 2)), 0.0
         for side in (~self.after, self.after):
             first, second = (_gradient(self._mean(path, side & parity)) for parity in (self._even, ~self._even))
             seen = np.isfinite(first + second).all(axis=0)
             information = first[:, seen] @ second[:, seen].T
             values, directions = np.linalg.eigh((information + information.T) / 2)
-            covariance += (directions / np.maximum(values, 1e-9)) @ directions.T
+            covariance += (directions / np.maximum(values, 1e-12)) @ directions.T
+            best = max(best, float(values[-1]))
         values, directions = np.linalg.eigh(covariance)
-        known = directions[:, values * _INFORMED <= values[0]]
+        known = directions[:, values * _INFORMED * best < 1]
         return replace(path, jump=known @ (known.T @ path.jump))
 
     def _mean(self, path: _Path, chosen: BoolArray) -> FluxImage:
