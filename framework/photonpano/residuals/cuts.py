@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photonpano.contracts.protocols import Source
 from photonpano.execution.context import Context
-from photonpano.geometry import apply, corners, inverse, steps_px
+from photonpano.geometry import corners, inverse, steps_px, transform_points
 from photonpano.locating import shift_of_spectra
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.timeline import Cut
@@ -136,7 +136,7 @@ def _tracks(source: Source, fit: MotionFit, span: FrameSpan, size: int, context:
     """
     binning, middle = binning_of(source), corners(fit.motion.frame_shape).mean(axis=0)[None]
     homographies = fit.motion.homographies[span.start : span.stop]
-    steps = apply(inverse(homographies[1:]) @ homographies[:-1], middle)[:, 0] - middle
+    steps = transform_points(inverse(homographies[1:]) @ homographies[:-1], middle)[:, 0] - middle
     followed = np.concatenate([np.zeros((1, 2)), steps.cumsum(axis=0)]) / binning
     sums = [each for each in span.blocks(size) if len(each) == size]
     light, beyond, chain, last = [], [], [np.zeros(2)], None
