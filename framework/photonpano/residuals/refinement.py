@@ -22,7 +22,7 @@ from photonpano.merging.panorama import render
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
-from photonpano.values import BoolArray, FloatArray, Panorama
+from photonpano.values import FloatArray, Panorama
 
 _SMOOTH_SPANS = 25  # the ratio is that of motion faster than this many spans
 _LOCAL_SPANS = 33  # the size is averaged over this many spans
