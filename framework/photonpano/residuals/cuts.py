@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 
 import cv2
 import numpy as np
@@ -309,12 +310,11 @@ def _located(source: Source, between: FrameSpan, template: FluxImage, path: _Pat
         image = binned_mean(source, FrameSpan(frame, frame + 1))
         expected = [_moved(template, path.at(frame, share)) for share in np.linspace(0, 1, _STEPS + 1)]
         likelihood[row] = _log_likelihoods(image, np.array(expected), binning_of(source) ** 2)
-    jumps = _likelihoods_of(likelihood, 0)
-    at = min(int(np.argmax(jumps)), len(frames) - 1)
-    short, *motions = (float(_likelihoods_of(likelihood, ramp).max()) for ramp in (_SHORT_RAMP, *_RAMPS))
-    sigmas = np.sqrt(2 * max(float(jumps[at]) - max(motions), 0.0))
-    cut = Cut(frames[at], path.jump * binning_of(source), float(sigmas))
-    return None if sigmas < _SURE or short > jumps[at] else cut
+    jump, frame, share = _likeliest(likelihood, 0)
+    short, *motions = (_likeliest(likelihood, ramp)[0] for ramp in (_SHORT_RAMP, *_RAMPS))
+    sigmas = np.sqrt(2 * max(jump - max(motions), 0.0))
+    cut = Cut(frames[min(frame, len(frames) - 1)], share * path.jump * binning_of(source), float(sigmas))
+    return None if sigmas < _SURE or short > jump or cut.size_px < SMALLEST_PX else cut
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -371,18 +371,23 @@ def _log_likelihoods(image: FluxImage, expected: FloatArray, n_pixels: int) -> F
     A binned pixel (h, w) is the mean of `n_pixels`.
     """
     seen = np.isfinite(expected).all(axis=0) & np.isfinite(image)
-    variance = np.maximum(expected[:, seen].mean(axis=0), _NOISE_FLOOR) / n_pixels
-    return np.asarray(-0.5 * ((image[seen] - expected[:, seen]) ** 2 / variance).sum(axis=1))
+    expected, observed = expected[:, seen], image[seen]
+    variance = np.maximum(expected.mean(axis=0), _NOISE_FLOOR) / n_pixels
+    return np.asarray(-0.5 * ((observed - expected) ** 2 / variance).sum(axis=1))
 
 
-def _likelihoods_of(likelihood: FloatArray, ramp: int) -> FloatArray:
-    """Return the log likelihood of motions that take `ramp` frames from the old path to the new one, for each middle: (M,).
+def _likeliest(likelihood: FloatArray, ramp: int) -> tuple[float, int, float]:
+    """Return the log likelihood of the likeliest motion that takes `ramp` frames between the paths, its middle, and its share.
 
     `likelihood` is (T, steps + 1), that of each frame from the old path to the new one. Of a jump, whose ramp is 0, the middle
-    is its first frame.
+    is its first frame. Paths are not exact: a motion may begin and end up to a quarter of the way from them.
     """
     n_frames, steps = likelihood.shape[0], likelihood.shape[1] - 1
     frames, middles = np.arange(n_frames), np.arange(n_frames + 1)
     passed = frames + 0.5 - middles[:, None]
     share = (passed > 0).astype(float) if ramp == 0 else np.clip(passed / ramp + 0.5, 0, 1)
-    return np.asarray(likelihood[frames, np.rint(share * steps).astype(int)].sum(axis=1))
+    found = []
+    for first, last in product(range(steps // 4 + 1), range(steps - steps // 4, steps + 1)):
+        total = likelihood[frames, np.rint(first + share * (last - first)).astype(int)].sum(axis=1)
+        found.append((float(total.max()), int(total.argmax()), (last - first) / steps))
+    return max(found)
