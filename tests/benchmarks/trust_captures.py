@@ -119,10 +119,10 @@ def bounded(seed: int) -> np.ndarray:
 
 
 def horizon(seed: int) -> np.ndarray:
-    """Paint a sea under the sky, with hardly any texture along the horizon."""
+    """Paint a sea under the sky, with little texture along the horizon."""
     noise = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((500, 800)), (0, 0), 3)
     sides = np.where(np.arange(500)[:, None] > 255, 60, 150)
-    return np.uint8(sides + 2 * noise / noise.std())
+    return np.uint8(sides + 6 * noise / noise.std())
 
 
 def changed(settings: Settings) -> Callable[[Size], Settings]:
