@@ -140,7 +140,10 @@ def _tracks(source: Source, fit: MotionFit, span: FrameSpan, size: int, context:
     steps = transform_points(inverse(homographies[1:]) @ homographies[:-1], middle)[:, 0] - middle
     followed = np.concatenate([np.zeros((1, 2)), steps.cumsum(axis=0)]) / binning
     sums = [each for each in span.blocks(size) if len(each) == size]
-    light, beyond, chain, last = [], [], [np.zeros(2)], None
+    light: list[float] = []
+    beyond: list[FloatArray] = []
+    chain: list[FloatArray] = [np.zeros(2)]
+    last: Spectrum | None = None
     for image, spectrum, shift in context.in_order(partial(_compared, source, fit.predictions), sums):
         light.append(float(image.mean()))
         beyond.append(shift)
@@ -159,7 +162,7 @@ def _compared(source: Source, predictions: Predictions, span: FrameSpan) -> tupl
     image = span_image(source, span)
     height, width = (side * binning_of(source) for side in image.shape)
     full = predictions.predicted(span.centre)[0][:height, :width]
-    expected = cv2.resize(full, image.shape[::-1], interpolation=cv2.INTER_AREA)
+    expected = np.asarray(cv2.resize(full, image.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
     unseen = ~np.isfinite(expected)
     expected[unseen] = image[unseen]
     seen, panorama = spectra_of([image, expected])
