@@ -110,6 +110,21 @@ def stripes(_: int) -> np.ndarray:
     return np.uint8(200 * (np.indices((1365, 2048))[1] // 6 % 2) + 30)
 
 
+def bounded(seed: int) -> np.ndarray:
+    """Paint a texture that ends on both sides in a plain wall."""
+    rng = np.random.default_rng(seed)
+    texture = cv2.GaussianBlur(rng.standard_normal((500, 800)), (0, 0), 2)
+    inside = np.clip((130 - abs(np.arange(800) - 400)) / 20, 0, 1)
+    return np.uint8(np.clip(120 + 60 * inside * texture / texture.std(), 1, 255))
+
+
+def horizon(seed: int) -> np.ndarray:
+    """Paint a sea under the sky, with little texture along the horizon."""
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((500, 800)), (0, 0), 3)
+    sides = np.where(np.arange(500)[:, None] > 255, 60, 150)
+    return np.uint8(sides + 6 * noise / noise.std())
+
+
 def changed(settings: Settings) -> Callable[[Size], Settings]:
     """Return changes that do not depend on the size."""
     return lambda _: settings
@@ -177,7 +192,15 @@ CUT_ROWS: dict[str, Row] = {
     "clean, tremor of 1 px": Row(SPLINE, changed(TREMOR)),
     "clean, vibration of 3 px": Row(SPLINE, changed(shaken(TINY, SPLINE, 3, (1000,)))),
     "clean, strong shake": Row(SPLINE, changed(shaken(TINY, SPLINE, 10, (25, 90, 210)))),
+    **{
+        f"clean, tremor of {frequency} Hz": Row(SPLINE, changed(shaken(TINY, SPLINE, 2, (frequency,)) | {"flux": 0.2}))
+        for frequency in (25, 100, 400, 2000)
+    },
+    "clean, light that falls to a thirtieth": Row(SPLINE, changed({"drift": 0.03})),
+    "clean, ends without texture": Row(PAN, changed({"path": {"kind": "pan", "length_px": 250}}), picture=bounded),
+    "clean, horizon": Row(PAN, changed(shaken(TINY, PAN, 1, (25, 120, 400))), picture=horizon),
     "20 frames missing": Row(SPLINE, changed(missing(20, 700))),
+    "60 frames missing, flux 0.02": Row("clean, flux 0.02", changed(missing(60, 700))),
     "60 frames missing, flux 0.1": Row("clean, flux 0.1", changed(missing(60, 700))),
     "60 frames missing twice, tremor": Row(SPLINE, changed(TREMOR | missing(60, 500, 1000))),
     "50 frames doubled": Row(SPLINE, changed({"repeats": [{"at": 700, "frames": 50}]})),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
@@ -20,10 +20,11 @@ from photonpano.corrections.lighting import (
     measure_pixel_gain,
 )
 from photonpano.errors import CanvasTooLargeError, LocationError
+from photonpano.motion.timeline import Cut
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.state import State
 from photonpano.plugins.contributions import MergerContribution
-from photonpano.residuals.cuts import find_cuts
+from photonpano.residuals.cuts import SMALLEST_PX, find_cuts
 from photonpano.residuals.refinement import MotionFit
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Light
@@ -181,15 +182,21 @@ def later_levels(state: State, journal: list[Decision]) -> Proposal:
 
 
 def cut_at_jumps(state: State) -> Proposal | None:
-    """Cut the motion where the image jumps, and locate all levels again: exposures across a jump bias the first level, too."""
+    """Cut the motion where the image jumps, and locate all levels again: exposures across a jump bias the first level, too.
+
+    Where the pieces then meet to less than 1 px, there was no jump.
+    """
     cuts = find_cuts(state.source, state.fit, state.context)
     if not cuts:
         return None
 
-    def make() -> State:
+    def make(cuts: Sequence[Cut] = cuts) -> State | None:
         levels = build_levels(state.plan, state.source, [])
         cut = replace(state, timeline=state.timeline.cut_at(cuts), levels=levels).located(levels, state.start)
         measured = [each.along(cut.motion.trajectory, cut.motion.frame_shape) for each in cuts]
+        jumps = [each for each in measured if each.dark is not None or each.size_px >= SMALLEST_PX]
+        if len(jumps) < len(cuts):
+            return make(jumps) if jumps else None
         return replace(cut, timeline=cut.timeline.cut_at(measured))
 
     # Dark frames raise the residuals of any motion, most where its expected error is small; their run is doubtful anyway.

@@ -22,13 +22,12 @@ from photonpano.merging.panorama import render
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
-from photonpano.values import BoolArray, FloatArray, Panorama
+from photonpano.values import FloatArray, Panorama
 
 _SMOOTH_SPANS = 25  # the ratio is that of motion faster than this many spans
 _LOCAL_SPANS = 33  # the size is averaged over this many spans
 # Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations.
 _SIGNIFICANT = 3.0
-_REDUCED_CHI2 = 3.0  # a span also stands out if the mean squared residual / variance of its blocks exceeds this
 # A single span stands out if the sum of its four squared steps, over their variances, exceeds this. Noise does so once in
 # 200,000 spans.
 _STANDS_OUT = 30.0
@@ -109,14 +108,6 @@ def distance_to_nearest(instants: FloatArray, frames: NDArray[np.integer]) -> Fl
     """Return the distance of each frame to the nearest of instants that are in order, in frames."""
     after = np.searchsorted(instants, frames).clip(1, len(instants) - 1)
     return np.asarray(np.minimum(abs(frames - instants[after - 1]), abs(frames - instants[after])))
-
-
-def standing_out(residuals: Residuals) -> BoolArray:
-    """Return which spans show a step, or a reduced chi-square, that noise does not explain: (S,)."""
-    steps, variances = _series(residuals)
-    with np.errstate(invalid="ignore"):
-        excess = np.nansum(np.where(np.isfinite(variances), steps**2 / variances, 0), axis=1)
-    return np.asarray((excess > _STANDS_OUT) | (residuals.reduced_chi2 > _REDUCED_CHI2))
 
 
 def _series(residuals: Residuals) -> tuple[FloatArray, FloatArray]:

@@ -116,6 +116,21 @@ def test_cut_among_dark_frames_is_not_compared(dark: FrameSpan | None, worse: st
     assert proposal.rejection == "the image seems to jump before frame 4, but the motion is not cut there"
 
 
+@pytest.mark.parametrize(("sizes_px", "kept"), [((3.0, 0.2), [4]), ((3.0, 2.0), [4, 7]), ((0.9, 0.2), None)])
+def test_motion_is_not_cut_where_pieces_meet(
+    sizes_px: tuple[float, ...], kept: list[int] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cuts = tuple(Cut(frame, np.array([3.0, 0.0]), 9.0) for frame in (4, 7))
+    found = {cut.frame: replace(cut, shift_px=np.array([size, 0.0])) for cut, size in zip(cuts, sizes_px, strict=True)}
+    monkeypatch.setattr("photonpano.pipeline.passes.find_cuts", lambda *_: cuts)
+    monkeypatch.setattr("photonpano.pipeline.passes.build_levels", lambda *_: ())
+    monkeypatch.setattr(Cut, "along", lambda cut, *_: found[cut.frame])
+    monkeypatch.setattr(State, "motion", SimpleNamespace(trajectory=None, frame_shape=None))
+    monkeypatch.setattr(State, "fit", None)
+    state = cut_at_jumps(BEFORE).make()
+    assert (state and [cut.frame for cut in state.timeline.cuts]) == kept
+
+
 SHAPE, FRAMES = (40, 64), 400
 PATH = KnownMotion(lambda frame: translation(0.05 * (frame - FRAMES // 2), 0))
 

@@ -22,7 +22,7 @@ from photonpano.pipeline.run_folder import run_folder
 from photonpano.report import render_report
 from photonpano.report.viewer import shared_instant
 from photonpano.residuals.measure import Residuals
-from photonpano.residuals.refinement import Explained, bounded_std_px, residual_ratio, standing_out, unexplained_px
+from photonpano.residuals.refinement import Explained, bounded_std_px, residual_ratio, unexplained_px
 from photonpano_core.configs import ShortSpansConfig
 from photonpano_core.refiners import ShortSpansRefiner
 
@@ -98,7 +98,6 @@ def bytes_a_frame(work: Callable[[End], object], ends: tuple[End, End]) -> float
         pytest.param(lambda end: chunks_of(end.motion.span, end.motion.trajectory, (254, 496), 0.5), 60, id="chunks"),
         pytest.param(lambda end: plan_canvas(end.motion.trajectory, end.motion.span, (254, 496), 1.0, 2**31), 150, id="canvas"),
         pytest.param(lambda end: residual_ratio(end.residuals), 40, id="ratio"),
-        pytest.param(lambda end: standing_out(end.residuals), 40, id="outliers"),
         pytest.param(lambda end: unexplained_px(end.residuals, end.n_frames), 60, id="unexplained"),
         pytest.param(lambda end: bounded_std_px(end.motion.std_px, end.residuals), 80, id="bounds"),
         pytest.param(End.refined, 150, id="refinement"),

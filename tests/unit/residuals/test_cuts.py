@@ -1,7 +1,7 @@
 """Jumps of the image are found to the frame; tremor, turns and noise are not taken for jumps."""
 
-import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -11,7 +11,6 @@ from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut
-from photonpano.motion.tracking import spans
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import MotionFit
 from photonpano.testing import MemorySource
@@ -24,17 +23,24 @@ SHAPE, N_FRAMES, JUMP = (96, 128), 600, 330
 def cuts_of(street: np.ndarray) -> Callable[..., tuple[Cut, ...]]:
     """Look for cuts in frames of a street, given the true motion along x, in px by frame, and what the loop made of it."""
 
-    def cuts_of(true_px: np.ndarray, found_px: np.ndarray, flux: float = 1.0, dark: FrameSpan | None = None) -> tuple[Cut, ...]:
+    def cuts_of(
+        true_px: np.ndarray,
+        found_px: np.ndarray,
+        flux: float = 1.0,
+        dark: FrameSpan | None = None,
+        scene: np.ndarray = street,
+        context: Context = Context(2),  # noqa: B008
+    ) -> tuple[Cut, ...]:
         lit = np.full(N_FRAMES, flux)
         if dark is not None:
             lit[dark.start : dark.stop] = 0
-        views = seen_along(street, [translation(250 + x, 300) for x in true_px], SHAPE)
+        views = seen_along(scene, [translation(250 + x, 300) for x in true_px], SHAPE)
         source = MemorySource(detected(lit[:, None, None] * views, 3))
         homographies = np.array([translation(x, 0) for x in found_px])
         everywhere, std_px = np.ones(N_FRAMES, dtype=bool), np.full(N_FRAMES, 0.05)
         trajectory, span = FrameTrajectory(homographies), FrameSpan(0, N_FRAMES)
         motion = FrameMotion(trajectory, span, homographies, everywhere, std_px, N_FRAMES // 2, SHAPE)
-        return find_cuts(source, MotionFit(source, motion, 2**30, Context()), Context(2))
+        return find_cuts(source, MotionFit(source, motion, 2**30, Context()), context)
 
     return cuts_of
 
@@ -56,7 +62,7 @@ def test_jump_is_found_to_the_frame_with_its_size(cuts_of: Callable[..., tuple[C
     [cut] = cuts_of(true_px, smoothed(true_px))
     assert cut.frame == JUMP
     # The camera moves on, so the image moves back.
-    np.testing.assert_allclose(cut.shift_px, [-jump_px, 0], atol=0.7)
+    np.testing.assert_allclose(cut.shift_px, [-jump_px, 0], atol=1)
     assert cut.sigmas > 10
     assert cut.dark is None
 
@@ -85,33 +91,46 @@ def test_jump_behind_dark_frames_is_cut_in_their_middle(cuts_of: Callable[..., t
     true_px, dark = PAN_PX + 40 * AFTER, FrameSpan(300, 350)
     [cut] = cuts_of(true_px, smoothed(true_px), dark=dark)
     assert (cut.frame, cut.dark) == (325, dark)
-    np.testing.assert_allclose(cut.shift_px, [-40, 0], atol=1.5)
+    np.testing.assert_allclose(cut.shift_px, [-40, 0], atol=2.5)
 
 
 def test_dark_frames_without_jump_are_not_cut(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
     assert cuts_of(PAN_PX, PAN_PX, dark=FrameSpan(300, 350)) == ()
 
 
-def test_long_tremor_is_searched_without_keeping_its_sums(street: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All of a capture that trembles is searched: sums of 48x64 px that are kept would take 12 kB each."""
-    monkeypatch.setattr(spans, "_BLOCK", 8)
+def test_jump_is_found_within_tremor(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
+    tremor_px = 1.5 * np.sin(2 * np.pi * FRAMES / 160)
+    [cut] = cuts_of(PAN_PX + tremor_px + 4 * AFTER, smoothed(PAN_PX + 4 * AFTER) + tremor_px, flux=0.3)
+    assert abs(cut.frame - JUMP) <= 2
 
-    def peak(n_frames: int) -> int:
-        frames = np.arange(n_frames)
-        tremor_px = 3 * np.sin(2 * np.pi * frames / 40)
-        views = seen_along(street, [translation(250 + x, 300) for x in tremor_px], (48, 64))
-        source = MemorySource(detected(views, 5))
-        homographies, everywhere = np.tile(np.eye(3), (n_frames, 1, 1)), np.ones(n_frames, dtype=bool)
-        span, std_px = FrameSpan(0, n_frames), np.full(n_frames, 0.05)
-        motion = FrameMotion(FrameTrajectory(homographies), span, homographies, everywhere, std_px, 0, (48, 64))
-        look = MotionFit(source, motion, 2**30, Context())
-        tracemalloc.start()
-        try:
-            assert find_cuts(source, look, Context()) == ()
-            return tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
 
-    peak(500)
-    # Numbers and arrays of a few bytes for each frame are kept.
-    assert peak(2000) < peak(500) + 1_000_000
+def test_nothing_is_said_of_a_jump_along_edges(cuts_of: Callable[..., tuple[Cut, ...]], street: np.ndarray) -> None:
+    """Edges along one diagonal show how far the image moves along the other one."""
+    y, x = np.indices(street.shape)
+    waves = np.random.default_rng(4).uniform(0, 2 * np.pi, 40)
+    edges = sum(np.sin((x + y) / period + phase) for period, phase in zip(np.geomspace(2, 20, 40), waves, strict=True))
+    true_px = PAN_PX + 8 * AFTER
+    [cut] = cuts_of(true_px, smoothed(true_px), scene=0.5 + 0.45 * np.tanh(edges / 4))
+    assert cut.frame == JUMP
+    np.testing.assert_allclose(cut.shift_px, [-4, -4], atol=1)
+
+
+class Stages:
+    """Progress that keeps how many units the stages have."""
+
+    def __init__(self) -> None:
+        self.total = 0
+
+    @contextmanager
+    def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+        self.total += total
+        yield lambda _: None
+
+
+def test_only_frames_around_a_sudden_change_are_searched(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
+    """All spans stand out from the noise where the loop has missed a tremor."""
+    tremor_px, stages = 1.5 * np.sin(2 * np.pi * FRAMES / 160), Stages()
+    assert cuts_of(PAN_PX + tremor_px, PAN_PX, context=Context(1, stages)) == ()
+    assert stages.total == 0
+    assert cuts_of(PAN_PX + 5 * AFTER, smoothed(PAN_PX + 5 * AFTER), context=Context(1, stages))
+    assert 0 < stages.total < N_FRAMES / 2

@@ -1,11 +1,9 @@
-"""Sums of short spans of frames in binned pixels: their shifts, tracks of many, and which part of a sum follows a shift."""
+"""Sums of short spans of frames in binned pixels: their shifts, and which part of a sum follows a shift."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache, partial
-from itertools import chain, islice
+from collections.abc import Sequence
+from functools import cache
 
 import cv2
 import numpy as np
@@ -13,7 +11,6 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from photonpano.contracts.protocols import Source
-from photonpano.execution.context import Context
 from photonpano.geometry import translation
 from photonpano.locating import Follows, follows, shift_of_spectra
 from photonpano.merging import binned_mean, binning_of
@@ -24,9 +21,7 @@ SHORTEST = {"binary": 4, "intensity": 1}  # frames of the shortest span: sums of
 PEAK_PX = 1.5  # standard deviation of the peak of the phase correlation, in binned pixels
 
 Spectrum = NDArray[np.complexfloating]
-_MIN_SUMS = 6  # of a track
 DARK = 0.2  # sums, and frames, with less than this share of the usual light show nothing
-_BLOCK = 32  # sums that are tracked in one task
 
 
 def span_image(source: Source, span: FrameSpan) -> FluxImage:
@@ -82,64 +77,3 @@ def following(moving: FluxImage, fixed: FluxImage, noise: float) -> Follows:
 @cache
 def _window(shape: tuple[int, ...]) -> NDArray[np.float32]:
     return hann_window(shape)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SumTrack:
-    """Sums of successive frames with light, and the shifts of the image between them."""
-
-    spans: Sequence[FrameSpan]  # (N,) of the sums, in order
-    next_px: FloatArray  # (N - 1, 2) shifts from each to the next, in binned px
-    second_px: FloatArray  # (N - 2, 2) shifts from each to the second next
-
-    @property
-    def centres(self) -> FloatArray:
-        """(N,) instants, in frames."""
-        return np.array([span.centre for span in self.spans])
-
-    @property
-    def velocities(self) -> FloatArray:
-        """(N - 1, 2) mean velocity of the image from each sum to the next, in binned px per frame."""
-        return np.asarray(self.next_px / np.diff(self.centres)[:, None])
-
-
-def track_sums(source: Source, runs: Sequence[Sequence[FrameSpan]], context: Context) -> Iterator[SumTrack | None]:
-    """Yield the track of each run of sums that show something, in order; None if they are too few."""
-    blocks = [_blocks_of(spans) for spans in runs]
-    parts = context.in_order(partial(_tracked_block, source), list(chain.from_iterable(blocks)))
-    for spans, of_run in zip(runs, blocks, strict=True):
-        light, track = _joined(spans, list(islice(parts, len(of_run))))
-        lit = light > DARK * np.median(light) if len(light) else light
-        if np.count_nonzero(lit) < _MIN_SUMS:
-            yield None
-        elif lit.all():
-            yield track
-        else:
-            # Those without light are left out, and so are the shifts to them: once more, as few captures have any.
-            left = [spans[index] for index in np.flatnonzero(lit).tolist()]
-            yield _joined(left, [_tracked_block(source, block) for block in _blocks_of(left)])[1]
-
-
-def _blocks_of(spans: Sequence[FrameSpan]) -> list[tuple[FrameSpan, ...]]:
-    return [tuple(spans[first : first + _BLOCK + 2]) for first in range(0, len(spans), _BLOCK)]
-
-
-def _joined(
-    spans: Sequence[FrameSpan], parts: Sequence[tuple[FloatArray, FloatArray, FloatArray]]
-) -> tuple[FloatArray, SumTrack]:
-    """Return the light of each sum, (N,), and the track of all of them, from their blocks."""
-    light, next_px, second_px = (np.concatenate([part[number] for part in parts] or [np.empty(0)]) for number in range(3))
-    return light, SumTrack(spans, next_px, second_px)
-
-
-def _tracked_block(source: Source, spans: Sequence[FrameSpan]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the light of the first 32 sums, and their shifts to the next and the second next; two further sums follow them."""
-    images = [span_image(source, span) for span in spans]
-    spectra = spectra_of(images)
-
-    def shifts(skip: int) -> FloatArray:
-        # An image without texture does not shift.
-        found = shifts_between(spectra[:_BLOCK], spectra[skip:], images[0].shape)
-        return np.array([np.zeros(2) if shift is None else shift for shift in found]).reshape(-1, 2)
-
-    return np.array([float(np.mean(image)) for image in images[:_BLOCK]]), shifts(1), shifts(2)
