@@ -19,14 +19,14 @@ _STAGES = 3  # stages, which count ones, eights and sixty-fours
 
 
 @compiled
-def add_counts(packed: NDArray[np.uint8], n_frames: int, little: bool, counts: NDArray[np.uint8] | NDArray[np.uint32]) -> None:
-    """Add packed frames to the counts of their pixels.
+def sum_bits(packed: NDArray[np.uint8], n_frames: int, little: bool, counts: NDArray[np.uint8]) -> None:
+    """Count in how many packed frames each pixel is lit.
 
     Args:
         packed: (n B,) bytes of n frames, one after the other.
         n_frames: n, at most 255, so that a count fits into a byte.
         little: whether the first pixel of a byte is its lowest bit, and not its highest.
-        counts: (8 B,), which is increased.
+        counts: (8 B,) output.
     """
     frame_bytes = len(packed) // n_frames
     stages = np.empty((_STAGES, _ROWS * _WORDS), np.uint64)
@@ -44,7 +44,7 @@ def add_counts(packed: NDArray[np.uint8], n_frames: int, little: bool, counts: N
                 if little:
                     _reverse_bytes(low)
                 pixels = counts[8 * (start + first) : 8 * (start + min(first + _WORDS, size))]
-                _increase(pixels, low.view(np.uint8))
+                _copy(low.view(np.uint8)[: len(pixels)], pixels)
 
 
 @compiled
@@ -104,12 +104,6 @@ def _copy(source: NDArray[np.generic], target: NDArray[np.generic]) -> None:
 def _clear(target: NDArray[np.generic]) -> None:
     for j in range(len(target)):
         target[j] = 0
-
-
-@compiled
-def _increase(counts: NDArray[np.uint8] | NDArray[np.uint32], by: NDArray[np.uint8]) -> None:
-    for pixel in range(len(counts)):
-        counts[pixel] += by[pixel]
 
 
 @compiled

@@ -44,21 +44,24 @@ def packed_counts(
         raise ValueError(
             f"packed frames of width {width} must be uint8 (n, H, {-(-width // 8)}), got {packed.dtype} {packed.shape}"
         )
-    from photonpano.photometry.bits import add_counts
+    from photonpano.photometry.bits import sum_bits
 
     n_frames, height, row_bytes = packed.shape
-    if counts is None:
-        counts = np.zeros((height, width), np.uint8 if small and n_frames <= MAX_FRAMES else np.uint32)  # type: ignore[assignment]
-    elif counts.dtype != np.uint32 or counts.shape != (height, width) or not counts.flags.c_contiguous:
+    if counts is not None and (counts.dtype != np.uint32 or counts.shape != (height, width) or not counts.flags.c_contiguous):
         raise ValueError(f"counts must be contiguous uint32 {(height, width)}, got {counts.dtype} {counts.shape}")
-    whole = width == 8 * row_bytes
-    padded = counts if whole else np.zeros((height, 8 * row_bytes), counts.dtype)
     step = min(MAX_FRAMES, max(8, _BLOCK_BYTES // max(1, height * row_bytes)))
+    if small and 0 < n_frames <= MAX_FRAMES:
+        step = MAX_FRAMES
+    elif counts is None:
+        counts = np.zeros((height, width), np.uint32)
     for start in range(0, n_frames, step):
         block = np.ascontiguousarray(packed[start : start + step])
-        add_counts(block.reshape(-1), len(block), bit_order == "little", padded.reshape(-1))
-    if not whole:
-        counts += padded[:, :width]
+        lit = np.empty((height, 8 * row_bytes), np.uint8)
+        sum_bits(block.reshape(-1), len(block), bit_order == "little", lit.reshape(-1))
+        if counts is None:
+            return np.ascontiguousarray(lit[:, :width])  # type: ignore[return-value]  # bytes
+        counts += lit[:, :width]
+    assert counts is not None
     return counts
 
 
