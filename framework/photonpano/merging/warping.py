@@ -47,7 +47,7 @@ class Texture(NamedTuple):
         shape = image.shape[0] + 1, image.shape[1] + 1
         if image.dtype == np.uint8:
             small = np.empty(shape, np.uint32)
-            _fill_bytes(small, image)
+            _fill_bytes(small, image.view(np.uint8))
             return cls(small, 1.0, 0.0)
         pixels, texels = np.ascontiguousarray(image, np.float32), np.empty(shape, np.uint64)
         low, high = min(0.0, float(pixels.min(initial=0))), float(pixels.max(initial=0))

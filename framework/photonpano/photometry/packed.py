@@ -59,7 +59,7 @@ def packed_counts(
         lit = np.empty((height, 8 * row_bytes), np.uint8)
         sum_bits(block.reshape(-1), len(block), bit_order == "little", lit.reshape(-1))
         if counts is None:
-            return np.ascontiguousarray(lit[:, :width])  # type: ignore[return-value]  # bytes
+            return np.ascontiguousarray(lit[:, :width])
         counts += lit[:, :width]
     assert counts is not None
     return counts

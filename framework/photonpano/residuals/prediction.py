@@ -71,8 +71,9 @@ class Prediction:
         sharp = np.maximum(flux - blur / 2 * cv2.Laplacian(flux, cv2.CV_32F, ksize=1), 0)
         mean = response.mean_count(np.asarray(sharp, np.float32))
         # The gradient at a place is that of interpolated pixels up to two away.
-        reach, border = np.ones((5, 5), np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}
-        known = cv2.erode(inside.astype(np.uint8), reach, **border).astype(np.bool_)
+        known = cv2.erode(
+            inside.astype(np.uint8), np.ones((5, 5), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0
+        ).astype(np.bool_)
         variance = np.where(known, frame_variance(flux, response, response.mean_count), np.float32(0))
         variance = np.pad(variance.astype(np.float32, copy=False), ((1, 1), (1, 0)))
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
