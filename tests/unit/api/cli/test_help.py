@@ -225,7 +225,7 @@ def test_verbose_prints_decisions_of_run(folder: Path, invoke: Callable[..., Any
     header, *rows = result.stderr.partition("\nstage ")[2].splitlines()
     assert header.split("  ")[-1] == "share"
     found = [COSTS.findall(row)[0] for row in rows]
-    costs = {title: [float(number) for number in numbers.split()] for title, numbers in found}
+    costs = {title.split(" (")[0]: [float(number) for number in numbers.split()] for title, numbers in found}
     assert list(costs)[:2] == ["start", "level 1: merge and locate"]
     assert list(costs)[-2:] == ["other", "whole"]
     assert {"panorama", "residuals"} <= set(costs)
