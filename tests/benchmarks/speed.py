@@ -126,10 +126,11 @@ def warps() -> list[str]:
         canvas = plan_canvas(FrameTrajectory(moved[None]), FrameSpan(0, 1), SHAPE, 1.0, 2**30, view=view)
         (at,) = footprints_of(canvas, camera, moved[None], SHAPE)
         grid = Grid.zeros(canvas, 1)
-        seen_by = Texture.of(np.ones(SHAPE, np.float32)) if masked else None
+        mask = np.ones(SHAPE, np.uint8)
+        seen_by = Texture.of(mask) if masked else None
 
         def ours() -> object:
-            return add_warped(Texture.of(counts.astype(np.float32) if masked else counts), seen_by, np.ones(1), at, grid)
+            return add_warped(Texture.of(counts * mask if masked else counts), seen_by, np.ones(1), at, grid)
 
         y, x = np.mgrid[: canvas.height, : canvas.width].astype(np.float32)
         image = counts.astype(np.float32)
@@ -239,6 +240,9 @@ def plot(seconds: dict[str, dict[int, tuple[float, float]]], file: Path) -> None
         ):
             axes.plot(list(found), times, style, marker="o", color=colour, label=f"{kind}: {name}")
     axes.set(xscale="log", yscale="log", xlabel="frames of 254 x 496 px", ylabel="s, two threads")
+    axes.set_xticks(list(seconds["smooth"]), [f"{n_frames:,}" for n_frames in seconds["smooth"]])
+    axes.set_yticks([3, 5, 10, 20, 50, 100], ["3", "5", "10", "20", "50", "100"])
+    axes.minorticks_off()
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     figure.savefig(file, dpi=110)

@@ -6,8 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.capture import Capture, capture_of
 from photonpano.contracts.protocols import Source
@@ -162,16 +164,17 @@ def _sum_on(
     advance: Callable[[int], None],
 ) -> tuple[FluxImage, FluxImage]:
     """Return the counts and the coverages of a canvas: (H, W) and (P, H, W)."""
-    masked = weights_of(source)
+    masked: NDArray[np.float32] | NDArray[np.uint8] | None = weights_of(source)
     corrected = source.corrected if source.corrects_sums else None
+    if masked is not None and corrected is None and source.weight is None:
+        masked = masked.astype(np.uint8)  # sums in bytes stay in bytes
     grid, seen_by = Grid.zeros(canvas, 1 if terms is None else terms.number), _Seen(source.info.frame_shape, masked)
     for chunk, footprint in visible:
         amounts = np.array([float(len(chunk.span))]) if terms is None else terms.amounts(chunk.span)
         raw = counts_of(chunk.span)
         counts: FluxImage | Counts = raw if corrected is None else corrected(raw, len(chunk.span))
-        if masked is not None:
-            counts = np.asarray(counts * masked, np.float32)
-        add_warped(Texture.of(average_squares(counts, footprint.shrink)), seen_by(footprint.shrink), amounts, footprint, grid)
+        image = Texture.of(average_squares(counts if masked is None else counts * masked, footprint.shrink))
+        add_warped(image, seen_by(footprint.shrink, image.texels.dtype), amounts, footprint, grid)
         advance(len(chunk.span))
     return grid.total, grid.coverages
 
@@ -187,17 +190,18 @@ def weights_of(source: Source) -> FluxImage | None:
 class _Seen:
     """The share of each pixel that is seen, averaged over squares: the same for all chunks."""
 
-    def __init__(self, frame_shape: tuple[int, int], masked: FluxImage | None) -> None:
+    def __init__(self, frame_shape: tuple[int, int], masked: NDArray[np.float32] | NDArray[np.uint8] | None) -> None:
         self._frame_shape, self._masked = frame_shape, masked
-        self._textures: dict[int, Texture | None] = {}
+        self._textures: dict[tuple[int, object], Texture | None] = {}
 
-    def __call__(self, shrink: int) -> Texture | None:
-        """Return it for squares of `shrink` pixels a side; None if it is 1 for all."""
-        if shrink not in self._textures:
+    def __call__(self, shrink: int, texel: np.dtype[Any]) -> Texture | None:
+        """Return it for squares of `shrink` pixels a side, in texels of the same kind as the image; None if it is 1 for all."""
+        if (shrink, texel) not in self._textures:
             whole = self._masked is None and not any(side % shrink for side in self._frame_shape)
             share = np.ones(self._frame_shape, np.float32) if self._masked is None else self._masked
-            self._textures[shrink] = None if whole else Texture.of(average_squares(share, shrink))
-        return self._textures[shrink]
+            share = share.astype(np.uint8 if texel == np.uint32 else np.float32)
+            self._textures[shrink, texel] = None if whole else Texture.of(average_squares(share, shrink))
+        return self._textures[shrink, texel]
 
 
 def divided(length: int, parts: int) -> list[range]:
