@@ -199,8 +199,8 @@ class _Seen:
         if (shrink, texel) not in self._textures:
             whole = self._masked is None and not any(side % shrink for side in self._frame_shape)
             share = np.ones(self._frame_shape, np.float32) if self._masked is None else self._masked
-            share = share.astype(np.uint8 if texel == np.uint32 else np.float32)
-            self._textures[shrink, texel] = None if whole else Texture.of(average_squares(share, shrink))
+            like = share.astype(np.uint8) if texel == np.uint32 else share.astype(np.float32)
+            self._textures[shrink, texel] = None if whole else Texture.of(average_squares(like, shrink))
         return self._textures[shrink, texel]
 
 
