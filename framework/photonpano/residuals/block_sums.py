@@ -44,53 +44,70 @@ def add_block_sums(
         sums: (h, w, 12), see `n_blocks`; added to.
     """
     height, width = mean.shape
-    n = np.float32(n_frames)
-    half = np.float32(0.5) * n
-    zero, one = np.float32(0), np.float32(1)
-    for y in range(1, height - 1):
-        row, above, below = mean[y], mean[y - 1], mean[y + 1]
-        lit, variances, extra = counts[y], variance[y], dark[y]
-        for block in range((width + BLOCK_PX - 1) // BLOCK_PX):
-            start, stop = max(1, block * BLOCK_PX), min(width - 1, (block + 1) * BLOCK_PX)
-            size = stop - start
-            here, left, right = row[start:stop], row[start - 1 : stop - 1], row[start + 1 : stop + 1]
-            up, down = above[start:stop], below[start:stop]
-            k, q, e = lit[start:stop], variances[start:stop], extra[start:stop]
-            xx = xy = yy = xr = yr = xm = ym = mm = mr = rr = vv = ms = zero
-            for t in range(size):
-                m, gx, gy = here[t] * n, (right[t] - left[t]) * half, (down[t] - up[t]) * half
-                r = np.float32(k[t]) - m
-                ok = r == r and q[t] > zero
-                v = n * (q[t] + e[t]) if ok else zero
-                w = one / v if ok else zero
-                m = m if ok else zero
-                r = r if ok else zero
-                wx, wy, wm = w * gx, w * gy, w * m
-                xx += wx * gx
-                xy += wx * gy
-                yy += wy * gy
-                xr += wx * r
-                yr += wy * r
-                xm += wx * m
-                ym += wy * m
-                mm += wm * m
-                mr += wm * r
-                rr += r
-                vv += v
-                ms += m
-            cell = sums[y // BLOCK_PX, block]
-            cell[0] += xx
-            cell[1] += xy
-            cell[2] += yy
-            cell[3] += xr
-            cell[4] += yr
-            cell[5] += xm
-            cell[6] += ym
-            cell[7] += mm
-            cell[8] += mr
-            cell[9] += rr
-            cell[10] += vv
-            cell[11] += ms
+    n, zero = np.float32(n_frames), np.float32(0)
+    for block_row in range(len(sums)):
+        last = min(height - 1, (block_row + 1) * BLOCK_PX) - 1
+        # Two rows at a time: adding up what the lanes of the processor hold takes as long as a row.
+        for y in range(max(1, block_row * BLOCK_PX), last + 1, 2):
+            y2, both = min(y + 1, last), y < last
+            for block in range(sums.shape[1]):
+                start, stop = max(1, block * BLOCK_PX), min(width - 1, (block + 1) * BLOCK_PX)
+                here, left, right = mean[y, start:stop], mean[y, start - 1 : stop - 1], mean[y, start + 1 : stop + 1]
+                here2, left2, right2 = mean[y2, start:stop], mean[y2, start - 1 : stop - 1], mean[y2, start + 1 : stop + 1]
+                up, down, up2, down2 = (
+                    mean[y - 1, start:stop],
+                    mean[y + 1, start:stop],
+                    mean[y2 - 1, start:stop],
+                    mean[y2 + 1, start:stop],
+                )
+                k, q, e = counts[y, start:stop], variance[y, start:stop], dark[y, start:stop]
+                k2, q2, e2 = counts[y2, start:stop], variance[y2, start:stop], dark[y2, start:stop]
+                xx = xy = yy = xr = yr = xm = ym = mm = mr = rr = vv = ms = zero
+                for t in range(stop - start):
+                    gx, gy, m, r, v, w = _terms(here[t], right[t] - left[t], down[t] - up[t], k[t], q[t], e[t], n, True)
+                    wx, wy, wm = w * gx, w * gy, w * m
+                    xx, xy, yy, xr, yr = xx + wx * gx, xy + wx * gy, yy + wy * gy, xr + wx * r, yr + wy * r
+                    xm, ym, mm, mr = xm + wx * m, ym + wy * m, mm + wm * m, mr + wm * r
+                    rr, vv, ms = rr + r, vv + v, ms + m
+                    gx, gy, m, r, v, w = _terms(here2[t], right2[t] - left2[t], down2[t] - up2[t], k2[t], q2[t], e2[t], n, both)
+                    wx, wy, wm = w * gx, w * gy, w * m
+                    xx, xy, yy, xr, yr = xx + wx * gx, xy + wx * gy, yy + wy * gy, xr + wx * r, yr + wy * r
+                    xm, ym, mm, mr = xm + wx * m, ym + wy * m, mm + wm * m, mr + wm * r
+                    rr, vv, ms = rr + r, vv + v, ms + m
+                cell = sums[block_row, block]
+                cell[GXX] += xx
+                cell[GXY] += xy
+                cell[GYY] += yy
+                cell[GX_R] += xr
+                cell[GY_R] += yr
+                cell[GX_M] += xm
+                cell[GY_M] += ym
+                cell[M_M] += mm
+                cell[M_R] += mr
+                cell[R] += rr
+                cell[V] += vv
+                cell[M] += ms
+
+
+@compiled
+def _terms(
+    mean: np.float32,
+    across: np.float32,
+    along: np.float32,
+    counts: np.float32,
+    variance: np.float32,
+    dark: np.float32,
+    n: np.float32,
+    used: bool,
+) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
+    """Return gx, gy, m, r, v and 1 / v of a pixel: see `GXX`; m, r, v and 1 / v are 0 if it is not known, or not `used`."""
+    half, zero, one = np.float32(0.5) * n, np.float32(0), np.float32(1)
+    m = mean * n
+    r = np.float32(counts) - m
+    known = (r == r) & (variance > zero) & used
+    v = n * (variance + dark) if known else zero
+    w = one / v if known else zero
+    return across * half, along * half, m if known else zero, r if known else zero, v, w
 
 
 @compiled
