@@ -241,7 +241,7 @@ def claims(numbers: Numbers) -> list[Claim]:
             Claim(
                 f"{name}: near-perfect path and high-fidelity reconstruction from binary frames",
                 f"{case['flux']:g} photons per pixel per frame: mean error {ours['mean_px']:g} px, largest "
-                f"{ours['worst_px']:g} px; {ours['below_oracle_db']:.1f} dB below the panorama along the true "
+                f"{ours['worst_px']:g} px; {ours['below_oracle_db']:z.1f} dB below the panorama along the true "
                 f"motion (PSNR {ours['psnr_db']:.1f} dB, averages {case['averages_psnr_db']:.1f} dB)",
                 ours["below_oracle_db"] < 1,
             ),

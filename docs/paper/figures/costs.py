@@ -114,9 +114,9 @@ def run_time(study: Study) -> tuple[None, Numbers]:
     at = {size: found[-1] for size, found in counted.items()}
     numbers["power_of_m"] = round(float(np.polyfit(np.log(list(at)), np.log(list(at.values())), 1)[0]), 2)
     # The only number that depends on the machine is taken from the page of such numbers.
-    measured = re.search(rf"^\| {LENGTHS[-1]:,} \| (\d+) s \|", SPEED.read_text(encoding="utf-8"), re.MULTILINE)
+    measured = re.search(rf"^\| {LENGTHS[-1]:,} \| smooth \| ([\d.]+) s \|", SPEED.read_text(encoding="utf-8"), re.MULTILINE)
     assert measured is not None
-    numbers["seconds"] = int(measured[1])
+    numbers["seconds"] = round(float(measured[1]))
     return None, numbers
 
 
@@ -153,7 +153,7 @@ def run_time_claims(numbers: Numbers) -> list[Claim]:
         ),
         Claim(
             "ten minutes an iteration for 100,000 frames",
-            f"[{numbers['seconds']} s for {LAST} levels and the panorama](../explanation/speed.md#whole-runs), on two cores",
+            f"[{numbers['seconds']} s for the whole run](../explanation/speed.md#whole-runs), with all defaults, on two cores",
             numbers["seconds"] < 600,
         ),
     ]

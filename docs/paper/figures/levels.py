@@ -137,8 +137,8 @@ def groups_claims(numbers: Numbers) -> list[Claim]:
         ),
         Claim(
             "this results in blur and ghosting artifacts",
-            f"panorama {few['below_oracle_db']:.1f} dB below the one along the true motion, with new groups "
-            f"{many['below_oracle_db']:.1f} dB",
+            f"panorama {few['below_oracle_db']:z.1f} dB below the one along the true motion, with new groups "
+            f"{many['below_oracle_db']:z.1f} dB",
             few["below_oracle_db"] > many["below_oracle_db"] + 1,
         ),
     ]
@@ -180,8 +180,8 @@ def refinement_claims(numbers: Numbers) -> list[Claim]:
         ),
         Claim(
             "two or three iterations are satisfactory",
-            f"below the panorama along the true motion: {second['below_oracle_db']:.1f} dB after two levels, "
-            f"{third['below_oracle_db']:.1f} dB after three",
+            f"below the panorama along the true motion: {second['below_oracle_db']:z.1f} dB after two levels, "
+            f"{third['below_oracle_db']:z.1f} dB after three",
             third["below_oracle_db"] < 1,
         ),
     ]

@@ -92,7 +92,7 @@ def fails(scores: Mapping[str, Any]) -> bool:
 def told(scores: Mapping[str, Any]) -> str:
     """Return the scores of a path and its panorama in words."""
     return scores.get("reason") or (
-        f"mean corner error {scores['mean_px']:g} px, largest {scores['worst_px']:g} px, {scores['below_oracle_db']:.1f} dB "
+        f"mean corner error {scores['mean_px']:g} px, largest {scores['worst_px']:g} px, {scores['below_oracle_db']:z.1f} dB "
         "below the panorama along the true motion"
     )
 
