@@ -65,15 +65,22 @@ def add_block_sums(
                 xx = xy = yy = xr = yr = xm = ym = mm = mr = rr = vv = ms = zero
                 for t in range(stop - start):
                     gx, gy, m, r, v, w = _terms(here[t], right[t] - left[t], down[t] - up[t], k[t], q[t], e[t], n, True)
-                    wx, wy, wm = w * gx, w * gy, w * m
-                    xx, xy, yy, xr, yr = xx + wx * gx, xy + wx * gy, yy + wy * gy, xr + wx * r, yr + wy * r
-                    xm, ym, mm, mr = xm + wx * m, ym + wy * m, mm + wm * m, mr + wm * r
-                    rr, vv, ms = rr + r, vv + v, ms + m
-                    gx, gy, m, r, v, w = _terms(here2[t], right2[t] - left2[t], down2[t] - up2[t], k2[t], q2[t], e2[t], n, both)
-                    wx, wy, wm = w * gx, w * gy, w * m
-                    xx, xy, yy, xr, yr = xx + wx * gx, xy + wx * gy, yy + wy * gy, xr + wx * r, yr + wy * r
-                    xm, ym, mm, mr = xm + wx * m, ym + wy * m, mm + wm * m, mr + wm * r
-                    rr, vv, ms = rr + r, vv + v, ms + m
+                    gx2, gy2, m2, r2, v2, w2 = _terms(
+                        here2[t], right2[t] - left2[t], down2[t] - up2[t], k2[t], q2[t], e2[t], n, both
+                    )
+                    wx, wy, wm, wx2, wy2, wm2 = w * gx, w * gy, w * m, w2 * gx2, w2 * gy2, w2 * m2
+                    xx += wx * gx + wx2 * gx2
+                    xy += wx * gy + wx2 * gy2
+                    yy += wy * gy + wy2 * gy2
+                    xr += wx * r + wx2 * r2
+                    yr += wy * r + wy2 * r2
+                    xm += wx * m + wx2 * m2
+                    ym += wy * m + wy2 * m2
+                    mm += wm * m + wm2 * m2
+                    mr += wm * r + wm2 * r2
+                    rr += r + r2
+                    vv += v + v2
+                    ms += m + m2
                 cell = sums[block_row, block]
                 cell[GXX] += xx
                 cell[GXY] += xy

@@ -29,7 +29,7 @@ def cuts_of(street: np.ndarray) -> Callable[..., tuple[Cut, ...]]:
         flux: float = 1.0,
         dark: FrameSpan | None = None,
         scene: np.ndarray = street,
-        context: Context = Context(2),  # noqa: B008
+        context: Context | None = None,
     ) -> tuple[Cut, ...]:
         lit = np.full(N_FRAMES, flux)
         if dark is not None:
@@ -40,7 +40,7 @@ def cuts_of(street: np.ndarray) -> Callable[..., tuple[Cut, ...]]:
         everywhere, std_px = np.ones(N_FRAMES, dtype=bool), np.full(N_FRAMES, 0.05)
         trajectory, span = FrameTrajectory(homographies), FrameSpan(0, N_FRAMES)
         motion = FrameMotion(trajectory, span, homographies, everywhere, std_px, N_FRAMES // 2, SHAPE)
-        return find_cuts(source, MotionFit(source, motion, 2**30, Context()), context)
+        return find_cuts(source, MotionFit(source, motion, 2**30, Context()), context or Context(2))
 
     return cuts_of
 
