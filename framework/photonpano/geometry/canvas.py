@@ -159,17 +159,6 @@ class Canvas:
         """Return the canvas of a box of pixels."""
         return replace(self, height=height, width=width, transform=translation(-left, -top) @ self.transform)
 
-    def same_as(self, other: Canvas) -> bool:
-        """Return whether both have the same pixels at the same places."""
-        pairs = (
-            (self.transform, other.transform),
-            (self.camera_matrix, other.camera_matrix),
-            (self.horizon, other.horizon),
-        )
-        return (self.shape, self.projection) == (other.shape, other.projection) and all(
-            one is two or (one is not None and two is not None and np.array_equal(one, two)) for one, two in pairs
-        )
-
     @property
     def _projection(self) -> Projection:
         return PROJECTIONS[self.projection]

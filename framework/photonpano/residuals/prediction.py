@@ -152,7 +152,7 @@ class Prediction:
         images = np.empty((2, *self.frame_shape), np.float32)
         frame = max(0, round(float(instant)))
         self.view(self.trajectory.at([instant])[0], images, FrameSpan(frame, frame + 1))
-        images[:, images[1] <= 0] = np.nan
+        images[:, ~(images[1] > 0)] = np.nan  # the variance of relit darkness is NaN
         return images[0], images[1]
 
 

@@ -34,8 +34,8 @@ _STANDS_OUT = 30.0
 # The measured steps of three spans bound the error of frames that are at most one span away from one.
 _BOUND_SPANS, _NEAR_SPANS = 3, 1.0
 
-# Motion within which frames are summed for the panorama of the residuals. Of its blur, the part across the noise of single
-# pixels is smoothed away anyway; 0.125 px takes four times as long, and the residuals are the same to 1 %.
+# Motion within which frames are summed for the panorama of the residuals, which is smoothed by more than this. Within 0.125 px,
+# there are four times as many warps, and the errors of three captures were the same to 0.001 px.
 TOLERANCE_PX = 0.5
 _DARK = -0.5  # spans that are darker than predicted by half of the light or more show too little to be measured
 # A motion is worse if the scatter of the shifts grows by this factor, or the reduced chi-square of the photons by this much.

@@ -84,6 +84,26 @@ def test_isinstance_says_what_applies(
         assert {each for each in OPTIONAL if isinstance(changed, each)} == (own | set(gains)) - set(loses)
 
 
+class Tenfold(Simulated):
+    """A source whose correction multiplies sums, as those of plugins may."""
+
+    def corrected(self, counts: np.ndarray, n_frames: int) -> np.ndarray:
+        return (counts * np.uint8(10)).astype(np.float32)
+
+
+@pytest.mark.parametrize(("n_frames", "kind"), [(3, np.uint8), (255, np.uint8), (256, np.uint32)])
+def test_chunk_is_the_sum_in_the_smallest_type_that_holds_it(n_frames: int, kind: type) -> None:
+    lit = np.ones((300, *SHAPE), np.uint8)
+    lit[:, 2, 3] = 0
+    capture, span = capture_of(Tenfold(lit)), FrameSpan(7, 7 + n_frames)
+    chunk = capture.chunk(span)
+    assert chunk.dtype == kind
+    np.testing.assert_array_equal(chunk, capture.counts(span))
+    np.testing.assert_array_equal(capture.corrected(chunk, n_frames), 10.0 * capture.counts(span))
+    turned = corrected_source(capture, [CORRECTIONS["rot90"]()])
+    np.testing.assert_array_equal(turned.chunk(span), turned.counts(span))
+
+
 def test_capture_without_anything_to_correct_returns_the_counts_themselves() -> None:
     capture = capture_of(MemorySource(FRAMES))
     counts = capture.counts(FrameSpan(0, 9))
