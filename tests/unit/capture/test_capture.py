@@ -100,7 +100,7 @@ def test_chunk_is_the_sum_in_the_smallest_type_that_holds_it(n_frames: int, kind
     assert chunk.dtype == kind
     np.testing.assert_array_equal(chunk, capture.counts(span))
     np.testing.assert_array_equal(capture.corrected(chunk, n_frames), 10.0 * capture.counts(span))
-    turned = corrected_source(capture, [CORRECTIONS["rot90"]()])
+    turned = corrected_source(Simulated(lit), [CORRECTIONS["rot90"]()])
     np.testing.assert_array_equal(turned.chunk(span), turned.counts(span))
 
 
