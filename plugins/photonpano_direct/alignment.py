@@ -34,6 +34,7 @@ _MIN_CURVATURE = 5.0  # floor on the common curvature, relative to that of noise
 # Levenberg-Marquardt damping after a step that raised the cost, as a fraction of the Hessian of the template; multiplied by 4
 # on each further failure, and halved by each step that lowers the cost.
 _DAMPING = 0.1
+_MOST_RAISED = 3  # steps that raise the cost, after which no smaller ones are tried
 _NEGLIGIBLE = 0.02  # converged below this fraction of the expected error: in the dark, steps stay small for long
 _HESSIAN_PX = 0.25  # the Hessian is updated after steps above this
 
@@ -177,7 +178,7 @@ def descend(
     of_basis, gradient = transposed(basis), np.empty((8, 1))
     std_px, hessian_is_current = 0.0, False
     damping, previous, least_cost, last_px = 0.0, homography, np.inf, 0.0
-    pixels, squares, weights = 0, 0.0, 0.0
+    raised, pixels, squares, weights = 0, 0, 0.0, 0.0
     for _ in range(max_steps):
         pixels, squares, weights = residuals_and_moments(moving, fixed, homography, buffers, moments_x, moments_y)
         if pixels == 0:
@@ -206,7 +207,11 @@ def descend(
         if cost > least_cost:
             # The last step raised the cost: repeat it with more damping.
             homography, least_cost, last_px, damping = previous, np.inf, 0.0, max(_DAMPING, 4 * damping)
+            raised += 1
             continue
+        if raised == _MOST_RAISED:
+            # What overlaps changes the cost more than any step does, which damping would only make smaller.
+            return _CONVERGED, homography, pixels, squares, weights
         previous, least_cost, damping = homography, cost, damping / 2
         homography = scaled_to_one(product(homography, inverse_homography(step)))
         # An alignment that passes through an impossible homography may return, but not to the true one.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import Camera, nearest_rotations, scaled_ahead, translation, unit_coordinates
+from photonpano.geometry import Camera, nearest_rotations, parameters, scaled_ahead, translation, unit_coordinates
 from photonpano.locating import (
     ALL_PARAMETERS,
     NOTHING_SEEN,
@@ -34,6 +34,7 @@ _RESTRICTED = 2  # alignments of a hypothesis, each restricted to where the last
 _TRUST = 3.0  # weight of the part that follows the motion known so far, which many pairs have determined
 # Corner error above which a pair does not determine eight parameters; for a rotating camera, three are estimated instead.
 _DETERMINED_PX = 1.0
+_CONTRADICTION = 9.0  # mean squared deviation of the eight parameters, over what the images allow, that a rotation may have
 # Largest residual that different motion blur explains, as a fraction of the contrast; in much light, many times the noise.
 _BLUR_DIFFERENCE = 0.1
 
@@ -82,7 +83,15 @@ class DirectLocator:
         if self._camera_matrix is None or _determined(outcome):
             return outcome
         turned = _Alignment(self._config, self._camera_matrix).aligned(moving, fixed, start, searches)
-        return outcome if isinstance(turned, NotLocated) else turned
+        return outcome if isinstance(turned, NotLocated) or _contradicts(turned, outcome) else turned
+
+
+def _contradicts(turned: Located, outcome: Located | NotLocated) -> bool:
+    """Return whether a rotation is far from the homography that aligns the same images, for what these say of it."""
+    if isinstance(outcome, NotLocated) or outcome.information is None:
+        return False
+    away = parameters(turned.homography) - parameters(outcome.homography)
+    return float(away @ outcome.information @ away) > _CONTRADICTION * len(away)
 
 
 def _determined(outcome: Located | NotLocated) -> bool:
@@ -155,7 +164,8 @@ class _Alignment:
             return np.ascontiguousarray(np.eye(8)[:, list(free)]), free == ALL_PARAMETERS
         height, width = pyramid.layers[depth].image.shape
         matrix = unit_coordinates((height, width)) @ self._camera.scaled(0.5**depth).matrix
-        return np.ascontiguousarray(turn_slopes(np.eye(3), matrix)), True
+        slopes = turn_slopes(np.eye(3), matrix)
+        return np.ascontiguousarray(slopes / np.linalg.norm(slopes, axis=0)), True
 
     def _of_majority(
         self, moving: Pyramid, fixed: Pyramid, first: _Descent, start: Homography, judged: int, searches: bool

@@ -94,7 +94,8 @@ def view_of(exposure: VirtualExposure, blur_px: float) -> View:
     """
     known = exposure.weight > 0
     std = exposure.response.stabilised_std(np.where(known, exposure.weight, np.float32(1)))
-    variance = np.where(known, std * std, np.float32(0))
+    # A pixel at a smaller scale averages those of the frames that it covers.
+    variance = np.where(known, std * std, np.float32(0)) * np.float32(min(1.0, exposure.scale) ** 2)
     image, noise, near = _blurred(_stabilised(exposure), variance, known.astype(np.float32), blur_px=blur_px)
     bridged = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     border = math.ceil(_BORDER * blur_px)

@@ -46,6 +46,16 @@ class Assessment:
     std_camera: FloatArray
 
 
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """What a solution leaves of the residuals of a graph."""
+
+    squares: float  # sum of the squared residuals of unit variance
+    unknowns: int
+    shared: int  # those of them that all nodes share
+    left: int  # degrees of freedom of the residuals
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
     """A connected graph whose nodes are to be found."""
@@ -155,9 +165,15 @@ class Adjustment(ABC, Generic[StateT]):
         """Return the root mean square residual at the corners, for each edge: (E,) in px."""
         return np.asarray(np.sqrt(np.mean(np.sum(self._residuals(state) ** 2, axis=-1), axis=-1)))
 
-    def cost(self, norms: FloatArray, kept: BoolArray) -> tuple[float, int]:
-        """Return the sum of the squared residuals of unit variance of the edges that are kept, and its degrees of freedom."""
-        return float(8 * (norms[kept] ** 2).sum()), 8 * int(kept.sum()) - self._n_node * (self._n_nodes - 1) - self._n_shared
+    @property
+    def unknowns(self) -> int:
+        """How many numbers are to be found."""
+        return self._n_node * (self._n_nodes - 1) + self._n_shared
+
+    def cost(self, norms: FloatArray, kept: BoolArray) -> Cost:
+        """Return what a solution leaves of the edges that are kept, given the (E,) norms of their whitened residuals."""
+        squares = float(8 * (norms[kept] ** 2).sum())
+        return Cost(squares, self.unknowns, self._n_shared, 8 * int(kept.sum()) - self.unknowns)
 
     def assess(self, state: StateT, norms: FloatArray, kept: BoolArray) -> Assessment:
         """Return the information on each node while the others are held, and the expected error of its corners.
@@ -230,7 +246,7 @@ class Adjustment(ABC, Generic[StateT]):
         # Each node absorbs some of the residuals; the redundant ones determine the scale. The median alone would be too
         # small where robust weights make half of the edges fit exactly.
         n_edges = int(kept.sum())
-        redundancy = n_edges - (self._n_node * (self._n_nodes - 1) + self._n_shared) / 8
+        redundancy = n_edges - self.unknowns / 8
         scale = float(np.median(norms[kept])) * float(np.sqrt(n_edges / redundancy)) if redundancy > 0 else 0.0
         return max(scale, MEDIAN_NORM)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, Protocol
@@ -12,24 +13,19 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from photonpano.geometry import (
-    from_parameters,
     generators,
     inverse,
-    nearest_rotations,
     normalised,
     parameters,
     scaled_ahead,
-    unit_coordinates,
 )
-from photonpano.motion.adjustment import Adjustment, Assessment, Problem
+from photonpano.motion.adjustment import OUTLIER, Adjustment, Assessment, Cost, Problem
+from photonpano.motion.evidence import Evidence, likeliest
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
-from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
+from photonpano.motion.planar import PlanarName, basis_of, moved, nearest
+from photonpano.motion.rotation_graph import RotationAdjustment, Rotations, likely_rotations
 from photonpano.values import BoolArray, Edge, FloatArray, Located
-
-# A camera only turns if five unknowns more for each exposure lower the squared residuals by less than this for each of them, in
-# units of those that remain. Noise alone lowers them by 1, and noise that pairs have in common by some more.
-_EXPLAINED = 20.0
 
 
 class GraphOptions(Protocol):
@@ -64,34 +60,10 @@ class GraphSolution:
     residual_px: float  # root mean square residual of the other edges at the corners, 0 for a tree
     # returns how well the L located nodes are determined. It takes about as long as to solve the graph.
     assess: Callable[[], Assessment]
+    model: MotionModel = HOMOGRAPHIES  # of these homographies: the one that "auto" chose
     rotations: Rotations | None = None  # of the L located nodes, and their camera; None for homographies
-    # returns how well a rotating camera explains the edges; None where one of the two models is not fitted. For rotations it
-    # takes about as long as to solve the graph.
+    # returns how well rival models explain the edges, None without rivals; for rotations it takes as long as solving the graph
     compare: Callable[[], Evidence | None] = lambda: None
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """How well a rotating camera explains the pairs, compared with any homographies."""
-
-    rotation: float  # mean square of the whitened residuals of rotations, 1 where they are photon noise
-    homography: float  # that of homographies
-    # by how much each additional unknown of the homographies lowers the sum of the squares, in units of `homography`
-    gain: float
-
-    @classmethod
-    def of(cls, free: _Fit, rotating: _Fit) -> Evidence:
-        """Compare two fits to the same edges."""
-        kept = free.kept & rotating.kept
-        (of_free, left_free), (of_rotating, left_rotating) = (fit.adjustment.cost(fit.norms, kept) for fit in (free, rotating))
-        scale = max(of_free / max(left_free, 1), 1.0)
-        gain = (of_rotating - of_free) / max(left_rotating - left_free, 1) / scale
-        return cls(of_rotating / max(left_rotating, 1), of_free / max(left_free, 1), gain)
-
-    @property
-    def rotations_suffice(self) -> bool:
-        """Whether homographies explain the pairs no better than rotations."""
-        return self.gain < _EXPLAINED
 
 
 def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
@@ -118,24 +90,54 @@ def solve(
     tied = _Tied.of(n_nodes, edges, anchor, frame_shape)
     if not len(tied.motions):
         return tied.alone(model)
-    if model.kind == "homography":
-        return tied.solution(_homographies(tied, start))
-    rotating = _rotations(tied, start, model)
-    if model.kind == "rotation":
-        return tied.solution(rotating, lambda: _compared(tied, start, rotating)[1])
-    free, evidence = _compared(tied, start, rotating)
-    chosen = rotating if free is None or evidence is None or evidence.rotations_suffice else free
-    return tied.solution(chosen, lambda: evidence)
+    if model.kind == "auto":
+        fits = _rivals(tied, start, model)
+        chosen = likeliest(_costs(fits), start is None)
+        return tied.solution(fits[chosen], chosen, lambda: Evidence.of(_costs(fits)))
+    fit = _fitted(tied, start, model)
+    return tied.solution(fit, model, partial(_compared, tied, start, model, fit))
 
 
-def _compared(tied: _Tied, start: FloatArray | None, rotating: _Fit) -> tuple[_Fit | None, Evidence | None]:
-    """Fit homographies, and compare rotations with them; None for both where no plane holds all frames."""
+def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[MotionModel, _Fit]:
+    """Fit the models of which "auto" chooses; further ones only if simple ones do not explain the pairs."""
+    fits: dict[MotionModel, _Fit] = {}
+    for rivals in model.rivals:
+        for rival in rivals:
+            # No plane holds all frames of a camera that turns far.
+            with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
+                fits[rival] = _fitted(tied, start, rival, list(fits.values()))
+        if fits and likeliest(_costs(fits), start is None).is_simple:
+            break
+    return fits
+
+
+def _compared(tied: _Tied, start: FloatArray | None, model: MotionModel, fit: _Fit) -> Evidence | None:
+    """Compare rotations with homographies; None for other models, and where no plane holds all frames."""
+    if model.kind != "rotation":
+        return None
     try:
         with np.errstate(all="ignore"):
-            free = _homographies(tied, start)
-            return free, Evidence.of(free, rotating)
+            free = _fitted(tied, start, HOMOGRAPHIES)
     except (ValueError, np.linalg.LinAlgError):
-        return None, None
+        return None
+    return Evidence.of(_costs({model: fit, HOMOGRAPHIES: free}))
+
+
+def _costs(fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, Cost]:
+    """Return the costs of models for the edges that the one with most unknowns keeps."""
+    richest = max(fits.values(), key=lambda fit: fit.adjustment.unknowns)
+    return {model: fit.adjustment.cost(np.minimum(fit.norms, OUTLIER), richest.kept) for model, fit in fits.items()}
+
+
+def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel, fits: Sequence[_Fit] = ()) -> _Fit:
+    """Fit a model; rotations through a lens begin with those without, if these are among the `fits`."""
+    if model.kind != "rotation":
+        return _planar(tied, start, model.planar)
+    without = next((fit.state for fit in fits if isinstance(fit.state, Rotations)), None)
+    if without is None:
+        return _rotations(tied, start, model)
+    adjustment = RotationAdjustment(tied.problem, model.seen_by(tied.frame_shape), model.unknown)
+    return tied.fit(adjustment, without)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,7 +212,7 @@ class _Tied:
             found, norms = adjustment.minimise(found, kept)
         return _Fit(adjustment, found, norms, kept)
 
-    def solution(self, fit: _Fit, compare: Callable[[], Evidence | None] = lambda: None) -> GraphSolution:
+    def solution(self, fit: _Fit, model: MotionModel, compare: Callable[[], Evidence | None]) -> GraphSolution:
         """Return a fit as the solution of the graph."""
         adjustment, found = fit.adjustment, fit.state
         homographies = np.full((len(self.located), 3, 3), np.nan)
@@ -219,35 +221,36 @@ class _Tied:
         outliers = tuple(int(position) for position in self.positions[~fit.kept])
         assess = partial(adjustment.assess, found, fit.norms, fit.kept)
         rotations = found if isinstance(found, Rotations) else None
-        return GraphSolution(homographies, self.located, outliers, residual_px, assess, rotations, compare)
+        return GraphSolution(homographies, self.located, outliers, residual_px, assess, model, rotations, compare)
 
     def alone(self, model: MotionModel) -> GraphSolution:
         """Return the solution of a single node."""
         homographies = np.full((len(self.located), 3, 3), np.nan)
         homographies[self.anchor] = np.eye(3)
-        rotations = None if model.kind == "homography" else Rotations(np.eye(3)[None], model.camera(self.frame_shape))
+        rotations = None if model.kind != "rotation" else Rotations(np.eye(3)[None], model.camera(self.frame_shape))
         nothing = Assessment(np.full((1, 8, 8), np.nan), np.full(1, np.nan), np.zeros(0))
-        return GraphSolution(homographies, self.located, (), 0.0, lambda: nothing, rotations)
+        return GraphSolution(homographies, self.located, (), 0.0, lambda: nothing, model, rotations)
 
 
-def _homographies(tied: _Tied, start: FloatArray | None) -> _Fit:
-    problem = tied.problem
-    state = tied.composed(problem.observed)
-    if start is not None:
-        state = normalised(inverse(start[tied.anchor]) @ start[tied.located])
-    return tied.fit(HomographyAdjustment(problem), state)
+def _planar(tied: _Tied, start: FloatArray | None, model: PlanarName) -> _Fit:
+    problem, shape = tied.problem, tied.frame_shape
+    if start is None:
+        state = tied.composed(nearest(model, problem.observed, shape))
+    else:
+        state = nearest(model, normalised(inverse(start[tied.anchor]) @ start[tied.located]), shape)
+    return tied.fit(PlanarAdjustment(problem, model), state)
 
 
 def _rotations(tied: _Tied, start: FloatArray | None, model: MotionModel) -> _Fit:
-    problem, camera = tied.problem, model.camera(tied.frame_shape)
-    adjustment = RotationAdjustment(problem, model.seen_by(tied.frame_shape), model.unknown)
+    problem, camera, shape = tied.problem, model.camera(tied.frame_shape), tied.frame_shape
+    adjustment = RotationAdjustment(problem, model.seen_by(shape), model.unknown)
     if model.focal_px is None and model.known is None:
         camera = adjustment.likeliest_camera(camera)
     if start is None:
-        rotations = tied.composed(nearest_rotations(camera.rotations(problem.observed)))
+        rotations = tied.composed(likely_rotations(camera, problem.observed, shape))
     else:
-        rotations = camera.rotations(inverse(start[tied.anchor]) @ start[tied.located])
-    return tied.fit(adjustment, Rotations(nearest_rotations(rotations), camera))
+        rotations = likely_rotations(camera, inverse(start[tied.anchor]) @ start[tied.located], shape)
+    return tied.fit(adjustment, Rotations(rotations, camera))
 
 
 def _tree(n_nodes: int, pairs: NDArray[np.integer], anchor: int) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
@@ -278,13 +281,20 @@ def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:
     return np.array(located, dtype=int).reshape(-1, 2)
 
 
-class HomographyAdjustment(Adjustment[FloatArray]):
-    """The least-squares problem of a graph whose nodes have any homographies; its state is these, (N, 3, 3) with h33 = 1.
+class PlanarAdjustment(Adjustment[FloatArray]):
+    """The least-squares problem of a graph of homographies of a planar model; its state is these, (N, 3, 3) with h33 = 1.
 
-    The unknowns of a node are p1..p8 of a small homography of its own frame, in coordinates of about unit size.
+    The unknowns of a node are those of a small motion of its own frame, in coordinates of about unit size.
     """
 
-    _n_node = 8
+    def __init__(self, problem: Problem, model: PlanarName) -> None:
+        """Set up the problem."""
+        super().__init__(problem)
+        self._basis = basis_of(model)
+
+    @property
+    def _n_node(self) -> int:
+        return int(self._basis.shape[1])
 
     def homographies(self, state: FloatArray) -> FloatArray:
         """Return the state."""
@@ -293,8 +303,7 @@ class HomographyAdjustment(Adjustment[FloatArray]):
     def changed(self, state: FloatArray, nodes: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the homographies after a step; nothing is shared."""
         del shared
-        unit = unit_coordinates(self._frame_shape)
-        return normalised(state @ (np.linalg.inv(unit) @ from_parameters(nodes) @ unit))
+        return moved(state, nodes, self._basis, self._frame_shape)
 
     def anchored(self, state: FloatArray) -> FloatArray:
         """Return the homographies, of which the anchor's is the identity."""
@@ -302,12 +311,18 @@ class HomographyAdjustment(Adjustment[FloatArray]):
         return state
 
     def generators(self, state: FloatArray) -> FloatArray:
-        """Return those of p1..p8 in unit coordinates: (8, 3, 3)."""
+        """Return those of the model in unit coordinates: (k, 3, 3)."""
         del state
-        return generators(self._frame_shape)
+        return np.asarray(np.einsum("pk,pij->kij", self._basis, generators(self._frame_shape)))
 
     def information(self, state: FloatArray, blocks: FloatArray) -> FloatArray:
-        """Convert (N, 8, 8) information on changes of nodes to that on p1..p8 of their homographies."""
+        """Convert (N, k, k) information on changes of nodes to that on p1..p8 of their homographies.
+
+        What the model does not move is as sure as all that it does together.
+        """
+        back = np.linalg.pinv(self._basis)
+        fixed = np.eye(8) - self._basis @ back
+        blocks = back.T @ blocks @ back + np.trace(blocks, axis1=1, axis2=2)[:, None, None] * fixed
         changed = state[:, None] @ generators(self._frame_shape)
         slopes = changed - state[:, None] * changed[..., 2:, 2:]
         to_parameters = parameters(np.eye(3) + slopes).transpose(0, 2, 1)

@@ -16,7 +16,8 @@ from photonpano.execution.threads import thread_pool
 from photonpano.geometry import corner_displacements, inverse
 from photonpano.motion.closures import closure_candidates
 from photonpano.motion.diagnosis import require_tied, solving
-from photonpano.motion.graph import Evidence, GraphOptions, GraphSolution, components, solve
+from photonpano.motion.evidence import Evidence
+from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
 from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
@@ -43,8 +44,7 @@ class LocatedLevel:
     std_px: FloatArray  # (N,) expected error of the corners of each located exposure; NaN for a single one
     frame_shape: tuple[int, int]  # (height, width) of a frame
     std_camera: FloatArray  # (5,) expected errors of the camera, see `Assessment`
-    # how well a camera that only turns explains the pairs, compared with homographies; None where they are not
-    evidence: Evidence | None
+    evidence: Evidence | None  # how well rival models of the motion explain the pairs; None where none are compared
     ambiguity: Ambiguity | None = None  # pairs that fit the scene at more than one place; None where there are none
 
     @property
@@ -109,17 +109,19 @@ def locate(
             anchor = int(largest[len(largest) // 2])
             start = registrar.to_plane
             solution = solve(len(groups), edges, anchor, shape, start, model)
+            evidence = solution.compare()
             candidates = closure_candidates(groups, solution, shape, graph)
         revisits = context.checkpoints.log(f"level-{level.number}-revisits", groups, candidates, solution.homographies)
         closures = tuple(registrar.closures(candidates, solution.homographies, pool, revisits))
     log.finish()
     with exposures.clock("locate"), solving(level.number):
         if closures:
-            alone, solution = solution, solve(len(groups), edges + closures, anchor, shape, start, model)
+            alone, model = solution, solution.model
+            solution = solve(len(groups), edges + closures, anchor, shape, start, model)
             fair = _not_outvoting(closures, edges, alone, solution)
             if fair != closures:
                 closures, solution = fair, solve(len(groups), edges + fair, anchor, shape, start, model)
-        assessed, evidence = solution.assess(), solution.compare()
+        assessed = solution.assess()
     return LocatedLevel(
         groups,
         edges + closures,

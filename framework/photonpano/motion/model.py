@@ -8,17 +8,19 @@ from typing import Literal
 import numpy as np
 
 from photonpano.geometry import Camera, camera_matrix
+from photonpano.motion.planar import PLANAR_NAMES, PlanarName
 
-ModelName = Literal["homography", "rotation", "auto"]
+ModelName = Literal["auto", "translation", "euclidean", "similarity", "affine", "homography", "rotation"]
 # Initial focal length, in longer sides of a frame.
 _FIRST_FOCAL = 3.0
+_FAR_FOCAL = 1e4  # that of a camera whose turns shift and roll the image
 
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
     """The model of the motion of a camera."""
 
-    kind: ModelName = "homography"  # any homographies, rotations of one camera, or "auto": the model that the pairs support
+    kind: ModelName = "homography"  # "auto" for the one that the pairs support
     focal_px: float | None = None  # of the camera; None if it is to be found
     centre_px: tuple[float, float] | None = None  # (x, y) of its principal point; None for the middle of the frames
     # k1, k2, p1, p2 of its lens; None for those that are to be found
@@ -29,6 +31,34 @@ class MotionModel:
     def unknown(self) -> tuple[int, ...]:
         """Which numbers of the camera are to be found: 0 for the focal length, 1 to 4 for k1, k2, p1, p2."""
         return tuple(index for index, number in enumerate((self.focal_px, *self.distortion)) if number is None)
+
+    @property
+    def name(self) -> str:
+        """Its name, such as "rotation with a lens" where the distortion is to be found."""
+        return f"{self.kind} with a lens" if self.finds_lens else self.kind
+
+    @property
+    def is_simple(self) -> bool:
+        """Whether nothing but shift and roll moves the image."""
+        return self.kind in ("translation", "euclidean")
+
+    @property
+    def planar(self) -> PlanarName:
+        """The group of its homographies; any but those of a rotation have one."""
+        if self.kind == "rotation" or self.kind == "auto":
+            raise ValueError(f"{self.kind} is no planar model")
+        return self.kind
+
+    @property
+    def rivals(self) -> tuple[tuple[MotionModel, ...], ...]:
+        """The models of which "auto" chooses: those to compare first, and further ones if these do not explain the pairs."""
+        planar = {name: replace(self, kind=name) for name in PLANAR_NAMES}
+        rotation = replace(self, kind="rotation")
+        if any(self.distortion) and self.focal_px is None:
+            return (rotation,), ()  # a lens that is given is in units of its focal length
+        lenses = () if any(self.distortion) else (replace(rotation, distortion=(None, None, 0.0, 0.0)),)
+        first = planar["translation"], planar["euclidean"], planar["homography"], rotation
+        return first, (planar["similarity"], planar["affine"], *lenses)
 
     @property
     def finds_lens(self) -> bool:
@@ -52,13 +82,23 @@ class MotionModel:
 
     def turning_camera(self, frame_shape: tuple[int, int]) -> Camera | None:
         """Return the camera that locators may use: one that only turns, of a focal length that is given or was found."""
-        if self.kind != "rotation" or (self.known is None and self.focal_px is None):
-            return None
-        return self.camera(frame_shape)
+        if self.known is None and self.focal_px is None:
+            if self.kind != "auto":
+                return None
+            middle = (frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2
+            return Camera(camera_matrix(_FAR_FOCAL * max(frame_shape), middle))
+        return self.camera(frame_shape) if self.kind in ("rotation", "auto") else None
 
     def knowing(self, camera: Camera | None) -> MotionModel:
-        """Return the model after a level that has found the camera, or None."""
-        return self if camera is None else replace(self, known=camera)
+        """Return the model after a level that has found the camera, or None.
+
+        Frames are then seen through its lens, if it has one: "auto" keeps to that, and goes on to find it.
+        """
+        if camera is None:
+            return self
+        if self.kind == "auto" and camera.distorts:
+            return replace(self, kind="rotation", distortion=(None, None, 0.0, 0.0), known=camera)
+        return replace(self, known=camera)
 
 
 HOMOGRAPHIES = MotionModel()

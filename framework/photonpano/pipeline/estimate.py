@@ -36,6 +36,8 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
         passes.without_shading,
         passes.in_changing_light,
         partial(passes.later_levels, journal=journal),
+        passes.through_found_lens,
+        passes.through_found_lens,
         passes.cut_at_jumps,
     ):
         n_decisions, state = len(state.decisions), passes.tried(state, each).state
@@ -76,13 +78,10 @@ def _start(source: Source, reference: int, journal: list[Decision], context: Con
 
 
 def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:
-    """Return which model `auto` took, for the record."""
+    """Return which model `auto` took at the last level, for the record."""
     located = results[-1].located
-    if plan.motion.model != "auto":
+    if plan.motion.model != "auto" or located.evidence is None:
         return []
-    taken = "homography" if located.solution.rotations is None else "rotation"
-    if located.evidence is None:
-        return [Decision("motion_model", taken, "the camera turns too far for homographies to one plane")]
-    gain = located.evidence.gain
-    reason = f"each unknown that homographies have more lowers the squared residuals {gain:.2g} times as much as noise would"
-    return [Decision("motion_model", taken, reason)]
+    rivals = [f"{name} {rival.chi2:.3g} ({rival.unknowns:,})" for name, rival in located.evidence.rivals.items()]
+    reason = "reduced chi-square of the pairs, and the number of unknowns: " + ", ".join(rivals)
+    return [Decision("motion_model", located.solution.model.name, reason)]

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion, light_of
+from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
 from photonpano.corrections.lighting import (
     corrected_light,
@@ -20,6 +20,7 @@ from photonpano.corrections.lighting import (
     measure_pixel_gain,
 )
 from photonpano.errors import CanvasTooLargeError, LocationError
+from photonpano.geometry import Camera, corners
 from photonpano.motion.timeline import Cut
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.state import State
@@ -31,6 +32,7 @@ from photonpano.values import Decision, Light
 
 logger = logging.getLogger(__name__)
 
+_SAME_LENS_PX = 0.1  # largest difference of lenses at the corners of a frame that does not matter
 _EXPLAINED = 0.9  # changing light is accepted if it lowers the reduced chi-square of the photons to this fraction
 
 
@@ -89,10 +91,17 @@ def tried(state: State, propose: Pass) -> Trial:
 
 
 def through_found_lens(state: State) -> Proposal | None:
-    """Run the first level again with the lens distortion that it found: without that, pairs are off by pixels."""
-    if not state.model.finds_lens or camera_of_motion(state.trajectory) is None:
+    """Run the last level again with the lens that it found, if that differs from the one through which it saw the frames.
+
+    Homographies between frames with a lens are not exact: pairs are off by pixels.
+    """
+    found, result = camera_of_motion(state.trajectory), state.results[-1]
+    if found is None or not found.distorts:
         return None
-    return Proposal(lambda: state.located(state.levels[:1], state.trajectory), worse=None)
+    edge, seen = corners(state.source.info.frame_shape), camera_of(result.exposures.source) or Camera(found.matrix)
+    if np.linalg.norm(found.ideal(edge) - seen.ideal(edge), axis=1).max() < _SAME_LENS_PX:
+        return None
+    return Proposal(lambda: state.located([result.level], state.trajectory), worse=None)
 
 
 def without_shading(state: State) -> Proposal | None:

@@ -143,7 +143,9 @@ def level_record(result: LevelResult) -> LevelRecord:
         "std_px": mean_px if np.isfinite(mean_px) else None,
         "residual_px": located.solution.residual_px,
         "camera": _camera_record(result),
-        "evidence": None if located.evidence is None else _fields(located.evidence),
+        "evidence": None
+        if located.evidence is None
+        else {name: _fields(each) for name, each in located.evidence.rivals.items()},
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
     }
 

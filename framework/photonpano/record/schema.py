@@ -67,15 +67,15 @@ class CameraRecord(TypedDict):
     std_distortion: Sequence[float]
 
 
-class EvidenceRecord(TypedDict):
-    """How rotations explain the pairs of a level, compared with homographies.
+class RivalRecord(TypedDict):
+    """How well a model of the motion explains the pairs of a level.
 
-    `rotation` and `homography` are the mean squares of the residuals, 1 where they are photon noise; `gain` is by how much each
-    additional unknown of the homographies lowers the sum of the squares, about 1 where the camera only turns.
+    `chi2` is their reduced chi-square, 1 where residuals are photon noise; `gain` is by how much each unknown that homographies
+    have more lowers the sum of the squares, in units of what these leave.
     """
 
-    rotation: float
-    homography: float
+    chi2: float
+    unknowns: int
     gain: float
 
 
@@ -104,7 +104,7 @@ class LevelRecord(TypedDict):
     std_px: float | None
     residual_px: float
     camera: CameraRecord | None
-    evidence: EvidenceRecord | None
+    evidence: Mapping[str, RivalRecord] | None
     seconds: Mapping[str, float]
 
 

@@ -269,12 +269,13 @@ def _contradicting(dropped: int, pairs: int) -> _Found:
 def _no_turn(run: _Run) -> _Found | None:
     if not run.levels or run.levels[-1].located.solution.rotations is None:
         return None
-    evidence = run.levels[-1].located.evidence
-    if evidence is None:
+    located = run.levels[-1].located
+    evidence, name = located.evidence, located.solution.model.name
+    if evidence is None or not {name, "homography"} <= evidence.rivals.keys():
         return None
-    residual, free = np.sqrt([evidence.rotation, evidence.homography]).tolist()
+    residual, free = np.sqrt([evidence.rivals[each].chi2 for each in (name, "homography")]).tolist()
     where = f"residuals in units of their noise; those of any homographies are {free:.2g}"
-    return _Found(residual, where, doubtful=not evidence.rotations_suffice)
+    return _Found(residual, where, doubtful=not evidence.suffices(name))
 
 
 @_doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")

@@ -49,6 +49,9 @@ def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
         return (f"the check of the {choice.label} raised {described(error)}",)
 
 
+_TURNING = ("rotation", "auto")  # the models that may find that a camera turns
+
+
 def check_settings(found: dict[str, Any], posed: bool, spec: Spec) -> None:
     """Check the settings of each section, None where they have problems, against each other; problems go to the spec."""
     motion, camera, output, render = (found[name] for name in ("motion", "camera", "output", "render"))
@@ -60,18 +63,22 @@ def check_settings(found: dict[str, Any], posed: bool, spec: Spec) -> None:
     if output is not None and output.keep is not None and posed:
         message = "exposures are those of the levels of a panorama; remove it, or write exposures: true"
         spec.wrong(spec.root.at("output", "keep"), message)
-    is_planar = motion is None or render is None or motion.model != "homography" or render.projection in ("auto", "planar")
-    if not is_planar:
-        message = f"a {render.projection} panorama needs motion.model: rotation or auto; one of homographies is planar"
+    if (
+        motion is not None
+        and render is not None
+        and motion.model not in _TURNING
+        and render.projection not in ("auto", "planar")
+    ):
+        message = f"a {render.projection} panorama needs motion.model: rotation or auto; one of {motion.model} is planar"
         spec.wrong(spec.root.at("render", "projection"), message)
 
 
 def _check_camera(motion: MotionSettings, camera: CameraSettings, posed: bool, spec: Spec) -> None:
     """Refuse what homographies and pose estimators cannot find of the camera, and a start that only homographies have."""
-    if motion.model != "homography":
-        if motion.start != "none":
-            message = f"{motion.start} is the start of motion.model: homography, not of {motion.model}"
-            spec.wrong(spec.root.at("motion", "start"), message)
+    if motion.model == "rotation" and motion.start != "none":
+        message = f"{motion.start} is a start of planes, not of motion.model: rotation"
+        spec.wrong(spec.root.at("motion", "start"), message)
+    if motion.model in _TURNING and not posed:
         return
     unfindable = "find needs motion.model: rotation or auto, which measure the camera; give a number here"
     without_focal = "distortion is in units of the focal length: give camera.focal_px"

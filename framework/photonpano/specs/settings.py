@@ -45,10 +45,12 @@ class GraphSettings(Config):
 class MotionSettings(Config):
     """What the motion of the camera may be."""
 
-    model: Literal["homography", "rotation", "auto"] = Field(
-        "homography",
-        description="homography lets each frame have any homography; rotation is for a camera that only turns, by any angle, "
-        "and is more accurate there; auto takes rotation where homographies explain the pairs no better",
+    model: Literal["auto", "translation", "euclidean", "similarity", "affine", "homography", "rotation"] = Field(
+        "auto",
+        description="translation, euclidean (shift and roll), similarity (and zoom), affine or homography are for flat scenes, "
+        "from the fewest numbers a frame to the most; rotation is for a camera that only turns, by any angle, about one focal "
+        "length; auto takes the one that explains the pairs of exposures at the price of its unknowns, with a lens if they "
+        "show one",
     )
     start: Literal["none", "constant-velocity"] = Field(
         "none",

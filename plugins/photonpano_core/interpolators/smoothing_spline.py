@@ -74,7 +74,8 @@ class SmoothingSplineInterpolator:
             derivatives = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
             covariances = _covariances(information, _TO_MODES @ derivatives)
         paths = transform_points(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
-        moved = _smoothed_modes(instants, paths, covariances, _QUIET) @ _TO_MODES
+        still = np.ptp(paths[:, _QUIET] - paths[:, :2] * 0, axis=0).max() < 1e-6
+        moved = _smoothed_modes(instants, paths, covariances, _QUIET, 1.0 if still else None) @ _TO_MODES
         return _from_corners(self._corners, moved.reshape(-1, 4, 2))
 
 
