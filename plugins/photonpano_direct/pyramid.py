@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -12,17 +13,19 @@ from photonpano import FloatArray, Homography, VirtualExposure
 from photonpano.compiling import compiled
 from photonpano.geometry import run_from, sample_run, visible_columns
 from photonpano.locating import SMALLEST_SIDE, View, view_pyramid
-from photonpano.photometry import Similarity, autocorrelation, similarity_of, without_local_mean
+from photonpano.photometry import LOCAL_PX, Similarity, autocorrelation, similarity_of, without_local_mean
 from photonpano_direct.moments import Image, Layer, differentiate
 
-_COMPARED = 2  # layer on which aligned images are compared: coarse, so that noise and motion blur hardly matter
+# Aligned images are compared on the coarsest layer, of the first three, with this shorter side: on a coarse one, noise and
+# motion blur hardly matter.
+_COMPARED, _COMPARED_PX = 2, 60
 
 
 class Details(NamedTuple):
     """A layer without its local mean."""
 
     image: Image  # (H, W), the layer without its local mean; 0 at masked pixels
-    weight: Image  # (H, W), that of the layer
+    weight: Image  # (H, W), that of the layer, 0 where the local mean is one-sided
     gain: float  # fraction of the variance of white noise that the blur leaves
     autocorrelation: FloatArray
 
@@ -35,8 +38,13 @@ class Details(NamedTuple):
 
 def details_of(layer: Layer) -> Details:
     """Return the details of a layer."""
-    image = without_local_mean(layer.image, layer.weight > 0)
-    return Details(image, layer.weight, 1 / (4 * np.pi * layer.blur_px**2), autocorrelation(image))
+    seen = layer.weight > 0
+    image = without_local_mean(layer.image, seen)
+    # Near a border the mean is one-sided: a gradient looks like a structure there, in any two images.
+    inside = cv2.erode(seen.astype(np.uint8), np.ones((LOCAL_PX, LOCAL_PX), np.uint8), borderValue=0) > 0
+    image = np.where(inside, image, np.float32(0))
+    weight = np.where(inside, layer.weight, np.float32(0))
+    return Details(image, weight, 1 / (4 * np.pi * layer.blur_px**2), autocorrelation(image))
 
 
 def similarity_under(homography: Homography, moving: Details, fixed: Details) -> Similarity:
@@ -90,13 +98,18 @@ class Pyramid(NamedTuple):
     @property
     def compared(self) -> int:
         """Number of the layer on which aligned images are compared."""
-        return min(_COMPARED, len(self.layers) - 1)
+        return _compared(self.layers)
 
 
 def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> Pyramid:
     """Return an exposure, blurred against photon noise, and its halves; small images have fewer than `levels` layers."""
     layers = tuple(_layer_of(view) for view in view_pyramid(exposure, blur_px, levels, SMALLEST_SIDE))
-    return Pyramid(layers, details_of(layers[min(_COMPARED, len(layers) - 1)]))
+    return Pyramid(layers, details_of(layers[_compared(layers)]))
+
+
+def _compared(layers: Sequence[Layer]) -> int:
+    """Return the number of the layer on which aligned images are compared."""
+    return max((n for n, layer in enumerate(layers[: _COMPARED + 1]) if min(layer.image.shape) >= _COMPARED_PX), default=0)
 
 
 def _layer_of(view: View) -> Layer:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from photonpano.motion.adjustment import Cost
 from photonpano.motion.model import MotionModel
 
-# An unknown must lower the squared residuals by this much, in units of what homographies leave, and one that all exposures
-# share by more, since pairs have noise in common: in noise, an unknown of an exposure lowers them by 0.3 to 2. Before any
-# motion is known, exposures are blurred by it, which bends pairs by more than photon noise.
-_PRICE, _PRICE_AT_FIRST, _SHARED = 8.0, 40.0, 3.0
+# An unknown of an exposure must lower the squared residuals by this much, in units of what homographies leave: noise, which
+# pairs have in common, lets it lower them by 0.3 to 2. One that all exposures share must lower them by that much in units of
+# photon noise: it explains what all pairs do alike.
+_PRICE, _SHARED = 8.0, 24.0
 # A model suffices if homographies lower the squared residuals by less than this for each unknown that they have more.
 _EXPLAINED = 20.0
 
@@ -52,13 +52,13 @@ class Evidence:
         return self.rivals[model].gain < _EXPLAINED
 
 
-def likeliest(costs: Mapping[MotionModel, Cost], first: bool) -> MotionModel:
-    """Return the model that explains most at the price of its unknowns; `first`: before any motion is known."""
-    price, scale = _PRICE_AT_FIRST if first else _PRICE, _scale(costs)
+def likeliest(costs: Mapping[MotionModel, Cost]) -> MotionModel:
+    """Return the model that explains most at the price of its unknowns."""
+    scale = _scale(costs)
 
     def score(model: MotionModel) -> float:
         cost = costs[model]
-        return cost.squares / scale + price * (cost.unknowns + (_SHARED - 1) * cost.shared)
+        return (cost.squares + _SHARED * cost.shared) / scale + _PRICE * (cost.unknowns - cost.shared)
 
     return min(costs, key=score)
 

@@ -92,7 +92,7 @@ def solve(
         return tied.alone(model)
     if model.kind == "auto":
         fits = _rivals(tied, start, model)
-        chosen = likeliest(_costs(fits), start is None)
+        chosen = likeliest(_costs(fits))
         return tied.solution(fits[chosen], chosen, lambda: Evidence.of(_costs(fits)))
     fit = _fitted(tied, start, model)
     return tied.solution(fit, model, partial(_compared, tied, start, model, fit))
@@ -106,7 +106,7 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
             # No plane holds all frames of a camera that turns far.
             with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
                 fits[rival] = _fitted(tied, start, rival, list(fits.values()))
-        if fits and likeliest(_costs(fits), start is None).is_simple:
+        if fits and likeliest(_costs(fits)).is_simple:
             break
     return fits
 

@@ -123,6 +123,7 @@ class VirtualExposures:
     previous: Trajectory | None  # the motion known so far; None at the first level
     clock: Stopwatch  # adds up the time that merging takes
     timeline: Timeline | None = None  # where the image jumps; None if it is not known to
+    start: Trajectory | None = None  # along which exposures are merged while no motion is known; None if nothing shows it
 
     @property
     def frame_shape(self) -> tuple[int, int]:
@@ -143,7 +144,7 @@ class VirtualExposures:
         """
         level = self.level
         with (clock or self.clock)("merge"), level.attributing("merger"):
-            exposure = level.merger.merge(self.source, self.groups[index], self.previous, level.scale)
+            exposure = level.merger.merge(self.source, self.groups[index], self.previous or self.start, level.scale)
             return EXPOSURE.require(exposure, Asked(self.groups[index], level.scale, self.frame_shape))
 
 
@@ -154,6 +155,7 @@ def merge(
     previous: Trajectory | None,
     clock: Stopwatch,
     timeline: Timeline | None = None,
+    start: Trajectory | None = None,
 ) -> VirtualExposures:
     """Plan the virtual exposures of a level: its groups, merged along the motion known so far (paper, section 4, "Merge")."""
-    return VirtualExposures(level, source, groups, previous, clock, timeline)
+    return VirtualExposures(level, source, groups, previous, clock, timeline, start)

@@ -22,7 +22,7 @@ from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
-from photonpano.motion.tracking import starting_motion
+from photonpano.motion.tracking import StartingMotion
 from photonpano.text import listed
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated
 
@@ -75,14 +75,19 @@ class LocatedLevel:
 
 
 def locate(
-    exposures: VirtualExposures, graph: GraphOptions, context: Context, model: MotionModel = HOMOGRAPHIES
+    exposures: VirtualExposures,
+    graph: GraphOptions,
+    context: Context,
+    model: MotionModel = HOMOGRAPHIES,
+    start: StartingMotion | None = None,
 ) -> LocatedLevel:
     """Register the pairs of a level, and solve the motion graph (paper, section 4, "Locate").
 
     Each exposure is merged and described once, in order, a few ahead of the pairs that need it, and released after its last
-    pair. A pair that the first locator does not locate is passed to the next. Once the graph is solved, pairs of exposures that
-    overlap at different times are registered as loop closures, and the graph is solved again. Fallback locators and loop
-    closures need exposures that were released; these are merged again.
+    pair. At the first level, pairs begin with the `start` that short spans show, if any. A pair that the first locator does not
+    locate is passed to the next. Once the graph is solved, pairs of exposures that overlap at different times are registered as
+    loop closures, and the graph is solved again. Fallback locators and loop closures need exposures that were released; these
+    are merged again.
 
     Raises:
         LocationError: exposures cannot be tied to each other, and `graph.disconnected` is "error".
@@ -93,11 +98,11 @@ def locate(
     given = groups, pairs, exposures.previous_homographies(), exposures.timeline, camera_of(exposures.source)
     log = context.checkpoints.log(f"level-{level.number}", *given)
     with thread_pool(context.threads) as pool:
-        registrar = Registrar(exposures, log, context)
+        registrar = Registrar(exposures, log, context, start)
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
-        _require_motion(level, edges, shape, partial(_seen_px, exposures, edges, context))
+        _require_motion(level, edges, shape, partial(_seen_px, exposures.groups, edges, start))
         with exposures.clock("locate"), solving(level.number):
             edges = _checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
@@ -107,8 +112,8 @@ def locate(
             )
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
-            start = registrar.to_plane
-            solution = solve(len(groups), edges, anchor, shape, start, model)
+            to_plane = registrar.to_plane
+            solution = solve(len(groups), edges, anchor, shape, to_plane, model)
             evidence = solution.compare()
             candidates = closure_candidates(groups, solution, shape, graph)
         revisits = context.checkpoints.log(f"level-{level.number}-revisits", groups, candidates, solution.homographies)
@@ -117,10 +122,10 @@ def locate(
     with exposures.clock("locate"), solving(level.number):
         if closures:
             alone, model = solution, solution.model
-            solution = solve(len(groups), edges + closures, anchor, shape, start, model)
+            solution = solve(len(groups), edges + closures, anchor, shape, to_plane, model)
             fair = _not_outvoting(closures, edges, alone, solution)
             if fair != closures:
-                closures, solution = fair, solve(len(groups), edges + fair, anchor, shape, start, model)
+                closures, solution = fair, solve(len(groups), edges + fair, anchor, shape, to_plane, model)
         assessed = solution.assess()
     return LocatedLevel(
         groups,
@@ -177,11 +182,9 @@ def _checked_fallbacks(
     return tuple(map(checked, edges))
 
 
-def _seen_px(exposures: VirtualExposures, edges: Sequence[Edge], context: Context) -> float:
-    """Return the largest motion of a pair at level 1 by the velocities of short spans, in px; 0 where these show none."""
-    if exposures.previous is not None:
-        return 0.0
-    start, instants = starting_motion(exposures.source, exposures.groups, context), instants_of(exposures.groups)
+def _seen_px(groups: Sequence[Group], edges: Sequence[Edge], start: StartingMotion | None) -> float:
+    """Return the largest motion of a pair by the velocities of short spans, in px; 0 where these show none."""
+    instants = instants_of(groups)
     moved = [start.between(instants[edge.moving], instants[edge.fixed]) for edge in edges] if start else []
     return max((float(np.hypot(*motion[:2, 2])) for motion in moved if motion is not None), default=0.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from photonpano.capture import seen_through
@@ -18,6 +18,7 @@ from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
 from photonpano.motion.timeline import Timeline
+from photonpano.motion.tracking import StartingMotion, starting_motion
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.values import FloatArray, Group
 
@@ -77,8 +78,10 @@ def estimate_motion(
         model = model.knowing(camera_of_motion(previous))
         groups = timeline.parts(resample(level, source.info.n_frames, clock))
         turning = level.turning(model.turning_camera(source.info.frame_shape))
-        exposures = merge(turning, through_lens(source, model), groups, previous, clock, timeline)
-        located = locate(exposures, graph, context, model)
+        seen = through_lens(source, model)
+        start = None if previous is not None else _start(seen, groups, context, timeline, clock)
+        exposures = merge(turning, seen, groups, previous, clock, timeline, start)
+        located = locate(exposures, graph, context, model, start)
         trajectory = interpolate(level, located, timeline, reference, clock)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
@@ -89,6 +92,15 @@ def estimate_motion(
         if until_converged and results[-1].converged and level.scale == levels[-1].scale:
             break
     return results
+
+
+def _start(
+    source: Source, groups: Sequence[Group], context: Context, timeline: Timeline, clock: Stopwatch
+) -> StartingMotion | None:
+    """Measure the motion that short spans show before the first level, once; None if they show none."""
+    with clock("locate"):
+        found = context.checkpoints.once("start", partial(starting_motion, source, groups, context), groups)
+    return None if found is None else replace(found, timeline=timeline)
 
 
 def through_lens(source: Source, model: MotionModel) -> Source:

@@ -17,7 +17,7 @@ from photonpano.motion.diagnosis import Contrast
 from photonpano.motion.exposure_tasks import Descriptions, ExposureTasks, Notes, Pair
 from photonpano.motion.level import FrameHomography, VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of
-from photonpano.motion.tracking import Place, StartingMotion, starting_motion
+from photonpano.motion.tracking import Place, StartingMotion
 from photonpano.values import Decision, Edge, FloatArray, Located, NotLocated
 
 ResultT = TypeVar("ResultT")
@@ -45,8 +45,11 @@ class Registrar:
         to_plane: (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level.
     """
 
-    def __init__(self, exposures: VirtualExposures, log: Log, context: Context) -> None:
-        """Prepare to register; `log` has the first exposures in order, as `Registered`, and receives the others."""
+    def __init__(self, exposures: VirtualExposures, log: Log, context: Context, start: StartingMotion | None = None) -> None:
+        """Prepare to register; `log` has the first exposures in order, as `Registered`, and receives the others.
+
+        `start` is what short spans show of the motion, at the first level.
+        """
         self._executor, self._exposures, self._clock, self._log = context.executor, exposures, exposures.clock, log
         self._at_once = context.executor.at_once(len(exposures.groups))
         tasks = ExposureTasks(exposures, independent_share(exposures.groups))
@@ -58,7 +61,7 @@ class Registrar:
         self._tracks = exposures.previous is None and any(
             isinstance(locator.component, KeepsHypotheses) for locator in exposures.level.locators
         )
-        self._start = context.executor.share(self._starting_motion(context)) if self._tracks else None
+        self._start = context.executor.share(start) if self._tracks else None
         self._places: dict[int, Place] = {}
         self._kept: dict[int, Descriptions] = {}
         self.contrasts: dict[int, Contrast] = {}
@@ -218,11 +221,3 @@ class Registrar:
         if self.to_plane is None or self._from_plane is None:
             return None
         return FrameHomography(self._from_plane[fixed] @ self.to_plane[moving])
-
-    def _starting_motion(self, context: Context) -> StartingMotion | None:
-        """Measure how the image moves, before any exposure is located; None if that shows nothing, or all are located."""
-        exposures = self._exposures
-        if len(self._log.found) == len(exposures.groups):
-            return None
-        with self._clock("locate"):
-            return starting_motion(exposures.source, exposures.groups, context, exposures.timeline)

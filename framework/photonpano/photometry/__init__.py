@@ -14,6 +14,7 @@ from photonpano.photometry.pictures import (
 )
 from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, Factor, IntensityResponse
 from photonpano.photometry.similarity import (
+    LOCAL_PX,
     Similarity,
     autocorrelation,
     hann_window,
@@ -25,6 +26,7 @@ from photonpano.photometry.similarity import (
 )
 
 __all__ = [
+    "LOCAL_PX",
     "MAX_FRAMES",
     "BinaryResponse",
     "BinarySumResponse",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano.values import BoolArray, FloatArray, VirtualExposure
 
-_LOCAL_PX = 13  # side of the square whose mean is subtracted from each pixel before images are compared, px
+LOCAL_PX = 13  # side of the square whose mean is subtracted from each pixel before images are compared, px
 _MIN_INDEPENDENT = 50  # with fewer independent pixels, a correlation is not estimated
 _MIN_SIGMA = 5.0  # least variance of a scene, in standard errors of the variance of its noise
 _LAGS = 4  # the largest lag of an autocorrelation is the side of the image over this
@@ -62,9 +62,10 @@ class Similarity(NamedTuple):
         Args:
             min_correlation: the value of the option `min_agreement`.
         """
-        if self.correlation < min_correlation:
-            if not self.correlation:
-                return "where the images overlap after alignment, nothing stands out from photon noise"
+        if self.score < _MIN_SCORE and not self.correlation:
+            return "where the images overlap after alignment, nothing stands out from photon noise"
+        # A few structures may be certain where, all over the image, the scene varies by no more than its noise.
+        if self.correlation and self.correlation < min_correlation:
             return (
                 f"after alignment the similarity of the images is {self.correlation:.2f}, "
                 f"less than min_agreement = {min_correlation:g}"
@@ -92,7 +93,7 @@ def without_local_mean(image: NDArray[np.float32], seen: BoolArray) -> NDArray[n
     import cv2
 
     def local_mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        return np.asarray(cv2.blur(values, (_LOCAL_PX, _LOCAL_PX)), np.float32)
+        return np.asarray(cv2.blur(values, (LOCAL_PX, LOCAL_PX)), np.float32)
 
     mask = seen.astype(np.float32)
     seen_share = np.maximum(local_mean(mask), np.float32(1e-6))

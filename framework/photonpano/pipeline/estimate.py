@@ -18,6 +18,7 @@ from photonpano.pipeline.state import State, model_of
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision
 
+_MOST_LENSES = 4  # times that the last level is run again, through the lens that it has found
 START = "start"  # name of the decision on the initial motion
 
 
@@ -31,15 +32,15 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
     timeline = timeline_of(source, context)
     start = None if plan.motion.start == "none" else _start(source, reference, journal, context)
     state = State(plan, source, context, reference, levels, timeline, model_of(plan), start).located(levels[:1], start)
-    for each in (
+    tried: tuple[passes.Pass, ...] = (
         passes.through_found_lens,
         passes.without_shading,
         passes.in_changing_light,
         partial(passes.later_levels, journal=journal),
-        passes.through_found_lens,
-        passes.through_found_lens,
+        *[passes.through_found_lens] * _MOST_LENSES,
         passes.cut_at_jumps,
-    ):
+    )
+    for each in tried:
         n_decisions, state = len(state.decisions), passes.tried(state, each).state
         journal += state.decisions[n_decisions:]
     journal += [*state.timeline.decisions, *_model_decisions(plan, state.results)]

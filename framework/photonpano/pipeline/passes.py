@@ -32,7 +32,7 @@ from photonpano.values import Decision, Light
 
 logger = logging.getLogger(__name__)
 
-_SAME_LENS_PX = 0.1  # largest difference of lenses at the corners of a frame that does not matter
+_SAME_LENS_PX = 0.05  # largest difference of what two lenses do to a frame that does not matter
 _EXPLAINED = 0.9  # changing light is accepted if it lowers the reduced chi-square of the photons to this fraction
 
 
@@ -98,8 +98,10 @@ def through_found_lens(state: State) -> Proposal | None:
     found, result = camera_of_motion(state.trajectory), state.results[-1]
     if found is None or not found.distorts:
         return None
-    edge, seen = corners(state.source.info.frame_shape), camera_of(result.exposures.source) or Camera(found.matrix)
-    if np.linalg.norm(found.ideal(edge) - seen.ideal(edge), axis=1).max() < _SAME_LENS_PX:
+    seen, frame = camera_of(result.exposures.source) or Camera(found.matrix), corners(state.source.info.frame_shape)
+    # From the middle to the corners: k1 and k2 may cancel each other somewhere.
+    places = frame.mean(axis=0) + np.linspace(0.25, 1, 4)[:, None, None] * (frame - frame.mean(axis=0))
+    if np.linalg.norm(found.ideal(places) - seen.ideal(places), axis=-1).max() < _SAME_LENS_PX:
         return None
     return Proposal(lambda: state.located([result.level], state.trajectory), worse=None)
 

@@ -8,7 +8,7 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from photonpano.contracts.protocols import Source
 from photonpano.execution.context import Context
@@ -34,7 +34,8 @@ _SPANS = 16  # a window is divided into 16 spans: between two of them the image 
 _PEAK_PX = 1.0  # standard deviation of the peak of the phase correlation, in binned pixels
 # Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5.
 _SIGNIFICANT = 7.0
-_RIVAL = 0.6  # least height of the peak of a hypothesis, relative to the highest
+# Least height of the peak of a hypothesis, relative to the highest, and of one that may be as likely.
+_HYPOTHESIS, _RIVAL = 0.35, 0.6
 _LEAST_EXTENT = 0.05  # a part of the image that moves otherwise is a hypothesis if its extent is this share of the other part's
 _DISTINCT_PX = 4.0  # least difference of two motions over a window, in binned pixels
 # Shift between spans that is exact enough, in binned pixels; spans are doubled until then.
@@ -43,6 +44,9 @@ _TRACKED_PX = 2.0  # a peak of doubled spans lies within this many binned pixels
 _CONTINUITY_PX = 1.0  # standard deviation of the change of a shift, in binned pixels, from one window to the next
 _CONTINUITY_SHARE = 0.3  # its largest value, relative to the difference of two hypotheses
 _SLOWER = 3.0  # motions that are faster than the slowest by this factor are left out
+# A window is an outlier if it differs by this many times the median difference from its neighbours, of five windows at least.
+_LEAP, _FEWEST_STEADY = 6.0, 5
+_FAR = 1e6  # frames beyond the first and last instant within which the velocity is constant
 _TIE = 4.0  # difference of the log likelihoods of hypotheses below which both are kept
 
 
@@ -82,6 +86,22 @@ class StartingMotion:
             shift += self.timeline.shift_between(fixed, moving)
         return translation(*-shift)
 
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the shifts of N instants to the frame of the first known one, as homographies: (N, 3, 3)."""
+        instants = np.asarray(frame_indices, dtype=np.float64)
+        far = np.concatenate([[self.instants[0] - _FAR], self.instants, [self.instants[-1] + _FAR]])
+        velocities = np.pad(self.velocities, ((1, 1), (0, 0)), mode="edge")
+        # The trapezoid rule is exact, since velocities are linear between these instants.
+        travelled = np.concatenate(
+            [np.zeros((1, 2)), np.cumsum(np.diff(far)[:, None] * (velocities[1:] + velocities[:-1]) / 2, axis=0)]
+        )
+        before = np.clip(np.searchsorted(far, instants) - 1, 0, len(far) - 2)
+        here = np.stack([np.interp(instants, far, each) for each in velocities.T], axis=1)
+        shifts = travelled[before] + (instants - far[before])[:, None] * (velocities[before] + here) / 2 - travelled[1]
+        found = np.tile(np.eye(3), (len(instants), 1, 1))
+        found[:, :2, 2] = -shifts
+        return found
+
     def alternative_px(self, moving: float, fixed: float) -> float:
         """Return how far from that motion an equally likely one is, in px; 0 if there is none."""
         points = self._points(moving, fixed)
@@ -114,7 +134,9 @@ def starting_motion(
     if not known:
         return None
     velocities, alternatives = _continuous([each for _, each in known])
-    return StartingMotion(np.array([instant for instant, _ in known]), velocities, alternatives, 1.5 * length, timeline)
+    instants, px_per_frame = np.array([instant for instant, _ in known]), max(each.px_per_frame for _, each in known)
+    steady = _steady(instants, velocities, px_per_frame)
+    return StartingMotion(instants[steady], velocities[steady], alternatives[steady], 1.5 * length, timeline)
 
 
 def _hypotheses(source: Source, length: int, start: int, offered: Sequence[FloatArray] = ()) -> Hypotheses | None:
@@ -187,7 +209,7 @@ def _velocities(
     while len(spectra) >= 2:
         surface = _surface(spectra, shape)
         if surface is not None and surface.max() >= _SIGNIFICANT:
-            shifts, heights = correlation_peaks(surface, _RIVAL)
+            shifts, heights = correlation_peaks(surface, _HYPOTHESIS)
             return _refined(spectra, shape, shifts) / doubled, heights, doubled
         spectra, doubled = _summed_in_twos(spectra), 2 * doubled
     return None
@@ -244,9 +266,28 @@ def _continuous(windows: Sequence[Hypotheses]) -> tuple[FloatArray, FloatArray]:
     for index, (each, total) in enumerate(zip(windows, map(np.add, forward, reversed(backward)), strict=True)):
         best, *others = np.argsort(-total, kind="stable")
         velocities[index] = each.velocities[best]
+        others = [other for other in others if each.heights[other] >= _RIVAL]
         if others and total[best] - total[others[0]] < _TIE:
             alternatives[index] = each.velocities[others[0]]
     return velocities, alternatives
+
+
+def _steady(instants: FloatArray, velocities: FloatArray, px_per_frame: float) -> NDArray[np.integer]:
+    """Return which windows are no outliers: a single one among others that moves by much more than they change."""
+    kept = np.arange(len(instants))
+    while len(kept) >= _FEWEST_STEADY:
+        times, values = instants[kept], velocities[kept]
+        before, after = np.arange(len(kept)) - 1, np.arange(len(kept)) + 1
+        before[0], after[0], before[-1], after[-1] = 1, 2, len(kept) - 3, len(kept) - 2
+        share = ((times - times[before]) / (times[after] - times[before]))[:, None]
+        away = np.linalg.norm(values - (1 - share) * values[before] - share * values[after], axis=1)
+        # Beyond an end, what is foreseen is off by twice as much as between two windows.
+        away[[0, -1]] /= 2
+        worst = int(away.argmax())
+        if away[worst] < max(_LEAP * float(np.median(away)), px_per_frame):
+            break
+        kept = np.delete(kept, worst)
+    return kept
 
 
 def _link(before: Hypotheses, after: Hypotheses) -> FloatArray:

@@ -104,7 +104,7 @@ def test_resumed_run_repeats_nothing_that_was_kept(plan_of: Callable[..., Plan],
         with pytest.raises(Killed):
             run(killed)
     monkeypatch.setattr(DirectLocator, "register", repeats)
-    for step in ("motion.registration.starting_motion", "residuals.refinement.measure", "merging.panorama.accumulate"):
+    for step in ("motion.loop.starting_motion", "residuals.refinement.measure", "merging.panorama.accumulate"):
         monkeypatch.setattr(f"photonpano.{step}", repeats)
     run(killed, resume=True)
 
@@ -116,7 +116,7 @@ def test_last_level_with_other_settings_starts_from_the_first_and_a_finished_run
     other = {"levels": [{}, {"resample": {"with": {"group_size": 30}}}], "render": {"scale": 0.5}}
     anew = run(plan_of("anew", **other))
     with monkeypatch.context() as patch:
-        patch.setattr("photonpano.motion.registration.starting_motion", lambda *_: pytest.fail("level 1 was found before"))
+        patch.setattr("photonpano.motion.loop.starting_motion", lambda *_: pytest.fail("level 1 was found before"))
         again = run(plan_of("scan", **other), from_level=2)
     assert bytes_of(again) == bytes_of(anew)
     assert path_of(again.directory).is_dir()
