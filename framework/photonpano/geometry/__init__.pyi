@@ -30,6 +30,7 @@ from .homographies import rescaling as rescaling
 from .homographies import scaled_ahead as scaled_ahead
 from .homographies import slopes as slopes
 from .homographies import step_motions as step_motions
+from .homographies import steps_of as steps_of
 from .homographies import steps_px as steps_px
 from .homographies import transform_points as transform_points
 from .homographies import translation as translation

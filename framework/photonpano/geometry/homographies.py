@@ -76,6 +76,15 @@ def step_motions(steps: ArrayLike, shape: tuple[int, int]) -> Homography:
     return np.asarray(centre @ motions @ inverse(centre))
 
 
+def steps_of(motions: Homography, shape: tuple[int, int]) -> FloatArray:
+    """Return the steps of small motions of a frame, (..., 3, 3) to (..., 4): see `step_motions`."""
+    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    points = transform_points(motions, middle + np.array([[0, 0], [-0.5, 0], [0.5, 0]]))
+    along = points[..., 2, :] - points[..., 1, :]
+    roll, zoom = np.arctan2(along[..., 1], along[..., 0]), np.hypot(along[..., 0], along[..., 1]) - 1
+    return np.concatenate([points[..., 0, :] - middle, np.stack([roll, zoom], axis=-1)], axis=-1)
+
+
 @cache
 def rescaling(scale: float) -> Homography:
     """Return the map from pixels of an image to pixels of the same image rescaled: `(p + 0.5) * scale - 0.5`."""

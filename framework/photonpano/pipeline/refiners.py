@@ -22,6 +22,8 @@ from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Refined
 
 MAX_ROUNDS = 6  # maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against
+# A later correction that moves frames by less than this on average needs no new panorama: residuals change in proportion to it.
+_LINEAR_PX = 0.1
 
 
 def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
@@ -55,8 +57,10 @@ def _corrected(state: State, refiner: NamedRefiner, place: int, number: int) -> 
         return None
     homographies, std_px = found.homographies, found.std_px
     motion = replace(state.motion, trajectory=FrameTrajectory(homographies), homographies=homographies, std_px=std_px)
+    if number > 1 and _change_px(state.motion, motion) < _LINEAR_PX:
+        return Proposal(lambda: replace(state, refined=motion, known_fit=state.fit.moved(motion)), None, summary=found.summary)
     rejection = f"a correction of {refiner.origin} is not used"
-    return Proposal(lambda: replace(state, refined=motion), rejection=rejection, summary=found.summary)
+    return Proposal(lambda: replace(state, refined=motion, known_fit=None), rejection=rejection, summary=found.summary)
 
 
 def _refined(refiner: NamedRefiner, state: State, number: int) -> Refined | None:

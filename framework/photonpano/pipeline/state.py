@@ -41,6 +41,7 @@ class State:
         outdated: whether the source was corrected since these levels were located.
         vignette: by which the source is divided.
         refined: the motion corrected by refiners; None for that of the last level.
+        known_fit: how well that explains the photons, if it is known without measuring them.
     """
 
     plan: Plan
@@ -56,6 +57,7 @@ class State:
     vignette: Vignette | None = None
     decisions: tuple[Decision, ...] = ()
     refined: FrameMotion | None = None
+    known_fit: MotionFit | None = None
 
     def located(self, levels: Sequence[Level], previous: Trajectory | None) -> State:
         """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels."""
@@ -91,7 +93,7 @@ class State:
     @cached_property
     def fit(self) -> MotionFit:
         """How well the motion explains the photons; `CanvasTooLargeError` or `LocationError` if the panorama has no canvas."""
-        return MotionFit(self.view.source, self.motion, int(self.plan.run.memory), self.view.context)
+        return self.known_fit or MotionFit(self.view.source, self.motion, int(self.plan.run.memory), self.view.context)
 
 
 def model_of(plan: Plan) -> MotionModel:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -81,6 +81,10 @@ class Residuals:
         right = self.gradient[:, :N_STEPS] - mixed * (weight * self.gradient[:, N_STEPS])[:, None]
         steps = np.linalg.solve(information + np.diag(_PRIOR[:N_STEPS]), right[..., None])[..., 0]
         return SpanResiduals(self.spans, steps, information)
+
+    def moved(self, steps: FloatArray) -> Residuals:
+        """Return the residuals after steps (S, 4) of the spans, to first order; chi-square stays that before them."""
+        return replace(self, gradient=self.gradient - (self.normal[:, :, :N_STEPS] @ steps[..., None])[..., 0])
 
     def gains(self) -> tuple[FloatArray, FloatArray]:
         """Return the relative brightness of each span minus 1, and its standard deviation by photon noise: (S,) each."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +15,7 @@ from scipy.ndimage import minimum_filter1d
 from photonpano.contracts.protocols import Refiner, Source
 from photonpano.execution.context import Context
 from photonpano.filtering import SYSTEMATIC_PX
-from photonpano.geometry import Canvas, corners
+from photonpano.geometry import Canvas, corners, inverse, steps_of
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
@@ -210,6 +211,17 @@ class MotionFit:
         std_px = np.hypot(bounded_std_px(std_px, residuals), unexplained_px(residuals, len(std_px)))
         motion = replace(self.motion, std_px=std_px)
         return Explained(motion, self.canvas, residuals, self.ratio, tuple(refinements))
+
+    def moved(self, motion: FrameMotion) -> MotionFit:
+        """Return the fit of a motion that differs by a small fraction of a pixel, to first order, from the same panorama.
+
+        What all steps have in common moves the panorama, not the frames against it.
+        """
+        fit, instants = copy(self), self.residuals.instants
+        steps = steps_of(inverse(self.motion.trajectory.at(instants)) @ motion.trajectory.at(instants), motion.frame_shape)
+        fit.motion, fit.residuals = motion, self.residuals.moved(steps - steps.mean(axis=0))
+        fit.ratio = residual_ratio(fit.residuals)
+        return fit
 
     def _measured(self) -> Residuals:
         return measure(self.motion.span, self.predictions, self._context)

@@ -20,6 +20,7 @@ from photonpano.geometry import (
     rescaling,
     slopes,
     step_motions,
+    steps_of,
     transform_points,
     translation,
     unit_coordinates,
@@ -43,6 +44,8 @@ def test_step_motions_shift_roll_and_zoom_about_centre_of_frame() -> None:
     np.testing.assert_allclose(shifted, translation(1, 2))
     np.testing.assert_allclose(transform_points(rolled, [[10, 5], [14, 5]]), [[10, 5], [10, 9]], atol=1e-12)
     np.testing.assert_allclose(transform_points(zoomed, [[10, 5], [14, 7]]), [[10, 5], [16, 8]], atol=1e-12)
+    steps = [[1, -2, 0.3, 0.2], [0, 0, -0.1, -0.4]]
+    np.testing.assert_allclose(steps_of(step_motions(steps, (11, 21)), (11, 21)), steps, atol=1e-12)
 
 
 def test_transform_points_takes_x_as_column_and_y_as_row() -> None:

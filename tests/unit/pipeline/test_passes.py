@@ -22,6 +22,7 @@ from photonpano.pipeline.refiners import refine
 from photonpano.pipeline.state import State
 from photonpano.record.run_json import refinement_record
 from photonpano.record.run_warnings import refinement_warnings
+from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.refinement import Explained, MotionFit, NamedRefiner
 from photonpano.specs import parse_spec
 from photonpano.testing import MemorySource
@@ -208,6 +209,33 @@ def test_motion_that_explains_photons_better_is_used_until_none_is_left(run: Cal
     assert refinement.change_px == pytest.approx(0.5, rel=0.05)
     assert refinement_warnings(found.refinements) == []
     np.testing.assert_allclose(found.motion.homographies, PATH.at(np.arange(FRAMES)), atol=1e-9)
+
+
+def test_small_correction_after_another_is_not_measured_again(
+    run: Callable[..., Explained], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of the frames are off by 1 px; the refiner leaves a tremor at its first call, and corrects that at its second."""
+    measured = list[Residuals]()
+
+    def counted(*given: Any) -> Residuals:
+        measured.append(measure(*given))
+        return measured[-1]
+
+    def mend(homographies: np.ndarray, std_px: np.ndarray) -> Refined | None:
+        corrected = PATH.at(np.arange(FRAMES))
+        corrected[:, 0, 2] += 0.1 * np.sin(np.arange(FRAMES) / 10) if refiner.calls == 1 else 0
+        return Refined(corrected, std_px, "some") if refiner.calls < 3 else None
+
+    def tremor_px(residuals: Residuals) -> float:
+        return float(2 * np.mean(residuals.steps().steps[:, 0] * np.sin(residuals.instants / 10)))
+
+    monkeypatch.setattr("photonpano.residuals.refinement.measure", counted)
+    refiner = Answering(mend)
+    found = run(refiner, offset_px=1.0)
+    assert (found.refinements[0].rounds, len(measured)) == (("some", "some"), 2)
+    np.testing.assert_allclose(found.motion.homographies, PATH.at(np.arange(FRAMES)), atol=1e-9)
+    assert tremor_px(measured[-1]) == pytest.approx(-0.1, abs=0.03)
+    assert tremor_px(found.residuals) == pytest.approx(0, abs=0.03)
 
 
 def test_motion_is_returned_with_identity_at_reference_frame(run: Callable[..., Explained]) -> None:
