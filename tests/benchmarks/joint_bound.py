@@ -30,7 +30,8 @@ from scipy.special import ellipe
 
 from photonpano.geometry import ROTATION_AXES, Camera, corners, generators, inverse, slopes, transform_points
 
-SPACINGS, TOLERANCE_PX = (500, 400, 250, 200, 100, 50), 0.02
+SPACINGS, TOLERANCE_PX = (500, 400, 250, 200, 160, 125, 100, 80, 64, 50), 0.02
+EVERY = 10  # frames between those that a spline is fitted to
 VIEW_FRAMES = 50  # most frames that are taken to lie at one place
 PIXELS = 8192  # of the panorama that are summed at a time
 PLANE = 1e-7  # a change that moves corners, after alignment, and is known, relatively less than this, is one of the plane
@@ -186,9 +187,8 @@ def joint_bound(
     spacing, n = spacing or spacing_of(homographies, model.frame_shape), len(homographies)
     n_views = round(n / min(VIEW_FRAMES, spacing / 2))
     instants = (np.arange(n_views) + 0.5) * n / n_views - 0.5
-    nodes = np.linspace(0, n - 1, max(4, round(n / spacing) + 1))
     k, s = len(model.moves), len(model.shared)
-    spline = block_diag(np.kron(CubicSpline(nodes, np.eye(len(nodes)))(instants), np.eye(k)), np.eye(s))
+    spline = block_diag(np.kron(_spline(n, spacing, instants), np.eye(k)), np.eye(s))
     views = homographies[instants.round().astype(int)]
     of_views = information(scene, views, np.full(n_views, n / n_views), model, step)
     return Bound(*corner_errors_px(spline.T @ of_views @ spline, views, model, spline), spacing)
@@ -228,11 +228,17 @@ def corner_errors_px(
 
 
 def spacing_of(homographies: NDArray[np.float64], frame_shape: tuple[int, int]) -> int:
-    """Return the largest of `SPACINGS` at which a spline through nodes represents the corners within `TOLERANCE_PX`."""
-    there = transform_points(homographies, corners(frame_shape)).reshape(len(homographies), -1)
-    frames = np.arange(len(there))
+    """Return the largest of `SPACINGS` at which a spline represents the corners of all frames within `TOLERANCE_PX`."""
+    frames = np.arange(0, len(homographies), EVERY)
+    there = transform_points(homographies[frames], corners(frame_shape)).reshape(len(frames), -1)
     for spacing in SPACINGS[:-1]:
-        nodes = np.linspace(0, frames[-1], round(len(frames) / spacing) + 1).round().astype(int)
-        if len(nodes) > 3 and np.abs(CubicSpline(nodes, there[nodes])(frames) - there).max() <= TOLERANCE_PX:
+        basis = _spline(len(homographies), spacing, frames)
+        if np.abs(basis @ np.linalg.lstsq(basis, there, rcond=None)[0] - there).max() <= TOLERANCE_PX:
             return spacing
     return SPACINGS[-1]
+
+
+def _spline(n_frames: int, spacing: int, instants: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the values of a cubic spline at instants by its values at nodes: (N, nodes)."""
+    nodes = np.linspace(0, n_frames - 1, max(4, round(n_frames / spacing) + 1))
+    return np.asarray(CubicSpline(nodes, np.eye(len(nodes)))(instants))

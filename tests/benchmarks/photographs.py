@@ -40,7 +40,7 @@ from photonpano.geometry import Camera
 
 HEIGHT, SHAPE = 900, (254, 496)
 LENGTHS_PX = (500, 400, 300, 250, 200, 150, 100)
-TREMBLE = {"rms_px": 6.0, "roll_rms_deg": 0.4, "frequencies_hz": [24.0, 60.0, 110.0]}  # of periods from 880 frames on
+TREMBLE = {"rms_px": 6.0, "roll_rms_deg": 0.4, "frequencies_hz": [12.0, 30.0, 50.0]}  # 0.5 to 2 periods in 4,000 frames
 PATHS = {"pan": 0, "spline": 1}
 LENS = {"k1": -0.1, "k2": 0.03}
 MOTIONS: dict[str, tuple[float, dict[str, float]]] = {
