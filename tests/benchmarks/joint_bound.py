@@ -28,7 +28,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag
 from scipy.special import ellipe
 
-from photonpano.geometry import ROTATION_AXES, Camera, corners, generators, inverse, slopes, transform_points
+from photonpano.geometry import ROTATION_AXES, Camera, corners, generators, slopes, transform_points
 
 SPACINGS, TOLERANCE_PX = (500, 400, 250, 200, 160, 125, 100, 80, 64, 50), 0.02
 EVERY = 10  # frames between those that a spline is fitted to
@@ -207,7 +207,7 @@ def corner_errors_px(
     moved = moved if spline is None else moved @ spline
     to_scene = views @ lens_at_corners(model.camera, shape)
     here = _homogeneous(corners(shape))
-    by_plane = inverse(to_scene)[:, None] @ generators(shape) @ to_scene[:, None] @ here
+    by_plane = np.linalg.inv(to_scene)[:, None] @ generators(shape) @ to_scene[:, None] @ here
     planes = np.linalg.qr(slopes(np.broadcast_to(here, (n, 3, 4)), by_plane).reshape(-1, 8))[0]
     moved = moved - planes @ (planes.T @ moved)
     # Numbers in units of their own information, as they differ by many orders of magnitude.
