@@ -3,14 +3,14 @@
     python tests/benchmarks/photographs.py --photographs FOLDER [--only sign dunes] [--fluxes 0.3 0.1 0.03] [--paths pan]
         [--motions shift-roll f430-lens] [--captures FOLDER] [--jobs 2] [--output photographs.json]
 
-Every photograph in the folder, and in folders in it, is scaled to a height of 900 px. Frames of 254x496 px of a perfect sensor
-see it along two smooth paths of 500 px, or of what there is room for: to and fro along its diagonal ("pan"), and a spline by
-chance. `shift-roll` moves frames by shifts and rolls; f430 and f2000 turn a camera of this focal length in px, with a lens of
-k1 = -0.1 and k2 = 0.03 or without one. The spec of a run has a source alone, and one thread.
+Photographs in the folder, and in folders in it, are scaled to a height of 900 px. Frames of 254x496 px of a perfect sensor see
+them along two smooth paths of 500 px, or of what there is room for: a diagonal ("pan"), and a random spline. `shift-roll` moves
+frames by shifts and rolls; f430 and f2000 turn a camera of this focal length in px, with or without a lens of k1 = -0.1 and
+k2 = 0.03. The spec of a run has a source alone, and one thread. The bound is that of `joint_bound` for the numbers that moved:
+shift and roll; or a rotation, the focal length and, with a lens, k1 and k2. In brackets is that of homographies.
 
-The bound is that of `joint_bound` for the numbers that moved: shift and roll; or a rotation, the focal length and, with a
-lens, k1 and k2. The bound with the eight numbers of a homography is beside it. Captures, with their bounds, stay in the folder
-of captures (63 MB each). Results stay in the JSON file, so that an interrupted benchmark continues; the table is beside it.
+Captures with their bounds stay in their folder (63 MB each), and results in the JSON file, so that an interrupted benchmark
+continues; the table is beside it.
 """
 
 from __future__ import annotations
@@ -42,15 +42,11 @@ HEIGHT, SHAPE = 900, (254, 496)
 LENGTHS_PX = (500, 400, 300, 250, 200, 150, 100)
 TREMBLE = {"rms_px": 6.0, "roll_rms_deg": 0.4, "frequencies_hz": [12.0, 30.0, 50.0]}  # 0.5 to 2 periods in 4,000 frames
 PATHS = {"pan": 0, "spline": 1}
+NO_LENS: dict[str, float] = {}
 LENS = {"k1": -0.1, "k2": 0.03}
-MOTIONS: dict[str, tuple[float, dict[str, float]]] = {
-    "shift-roll": (1e6, {}),
-    "f2000": (2000.0, {}),
-    "f430": (430.0, {}),
-    "f2000-lens": (2000.0, LENS),
-    "f430-lens": (430.0, LENS),
-}
-"""Focal length in px, so long that a rotation is a shift or a roll, and distortion."""
+MOTIONS: dict[str, tuple[float, dict[str, float]]] = {"f2000": (2e3, NO_LENS), "f430": (430.0, NO_LENS)}
+MOTIONS |= {"f2000-lens": (2e3, LENS), "f430-lens": (430.0, LENS), "shift-roll": (1e6, NO_LENS)}
+"""Focal length in px, at last so long that a rotation is a shift or a roll; and distortion."""
 HEAD = (
     "Photograph", "Path", "Flux", "Motion", "Bound (8)", "Mean (max)", "/ bound", "Claimed", "Within 2", "std / rms", "Cuts",
     "Located", "CPU s", "Says",
@@ -84,18 +80,23 @@ def simulated(photo: Path, path: str, flux: float, motion: str, frames: int, stu
     raise SystemExit(f"{photo} has no room for the {path} of {motion}")
 
 
-def bounds_of(cube: Path, motion: str) -> dict[str, Any]:
-    """Return the bound of the true model of a capture, and that of homographies, which stay beside the capture."""
-    file = cube.with_suffix(".bound.json")
+def bounds_of(cube: Path, motion: str) -> dict[str, float]:
+    """Return the bounds of a capture in px, which stay beside it.
+
+    They are `bound_px` of what moved, `strict_px` as if noise left all of the gradient, and `homography_px`.
+    """
+    file = cube.with_suffix(".bounds.json")
     if not file.exists():
         truth, (focal_px, distortion) = load_truth(truth_path(cube)), MOTIONS[motion]
-        camera = Camera.of(focal_px, SHAPE, (*distortion.values(), 0, 0) if distortion else (0,) * 4)
-        true = Model.of("rotation", SHAPE, camera, 3 if distortion else 1)
-        model = Model.of("euclidean", SHAPE) if motion == "shift-roll" else true
-        bound = joint_bound(truth.scene, truth.ideal_homographies, model)
-        free = joint_bound(truth.scene, truth.homographies, Model.of("homography", SHAPE))
-        file.write_text(json.dumps({"bound": bound._asdict(), "homography": free._asdict()}))
-    found: dict[str, Any] = json.loads(file.read_text())
+        camera = Camera.of(focal_px, SHAPE, [*distortion.values(), 0, 0, 0, 0][:4])
+        turning = Model.of("rotation", SHAPE, camera, 3 if camera.distorts else 1)
+        model = Model.of("euclidean", SHAPE) if motion == "shift-roll" else turning
+        of_scene = partial(joint_bound, truth.scene)
+        bound, strict = (of_scene(truth.ideal_homographies, model, limited=limited) for limited in (True, False))
+        free = of_scene(truth.homographies, Model.of("homography", SHAPE))
+        bounds = {"bound_px": bound.mean_px, "strict_px": strict.mean_px, "homography_px": free.mean_px}
+        file.write_text(json.dumps(bounds | {"spacing": bound.spacing}))
+    found: dict[str, float] = json.loads(file.read_text())
     return found
 
 
@@ -125,10 +126,10 @@ def measured(task: tuple[Path, str, float, str], frames: int, captures: Path) ->
 def row(result: dict[str, Any]) -> Iterator[str]:
     """Yield the cells of a row."""
     yield from (str(result[key]) for key in ("photograph", "path", "flux", "motion"))
-    yield f"{result['bound']['mean_px']:.3f} ({result['homography']['mean_px']:.3f})"
+    yield f"{result['bound_px']:.3f} ({result['homography_px']:.3f})"
     if "mean_px" in result:
         yield f"{result['mean_px']:.3f} ({result['max_px']:.2f})"
-        yield f"{result['mean_px'] / result['bound']['mean_px']:.1f}"
+        yield f"{result['mean_px'] / result['bound_px']:.1f}"
         yield from (f"{result['std_px']:.3f}", f"{result['within_2']:.0%}", f"{result['std_px'] / result['rms_px']:.2f}")
         yield from (str(result["cuts"]), f"{result['located']:.0%}")
     else:
@@ -137,19 +138,18 @@ def row(result: dict[str, Any]) -> Iterator[str]:
     yield ": ".join([status(result), *(reason.splitlines()[0] for reason in reasons(result)[:1])])
 
 
-def summary(results: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the lines below the table."""
-    scored = [each for each in results if "mean_px" in each]
-    ratios = [each["mean_px"] / each["bound"]["mean_px"] for each in scored] or [np.nan]
-    honest, right = sum(each["within_2"] >= 0.95 for each in scored), [each for each in scored if each["mean_px"] < 0.2]
-    widths = [each["std_px"] / each["rms_px"] for each in scored] or [np.nan]
-    return [
-        f"Error over bound: {np.median(ratios):.2f} (median), {max(ratios):.1f} (worst). {len(scored)} of {len(results)} "
-        f"captures ended, {honest} with 95 % of the frames within 2 std_px. Of {len(right)} with an error below 0.2 px, "
-        f"{sum(status(each) == 'trusted' for each in right)} are trusted. std_px over rms: {min(widths):.2f} to "
-        f"{max(widths):.2f}. {sum(each['cuts'] for each in scored)} false cuts in {sum(each['cuts'] > 0 for each in scored)} "
-        f"captures. {sum(each['cpu_s'] for each in results):.0f} CPU seconds."
-    ]
+def summary(results: Sequence[dict[str, Any]]) -> str:
+    """Return the line below the table."""
+    ended = [each for each in results if "mean_px" in each]
+    right = [status(each) == "trusted" for each in ended if each["mean_px"] < 0.2]
+    ratios = [each["mean_px"] / each["bound_px"] for each in ended] or [np.nan]
+    widths = [each["std_px"] / each["rms_px"] for each in ended] or [np.nan]
+    return (
+        f"{len(ended)} of {len(results)} runs ended. Error over bound: {np.median(ratios):.2f} (median), {max(ratios):.1f} "
+        f"(worst). {sum(each['within_2'] >= 0.95 for each in ended)} have 95 % of the frames within 2 std_px. {sum(right)} of "
+        f"{len(right)} with an error below 0.2 px are trusted. std_px over rms: {min(widths):.2f} to {max(widths):.2f}. "
+        f"{sum(each['cuts'] for each in ended)} false cuts. {sum(each['cpu_s'] for each in results):.0f} CPU seconds."
+    )
 
 
 def main(
@@ -170,21 +170,19 @@ def main(
     photos = [files[name] for name in chosen(only, files)]
     tasks = list(product(photos, chosen(paths, PATHS), fluxes, [name for name in MOTIONS if name in motions]))
     results: list[dict[str, Any]] = json.loads(output.read_text()) if output.exists() else []
-    done = {(each["photograph"], each["path"], each["flux"], each["motion"], each["frames"]) for each in results}
-    tasks = [(photo, *rest) for photo, *rest in tasks if (photo.stem, *rest, frames) not in done]
+    known = {tuple(each[key] for key in ("photograph", "path", "flux", "motion", "frames")) for each in results}
+    tasks = [task for task in tasks if (task[0].stem, *task[1:], frames) not in known]
     captures.mkdir(parents=True, exist_ok=True)
-    measure = partial(measured, frames=frames, captures=captures)
-
-    def rows(pool: ProcessPoolExecutor) -> Iterator[Iterator[str]]:
-        for each in results:
-            yield row(each)
-        for result in pool.map(measure, tasks):
-            results.append(result)
-            output.write_text(json.dumps(results, indent=1))
-            yield row(result)
-
     with ProcessPoolExecutor(jobs, get_context("spawn"), max_tasks_per_child=1) as pool:
-        lines = [*table_of(HEAD, rows(pool)), "", *summary(results)]
+
+        def rows() -> Iterator[Iterator[str]]:
+            yield from map(row, results)
+            for result in pool.map(partial(measured, frames=frames, captures=captures), tasks):
+                results.append(result)
+                output.write_text(json.dumps(results, indent=1))
+                yield row(result)
+
+        lines = [*table_of(HEAD, rows()), "", summary(results)]
     print(lines[-1])
     output.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
