@@ -19,6 +19,7 @@ plane, of which no photon tells, drops out: corners are compared after the best 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
@@ -36,7 +37,7 @@ PIXELS = 8192  # of the panorama that are summed at a time
 PLANE = 1e-7  # a change that moves corners, after alignment, and is known, relatively less than this, is one of the plane
 UNKNOWN = 1e-12  # information, relative to the largest, that is none
 HALF_STEP = 1e-4  # of numerical derivatives by the logarithm of the focal length, k1 and k2
-OCTAVES_PX = (0.0, 0.7, 1.4, 2.8, 5.6, 11.2)  # standard deviations of the Gaussian kernels between octaves
+OCTAVES_PX = (0.7, 1.4, 2.8, 5.6, 11.2)  # standard deviations of the Gaussian kernels between octaves
 _P = np.eye(8)  # p1..p8 of `generators`, which are the elements a, d, b, e, c, f, g, h of a homography
 MODELS = {
     "translation": _P[4:6],
@@ -114,28 +115,26 @@ def gradient(chance: Array, variance: Array, limited: bool) -> tuple[Array, Arra
     """Return the gradient of p, (H, W), down and to the right; `limited` to what noise of a variance at each pixel leaves."""
     if not limited:
         return np.gradient(chance)
-    down, right, point = np.zeros_like(chance), np.zeros_like(chance), np.zeros((129, 129))
+    gradients, point = np.zeros((2, *chance.shape)), np.zeros((129, 129), np.float32)
     point[64, 64] = 1
-    finer, finer_point = chance, point
-    for sigma in (*OCTAVES_PX[1:], None):
-        coarser, coarser_point = (0 if sigma is None else cv2.GaussianBlur(each, (0, 0), sigma) for each in (chance, point))
-        slopes_of, kernel = np.gradient(finer - coarser), np.gradient(finer_point - coarser_point)[0]
-        power = cv2.GaussianBlur((slopes_of[0] ** 2 + slopes_of[1] ** 2) / 2, (0, 0), max(4.0, 3 * (sigma or OCTAVES_PX[-1])))
-        kept = np.sqrt(power / (power + variance * (kernel**2).sum()))
-        down, right = down + kept * slopes_of[0], right + kept * slopes_of[1]
-        finer, finer_point = coarser, coarser_point
-    return down, right
+    octaves = _octaves(chance.astype(np.float32)), _octaves(point)
+    for sigma, octave, (kernel, _) in zip((*OCTAVES_PX, OCTAVES_PX[-1]), *octaves, strict=True):
+        power = cv2.GaussianBlur((octave**2).mean(axis=0), (0, 0), max(4.0, 3 * sigma))
+        gradients += np.sqrt(power / (power + variance * (kernel**2).sum())) * octave
+    return gradients[0], gradients[1]
+
+
+def _octaves(image: Array) -> list[Array]:
+    """Return the gradients of the octaves of an image, from fine to coarse, (2, H, W) each."""
+    blurred = [image, *(cv2.GaussianBlur(image, (0, 0), sigma) for sigma in OCTAVES_PX), np.zeros_like(image)]
+    return [np.array(np.gradient(finer - coarser)) for finer, coarser in pairwise(blurred)]
 
 
 def information(scene: NDArray[Any], views: Array, n_frames: Array, model: Model, step: int, limited: bool) -> Array:
     """Return the information on the motion of views: (V k + s, V k + s), shared numbers last.
 
-    Args:
-        scene: (Hs, Ws) flux.
-        views: (V, 3, 3), ideal pixels of a frame to pixels of the scene.
-        n_frames: (V,) frames of each view.
-        step: px of the scene between those that are summed, along each axis.
-        limited: whether the gradient is that which the photons show.
+    `scene` is (Hs, Ws) flux, of which every `step`-th pixel along each axis is summed. `views`, (V, 3, 3), map ideal pixels of
+    a frame to those of the scene, and stand for (V,) `n_frames`. `limited` is that of `gradient`.
     """
     chance = -np.expm1(-np.asarray(scene, np.float64))
     level = np.clip(cv2.blur(chance, (3, 3)), 1e-9, 1 - 1e-9)
@@ -168,14 +167,9 @@ def information(scene: NDArray[Any], views: Array, n_frames: Array, model: Model
     return total
 
 
-def joint_bound(
-    scene: NDArray[Any], homographies: Array, model: Model, step: int = 3, limited: bool = True, spacing: int | None = None
-) -> Bound:
-    """Return the bound of the motion of all frames, (T, 3, 3), ideal pixels of a frame to pixels of the scene.
-
-    The spacing of the nodes, in frames, is by default what the motion allows. Other arguments are those of `information`.
-    """
-    spacing, n = spacing or spacing_of(homographies, model.shape), len(homographies)
+def joint_bound(scene: NDArray[Any], homographies: Array, model: Model, step: int = 3, limited: bool = True) -> Bound:
+    """Return the bound of the motion of all frames: (T, 3, 3), ideal pixels of a frame to pixels of the scene."""
+    spacing, n = spacing_of(homographies, model.shape), len(homographies)
     n_views = round(n / min(VIEW_FRAMES, spacing / 2))
     instants = (np.arange(n_views) + 0.5) * n / n_views - 0.5
     spline = block_diag(np.kron(_spline(n, spacing, instants), np.eye(len(model.moves))), np.eye(len(model.shared)))
