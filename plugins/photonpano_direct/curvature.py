@@ -117,9 +117,6 @@ def _hessian(first: NDArray[np.float32], second: NDArray[np.float32], weight: ND
     return hessian
 
 
-_LEAST_NOISE = 0.25  # of the residuals, relative to that of photons; to interpolate leaves less of it
-
-
 @compiled
 def expected_px(information: FloatArray, basis: FloatArray, to_corners: FloatArray) -> float:
     """Return the expected error of a corner in px if noise is white; 0 if the information is singular.
@@ -161,7 +158,7 @@ def information_of(
     if not cholesky(scatter, root):
         return PRIOR.copy(), np.inf
     solve_lower(root, hessian)
-    information = hessian.T @ hessian / max(_LEAST_NOISE, noise_ratio) + PRIOR
+    information = hessian.T @ hessian / max(1.0, noise_ratio) + PRIOR
     std_px = expected_px(information, np.eye(8), coordinates.to_corners)
     # From steps in unit coordinates of the template to p1..p8 of the homography, with h33 = 1.
     changed = homography @ coordinates.generators

@@ -22,6 +22,7 @@ from photonpano.geometry import (
 )
 from photonpano.motion.frame_motion import FrameMotion, smooth_view
 from photonpano.motion.tracking import StartingMotion, starting_motion
+from photonpano.motion.tracking.start import _steady
 from photonpano.motion.tracking.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
 from photonpano.testing.scenes import detected, seen_along, textured
 
@@ -89,6 +90,27 @@ def test_motion_is_unknown_beyond_the_windows_with_a_significant_peak_and_withou
     assert start.between(64.0, 32.0) is not None
     assert start.between(250.0, 220.0) is None
     assert started(np.full((64, 800), 0.3), 2) is None
+
+
+def test_start_is_a_path_of_shifts_that_agrees_with_its_motion_between_frames() -> None:
+    instants, velocities = np.array([10.0, 30.0, 60.0]), np.array([[1.0, 0.0], [2.0, -1.0], [0.0, 1.0]])
+    start = StartingMotion(instants, velocities, np.full((3, 2), np.nan), 100.0)
+    for moving, fixed in ((30.0, 10.0), (52.5, 20.0), (90.0, 60.0), (5.0, -4.0)):
+        there, here = start.at([fixed, moving])
+        expected = start.between(moving, fixed)
+        assert expected is not None
+        np.testing.assert_allclose(inverse(there) @ here, expected, atol=0.5)
+    np.testing.assert_allclose(start.at([10.0])[0], np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(start.at([30.0])[0, :2, 2], [-30, 10])
+
+
+@pytest.mark.parametrize("wrong", [[], [4], [0], [0, 1], [9], [5, 6]], ids=str)
+def test_windows_that_move_unlike_those_near_are_left_out(wrong: list[int]) -> None:
+    windows = np.arange(10)
+    velocities = np.stack([0.1 * np.sin(windows / 3), 0.05 * np.cos(windows / 2)], axis=1)
+    velocities[wrong] = [0.7, 0.1]
+    kept = _steady(velocities, px_per_frame=0.2)
+    assert sorted({*range(10)} - {*kept.tolist()}) == wrong
 
 
 MIDDLE = np.array([47.5, 31.5])

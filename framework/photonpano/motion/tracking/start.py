@@ -44,8 +44,8 @@ _TRACKED_PX = 2.0  # a peak of doubled spans lies within this many binned pixels
 _CONTINUITY_PX = 1.0  # standard deviation of the change of a shift, in binned pixels, from one window to the next
 _CONTINUITY_SHARE = 0.3  # its largest value, relative to the difference of two hypotheses
 _SLOWER = 3.0  # motions that are faster than the slowest by this factor are left out
-# A window is an outlier if it differs by this many times the median difference from its neighbours, of five windows at least.
-_LEAP, _FEWEST_STEADY = 6.0, 5
+# A window is an outlier if it differs from the median of its nearest windows by this many times what others do.
+_NEAR_WINDOWS, _LEAP = 6, 6.0
 _FAR = 1e6  # frames beyond the first and last instant within which the velocity is constant
 _TIE = 4.0  # difference of the log likelihoods of hypotheses below which both are kept
 
@@ -135,7 +135,7 @@ def starting_motion(
         return None
     velocities, alternatives = _continuous([each for _, each in known])
     instants, px_per_frame = np.array([instant for instant, _ in known]), max(each.px_per_frame for _, each in known)
-    steady = _steady(instants, velocities, px_per_frame)
+    steady = _steady(velocities, px_per_frame)
     return StartingMotion(instants[steady], velocities[steady], alternatives[steady], 1.5 * length, timeline)
 
 
@@ -272,22 +272,16 @@ def _continuous(windows: Sequence[Hypotheses]) -> tuple[FloatArray, FloatArray]:
     return velocities, alternatives
 
 
-def _steady(instants: FloatArray, velocities: FloatArray, px_per_frame: float) -> NDArray[np.integer]:
-    """Return which windows are no outliers: a single one among others that moves by much more than they change."""
-    kept = np.arange(len(instants))
-    while len(kept) >= _FEWEST_STEADY:
-        times, values = instants[kept], velocities[kept]
-        before, after = np.arange(len(kept)) - 1, np.arange(len(kept)) + 1
-        before[0], after[0], before[-1], after[-1] = 1, 2, len(kept) - 3, len(kept) - 2
-        share = ((times - times[before]) / (times[after] - times[before]))[:, None]
-        away = np.linalg.norm(values - (1 - share) * values[before] - share * values[after], axis=1)
-        # Beyond an end, what is foreseen is off by twice as much as between two windows.
-        away[[0, -1]] /= 2
-        worst = int(away.argmax())
-        if away[worst] < max(_LEAP * float(np.median(away)), px_per_frame):
-            break
-        kept = np.delete(kept, worst)
-    return kept
+def _steady(velocities: FloatArray, px_per_frame: float) -> NDArray[np.integer]:
+    """Return which windows are no outliers: few among others, that move by much more than these change."""
+    every = np.arange(len(velocities))
+    if len(every) <= _NEAR_WINDOWS:
+        return every
+    first = np.clip(every - _NEAR_WINDOWS // 2, 0, len(every) - 1 - _NEAR_WINDOWS)
+    near = first[:, None] + np.arange(_NEAR_WINDOWS + 1)
+    others = near[near != every[:, None]].reshape(len(every), _NEAR_WINDOWS)
+    leaps = np.linalg.norm(velocities - np.median(velocities[others], axis=1), axis=1)
+    return np.flatnonzero(leaps <= max(_LEAP * float(np.median(leaps)), px_per_frame))
 
 
 def _link(before: Hypotheses, after: Hypotheses) -> FloatArray:
