@@ -34,7 +34,7 @@ _MIN_CURVATURE = 5.0  # floor on the common curvature, relative to that of noise
 # Levenberg-Marquardt damping after a step that raised the cost, as a fraction of the Hessian of the template; multiplied by 4
 # on each further failure, and halved by each step that lowers the cost.
 _DAMPING = 0.1
-_MOST_RAISED = 3  # steps that raise the cost, after which no smaller ones are tried
+_MOST_RAISED = 6  # steps that raise the cost, after which no smaller ones are tried
 _NEGLIGIBLE = 0.02  # converged below this fraction of the expected error: in the dark, steps stay small for long
 _HESSIAN_PX = 0.25  # the Hessian is updated after steps above this
 

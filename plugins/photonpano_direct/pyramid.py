@@ -42,6 +42,8 @@ def details_of(layer: Layer) -> Details:
     image = without_local_mean(layer.image, seen)
     # Near a border the mean is one-sided: a gradient looks like a structure there, in any two images.
     inside = cv2.erode(seen.astype(np.uint8), np.ones((LOCAL_PX, LOCAL_PX), np.uint8), borderValue=0) > 0
+    if 2 * np.count_nonzero(inside) < np.count_nonzero(seen):
+        inside = seen  # a small image has hardly anything else
     image = np.where(inside, image, np.float32(0))
     weight = np.where(inside, layer.weight, np.float32(0))
     return Details(image, weight, 1 / (4 * np.pi * layer.blur_px**2), autocorrelation(image))

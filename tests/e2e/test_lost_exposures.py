@@ -29,7 +29,7 @@ def run(outcome_of: Callable) -> Callable[..., Any]:
 def lines_of(error: LocationError) -> list[str]:
     """Return the lines of an error, with # for counts and for the reasons of the first locator."""
     lines = str(error).splitlines()
-    lines = [re.sub(r"direct: [^;]+;", "direct: #;", line) for line in lines]
+    lines = [re.sub(r"direct: [^;]+;", "direct: #;", re.sub("; as a rotation: .*", "", line)) for line in lines]
     lines = [re.sub(r"\d+(?= (matches|and|keypoints))", "#", line) if line.startswith("  frames") else line for line in lines]
     return [re.sub(r"[\d.]+(?= times)", "#", line) for line in lines]
 

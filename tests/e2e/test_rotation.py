@@ -78,8 +78,8 @@ def test_trajectory_holds_the_camera_and_homographies_of_determinant_1(result: R
 
 def test_auto_records_which_model_it_took_and_why(result: RunResult) -> None:
     [decision] = [each for each in result.record["decisions"] if each["what"] == "motion_model"]
-    assert decision["value"] == "rotation"
-    assert decision["reason"].startswith("each unknown that homographies have more lowers the squared residuals")
+    assert decision["value"] == "rotation with a lens"
+    assert decision["reason"].startswith("reduced chi-square of the pairs, and the number of unknowns: ")
 
 
 def test_principal_point_outside_the_frames_is_refused(capture: Path, tmp_path: Path) -> None:

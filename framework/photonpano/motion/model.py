@@ -13,6 +13,7 @@ from photonpano.motion.planar import PLANAR_NAMES, PlanarName
 ModelName = Literal["auto", "translation", "euclidean", "similarity", "affine", "homography", "rotation"]
 # Initial focal length, in longer sides of a frame.
 _FIRST_FOCAL = 3.0
+_LENS = (None, None, 0.0, 0.0)  # what "auto" finds of a lens: k1 and k2
 _FAR_FOCAL = 1e4  # that of a camera whose turns shift and roll the image
 
 
@@ -56,7 +57,7 @@ class MotionModel:
         rotation = replace(self, kind="rotation")
         if any(self.distortion) and self.focal_px is None:
             return (rotation,), ()  # a lens that is given is in units of its focal length
-        lenses = () if any(self.distortion) else (replace(rotation, distortion=(None, None, 0.0, 0.0)),)
+        lenses = () if any(self.distortion) or self.finds_lens else (replace(rotation, distortion=_LENS),)
         first = planar["translation"], planar["euclidean"], planar["homography"], rotation
         return first, (planar["similarity"], planar["affine"], *lenses)
 
@@ -97,7 +98,7 @@ class MotionModel:
         if camera is None:
             return self
         if self.kind == "auto" and camera.distorts:
-            return replace(self, kind="rotation", distortion=(None, None, 0.0, 0.0), known=camera)
+            return replace(self, kind="rotation", distortion=self.distortion if self.finds_lens else _LENS, known=camera)
         return replace(self, known=camera)
 
 
