@@ -87,7 +87,7 @@ def test_failed_run_leaves_a_report_until_a_run_succeeds(with_a_wall: Callable, 
     assert lines[2:5] == [pair("50 to 74", "0 to 24"), pair("50 to 74", "25 to 49"), pair("75 to 99", "25 to 49")]
     assert re.fullmatch(r"  \.\.\. and \d+ more", lines[8])
     assert lines[9:] == [
-        "In these exposures of 25 frames the scene varies # times as much as a pixel's photon noise: either they are too dark "
+        "In these exposures of 25 frames the scene does not stand out from a pixel's photon noise: either they are too dark "
         "(try larger groups, such as resample.with.group_size=50), or the scene has no texture there.",
         "To go on with the largest part alone, set graph.disconnected to largest.",
     ]
