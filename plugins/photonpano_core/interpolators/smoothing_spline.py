@@ -26,6 +26,7 @@ _MIN_INFORMATION = 1e-8  # floor on the information eigenvalues of a knot, relat
 _TO_MODES = np.kron(hadamard(4) / 2, np.eye(2))
 # the twists, which a shaking camera hardly excites: it changes perspective less than shift, roll and scale
 _QUIET = [2, 3]
+_STILL_PX = 1e-6  # range of a mode that does not move
 
 
 class SmoothingSplineInterpolator:
@@ -37,7 +38,8 @@ class SmoothingSplineInterpolator:
 
     where y are the modes of the motion of the frame's corners, in px. Each mode has its own scale. The scales, and a factor on
     the covariances W^-1, are estimated by restricted maximum likelihood with white noise as the jerk. The factor is estimated
-    from the twists alone: in the other modes, motion that is too fast for the knots looks like noise.
+    from the twists alone: in the other modes, motion that is too fast for the knots looks like noise. It is 1 for motions
+    without perspective, which have no twists.
     """
 
     def __init__(self, config: InterpolatorConfig, frame_shape: tuple[int, int]) -> None:
@@ -74,8 +76,9 @@ class SmoothingSplineInterpolator:
             derivatives = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
             covariances = _covariances(information, _TO_MODES @ derivatives)
         paths = transform_points(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
-        still = np.ptp(paths[:, _QUIET] - paths[:, :2] * 0, axis=0).max() < 1e-6
-        moved = _smoothed_modes(instants, paths, covariances, _QUIET, 1.0 if still else None) @ _TO_MODES
+        # Without perspective, twists are rounding errors, which tell nothing of the noise.
+        noise = 1.0 if np.ptp(paths[:, _QUIET], axis=0).max() < _STILL_PX else None
+        moved = _smoothed_modes(instants, paths, covariances, _QUIET, noise) @ _TO_MODES
         return _from_corners(self._corners, moved.reshape(-1, 4, 2))
 
 
