@@ -21,7 +21,7 @@ from paper.figures.study import (
 )
 
 QUICK = {
-    "source.with.path": {"kind": "random-spline", "length_px": 60, "shake": {"rms_px": 1.5, "frequencies_hz": [450, 800]}},
+    "source.with.path": {"kind": "random-spline", "length_px": 60, "shake": {"rms_px": 2.0, "frequencies_hz": [450, 800]}},
     "source.with.scene": {"kind": "street", "width": 512, "height": 341, "seed": 3},
     "source.with.n_frames": 1200,
     "source.with.frame_shape": [96, 128],

@@ -99,7 +99,7 @@ def _start(
 ) -> StartingMotion | None:
     """Measure the motion that short spans show before the first level, once; None if they show none."""
     with clock("locate"):
-        found = context.checkpoints.once("start", partial(starting_motion, source, groups, context), groups)
+        found = context.checkpoints.once("level-1-start", partial(starting_motion, source, groups, context), groups)
     return None if found is None else replace(found, timeline=timeline)
 
 

@@ -69,14 +69,14 @@ def check_settings(found: dict[str, Any], posed: bool, spec: Spec) -> None:
         and motion.model not in _TURNING
         and render.projection not in ("auto", "planar")
     ):
-        message = f"a {render.projection} panorama needs motion.model: rotation or auto; one of {motion.model} is planar"
+        message = f"a {render.projection} panorama needs motion.model: rotation or auto; that of {motion.model} is planar"
         spec.wrong(spec.root.at("render", "projection"), message)
 
 
 def _check_camera(motion: MotionSettings, camera: CameraSettings, posed: bool, spec: Spec) -> None:
-    """Refuse what homographies and pose estimators cannot find of the camera, and a start that only homographies have."""
+    """Refuse what planar models and pose estimators cannot find of the camera, and a start that rotations do not have."""
     if motion.model == "rotation" and motion.start != "none":
-        message = f"{motion.start} is a start of planes, not of motion.model: rotation"
+        message = f"{motion.start} is a start of planar models, not of motion.model: rotation"
         spec.wrong(spec.root.at("motion", "start"), message)
     if motion.model in _TURNING and not posed:
         return
@@ -85,7 +85,7 @@ def _check_camera(motion: MotionSettings, camera: CameraSettings, posed: bool, s
     if posed:
         unfindable = "find does not apply with `pose`: calibrate the lens, or measure it in a run with motion.model: rotation"
     else:
-        without_focal += ", or take motion.model: rotation"
+        without_focal += ", or take motion.model: rotation or auto"
     distortion, written = camera.distortion.model_dump(), spec.root.at("camera", "distortion")
     for key, number in distortion.items():
         if number == "find":

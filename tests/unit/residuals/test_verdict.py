@@ -11,7 +11,8 @@ import pytest
 from photonpano import FrameSpan
 from photonpano.geometry import Canvas, FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.graph import Evidence
+from photonpano.motion.evidence import Evidence, Rival
+from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
@@ -234,7 +235,7 @@ def level_with(rotations: object | None = None, evidence: Evidence | None = None
     """A level of 30 pairs."""
     pairs = tuple((index + 1, index) for index in range(n_ambiguous))
     ambiguity = Ambiguity(1, pairs, 40.0) if pairs else None
-    solution = SimpleNamespace(rotations=rotations, outliers=())
+    solution = SimpleNamespace(rotations=rotations, outliers=(), model=MotionModel("rotation"))
     located = SimpleNamespace(ambiguity=ambiguity, evidence=evidence, edges=(None,) * 30, solution=solution)
     return SimpleNamespace(level=SimpleNamespace(number=1), located=located)
 
@@ -244,7 +245,8 @@ def test_rotations_that_do_not_explain_the_pairs_are_doubtful(
     explained: Explained, rotation: float, gain: float, doubtful: bool
 ) -> None:
     """Either the residuals are large, or those of homographies are much smaller."""
-    reasons = judge(explained, [level_with(object(), Evidence(rotation, 1.0, gain))]).reasons
+    evidence = Evidence({"homography": Rival(1.0, 232, 0.0), "rotation": Rival(rotation, 88, gain)})
+    reasons = judge(explained, [level_with(object(), evidence)]).reasons
     assert [(reason.what, reason.figure) for reason in reasons] == [(NO_TURN, np.sqrt(rotation))] * doubtful
 
 

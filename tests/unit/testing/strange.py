@@ -65,13 +65,18 @@ ERRORS: Mapping[str, tuple[BaseException, str]] = {
 
 
 class Around:
-    """A component around a good one, some of whose attributes are replaced."""
+    """A component around a good one, some of whose attributes are replaced.
+
+    A strange locator offers no `turning`: what that of the good one returns would not misbehave.
+    """
 
     def __init__(self, inner: Any, **changed: Any) -> None:
         self.inner = inner
         self.__dict__.update(changed)
 
     def __getattr__(self, name: str) -> Any:
+        if name == "turning":
+            raise AttributeError(name)
         return getattr(self.inner, name)
 
     def __enter__(self) -> Around:
