@@ -19,7 +19,7 @@ _DIM_PHOTONS = 8.0  # photons per pixel below which groups are doubled once the 
 _DOUBLED_FROM = 3  # first level of doubled groups: by then tremor is known, whose period limits earlier groups
 _BRIGHT_PHOTONS = 1000.0  # photons per pixel above which groups get shorter: less blur is worth more than more light
 _BRIGHT_BLUR = 0.04  # blur below which groups do not get shorter, in shorter sides of a frame
-_MIN_GROUPS = 8  # fewest groups at level 1 of a capture that is long enough
+_MIN_GROUPS = 16  # fewest groups at level 1 of a capture that is long enough
 _NEARLY_WHOLE = 0.1  # a group that exceeds whole periods by less than this fraction of one is shortened to them
 _MOST_LENGTHENED = 4  # longest period of the light that a group is lengthened to, in groups
 _EPSILON = 1e-9  # floor on flux and speed in divisions
@@ -169,7 +169,7 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
 
     A group of m frames is blurred by m v px at v px per frame. The blur may be 0.15 of the shorter side of a frame; up to twice
     that while a pixel collects fewer than 3 photons; down to 0.04 while it collects more than 1000. A group has at least
-    `shortest` frames, and the capture at least 8 groups.
+    `shortest` frames, and the capture at least 16 groups.
     """
     if capture.speed_px is None:
         size, bound = _bounded(_DEFAULT_SIZE, n_frames, shortest)
@@ -193,7 +193,7 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
 def whole_periods(size: int, period_frames: float | None, n_frames: int) -> int:
     """Return a group size that is lengthened to whole periods of flickering light (paper, section 6), in frames.
 
-    It stays as it is in steady light, where a period is longer than 4 groups, and where there would be fewer than 8 groups.
+    It stays as it is in steady light, where a period is longer than 4 groups, and where there would be fewer than 16 groups.
     """
     if period_frames is None or period_frames > _MOST_LENGTHENED * size:
         return size
