@@ -10,8 +10,8 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.geometry import Canvas, FrameTrajectory
-from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.evidence import Evidence, Rival
+from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, V, n_blocks
