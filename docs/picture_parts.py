@@ -78,9 +78,10 @@ def all_labelled(images: Mapping[str, Picture]) -> list[Picture]:
 
 
 def beside(pictures: Sequence[Picture]) -> Picture:
-    """Put pictures of one height side by side."""
-    gap = np.full((pictures[0].shape[0], GAP), 255, np.uint8)
-    return np.hstack([part for each in pictures for part in (each, gap)][:-1])
+    """Put pictures side by side, as high as the lowest."""
+    height = min(len(each) for each in pictures)
+    gap = np.full((height, GAP), 255, np.uint8)
+    return np.hstack([part for each in pictures for part in (each[:height], gap)][:-1])
 
 
 def widened(image: Picture, width: int) -> Picture:

@@ -19,7 +19,8 @@ _DIM_PHOTONS = 8.0  # photons per pixel below which groups are doubled once the 
 _DOUBLED_FROM = 3  # first level of doubled groups: by then tremor is known, whose period limits earlier groups
 _BRIGHT_PHOTONS = 1000.0  # photons per pixel above which groups get shorter: less blur is worth more than more light
 _BRIGHT_BLUR = 0.04  # blur below which groups do not get shorter, in shorter sides of a frame
-_MIN_GROUPS = 16  # fewest groups at level 1 of a capture that is long enough
+_MIN_GROUPS = 8  # fewest groups at level 1 that are lengthened for more light, or for whole periods of it
+_SLOW_GROUPS = 16  # fewest groups of a long capture, however slow: between their instants, the motion is interpolated
 _NEARLY_WHOLE = 0.1  # a group that exceeds whole periods by less than this fraction of one is shortened to them
 _MOST_LENGTHENED = 4  # longest period of the light that a group is lengthened to, in groups
 _EPSILON = 1e-9  # floor on flux and speed in divisions
@@ -193,7 +194,7 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
 def whole_periods(size: int, period_frames: float | None, n_frames: int) -> int:
     """Return a group size that is lengthened to whole periods of flickering light (paper, section 6), in frames.
 
-    It stays as it is in steady light, where a period is longer than 4 groups, and where there would be fewer than 16 groups.
+    It stays as it is in steady light, where a period is longer than 4 groups, and where there would be fewer than 8 groups.
     """
     if period_frames is None or period_frames > _MOST_LENGTHENED * size:
         return size
@@ -203,9 +204,9 @@ def whole_periods(size: int, period_frames: float | None, n_frames: int) -> int:
 
 def _bounded(wanted: float, n_frames: int, shortest: int) -> tuple[int, str]:
     """Return the nearest size that suits the capture, and a clause with the reason if it is not the wanted one."""
-    longest = max(shortest, n_frames // _MIN_GROUPS)
+    longest = max(shortest, n_frames // _SLOW_GROUPS)
     if wanted > longest:
-        return longest, f"; of longer groups there would be fewer than {_MIN_GROUPS}"
+        return longest, f"; of longer groups there would be fewer than {_SLOW_GROUPS}"
     if wanted < shortest:
         return shortest, "; shorter groups would be mostly noise" if shortest > 1 else ""
     return round(wanted), ""

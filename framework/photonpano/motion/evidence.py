@@ -53,14 +53,19 @@ class Evidence:
 
 
 def likeliest(costs: Mapping[MotionModel, Cost]) -> MotionModel:
-    """Return the model that explains most at the price of its unknowns."""
+    """Return the model that explains most at the price of its unknowns.
+
+    Shifts without roll are a rival of those with roll alone: on the sphere around a camera that turns, they do not exist.
+    """
     scale = _scale(costs)
 
     def score(model: MotionModel) -> float:
         cost = costs[model]
         return (cost.squares + _SHARED * cost.shared) / scale + _PRICE * (cost.unknowns - cost.shared)
 
-    return min(costs, key=score)
+    best = min((model for model in costs if model.kind != "translation"), key=score)
+    shifts = (model for model in costs if model.kind == "translation" and best.kind == "euclidean")
+    return min((best, *shifts), key=score)
 
 
 def _richest(costs: Mapping[MotionModel, Cost]) -> Cost:

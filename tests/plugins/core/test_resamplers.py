@@ -204,8 +204,8 @@ NO_SPEED = "no motion was found at any of 12 places"
         ((0.5, 0.15), 254, f"at 0.15 {SPEED} 254 frames are blurred by 38.1 px, 0.15 {SIDE} 0.5 hold 127 photons per pixel"),
         ((0.02, 0.3), 150, "hold 3 photons per pixel, so few that more blur is allowed"),
         ((0.001, 0.3), 254, "so few that more blur is allowed"),
-        ((0.5, 0.0), 1250, "; of longer groups there would be fewer than 8"),
-        ((0.5, 0.001), 1250, "; of longer groups there would be fewer than 8"),
+        ((0.5, 0.0), 625, "; of longer groups there would be fewer than 16"),
+        ((0.5, 0.001), 625, "; of longer groups there would be fewer than 16"),
         (
             (0.5, 10.0),
             16,
@@ -218,9 +218,9 @@ NO_SPEED = "no motion was found at any of 12 places"
             "hold 4e+04 photons per pixel, enough to shorten groups for less blur",
         ),  # 0.04 of 254
         ((25, 0.5, 10_000, HOW, 1), 40, ", enough to shorten groups for less blur"),  # 1000 photons
-        ((0.5, 0.05), 762, "photons per pixel"),  # which are too few
+        ((0.5, 0.07), 544, "photons per pixel"),  # which are too few
         ((0.01, None, 10_000, NO_SPEED), 500, f"{NO_SPEED}, so 500 frames are assumed"),
-        ((0.01, None, 2000, NO_SPEED), 250, "so 500 frames are assumed; of longer groups there would be fewer than 8"),
+        ((0.01, None, 2000, NO_SPEED), 125, "so 500 frames are assumed; of longer groups there would be fewer than 16"),
         # At 500 frames per second the image may move by tens of px per frame.
         ((20, 10.0, 10_000, HOW, 1), 4, "photons per pixel"),
         (
@@ -262,10 +262,10 @@ def test_auto_resampler_chooses_and_records_size_once() -> None:
         measured.append(1)
         return CaptureSummary(0.5, 0.381, HOW)
 
-    resampler = built(StreamInfo(1000, 254, 496, None), capture=capture, decide=lambda *what: decided.append(what))
+    resampler = built(StreamInfo(2000, 254, 496, None), capture=capture, decide=lambda *what: decided.append(what))
     assert not measured
     fixed = MidpointResampler(MidpointConfig(group_size=100))
-    assert [resampler.groups(1000, level) for level in (1, 2, 3)] == [fixed.groups(1000, level) for level in (1, 2, 3)]
+    assert [resampler.groups(2000, level) for level in (1, 2, 3)] == [fixed.groups(2000, level) for level in (1, 2, 3)]
     assert measured == [1]
     assert [what[:2] for what in decided] == [("group_size", 100)]
 
