@@ -11,18 +11,20 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from photonpano.geometry import corners, jacobian
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.refinement import Explained
-from photonpano.values import BoolArray, Decision
+from photonpano.values import BoolArray, Decision, Located
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
 NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
 # Contrast of the residuals, as a share of the light, beyond which a large reduced chi-square counts.
 MAX_CONTRAST = 0.02
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
+_ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 
 
@@ -240,6 +242,29 @@ def _deformation(run: _Run) -> _Found | None:
 def _unknown(run: _Run) -> _Found | None:
     known = run.explained.motion.std_px[run.explained.motion.located]
     return None if len(known) and np.isfinite(known).all() else _Found(0.0, "a single exposure was located", doubtful=True)
+
+
+@_doubtful_above(
+    2.0,
+    "the image says nothing of motion along one direction",
+    "the motion may be wrong by any distance along it, which this panorama does not show; keep other structures in view",
+)
+def _one_direction(run: _Run) -> _Found | None:
+    located = run.levels[-1].located if run.levels else None
+    pairs = [] if located is None else [edge.motion for edge in located.edges if isinstance(edge.motion, Located)]
+    informed = [pair for pair in pairs if pair.information is not None]
+    if located is None or not informed:
+        return None
+    middle = corners(located.frame_shape).mean(axis=0)[None]
+    slopes = np.array([jacobian(pair.homography, middle)[0] for pair in informed])
+    covariances = slopes @ np.linalg.pinv(np.array([pair.information for pair in informed])) @ slopes.transpose(0, 2, 1)
+    variances, directions = np.linalg.eigh(np.median(covariances, axis=0))
+    strong, weak = np.sqrt(np.maximum(variances, 0)).tolist()
+    if weak < _ASLANT * strong:
+        return None
+    x, y = directions[:, 1]
+    angle = round(np.degrees(np.arctan2(y, x))) % 180
+    return _Found(weak, f"px, the error of a pair at {angle} degrees from x towards y; {strong:.2g} px across")
 
 
 @_doubtful_above(1.0, "the expected error of the motion is large", "use more light")

@@ -18,7 +18,7 @@ from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, 
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.verdict import NO_TURN, TESTS, Reason, contradictions, judge
-from photonpano.values import Ambiguity, Decision
+from photonpano.values import Ambiguity, Decision, Edge, Located
 
 SHAPE, N_SPANS, SPAN = (128, 192), 200, 10
 N_FRAMES = N_SPANS * SPAN
@@ -231,12 +231,21 @@ def test_uncertain_motion_is_doubtful(explained: Explained, change: Callable[...
     assert np.isfinite(reason.figure)
 
 
-def level_with(rotations: object | None = None, evidence: Evidence | None = None, n_ambiguous: int = 0) -> Any:
+UNINFORMED = Located(np.eye(3))
+
+
+def level_with(
+    rotations: object | None = None,
+    evidence: Evidence | None = None,
+    n_ambiguous: int = 0,
+    motion: Located = UNINFORMED,
+) -> Any:
     """A level of 30 pairs."""
     pairs = tuple((index + 1, index) for index in range(n_ambiguous))
     ambiguity = Ambiguity(1, pairs, 40.0) if pairs else None
     solution = SimpleNamespace(rotations=rotations, outliers=(), model=MotionModel("rotation"))
-    located = SimpleNamespace(ambiguity=ambiguity, evidence=evidence, edges=(None,) * 30, solution=solution)
+    edges = (Edge(1, 0, motion),) * 30
+    located = SimpleNamespace(ambiguity=ambiguity, evidence=evidence, edges=edges, solution=solution, frame_shape=SHAPE)
     return SimpleNamespace(level=SimpleNamespace(number=1), located=located)
 
 
@@ -248,6 +257,19 @@ def test_rotations_that_do_not_explain_the_pairs_are_doubtful(
     evidence = Evidence({"homography": Rival(1.0, 232, 0.0), "rotation": Rival(rotation, 88, gain)})
     reasons = judge(explained, [level_with(object(), evidence)]).reasons
     assert [(reason.what, reason.figure) for reason in reasons] == [(NO_TURN, np.sqrt(rotation))] * doubtful
+
+
+@pytest.mark.parametrize(("along", "doubtful"), [(6.0, True), (1.5, False), (0.1, False)])
+@pytest.mark.parametrize("angle", [0, 37, 90])
+def test_motion_along_an_edge_is_doubtful(explained: Explained, angle: int, along: float, doubtful: bool) -> None:
+    """Pairs know the motion across it to 0.1 px, and little of that along it."""
+    x, y = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    turned = np.array([[x, -y], [y, x]])
+    information = np.diag([1e6] * 4 + [0.0] * 2 + [1e12] * 2)
+    information[4:6, 4:6] = turned @ np.diag([along**-2, 0.1**-2]) @ turned.T
+    reasons = judge(explained, [level_with(motion=Located(np.eye(3), information))]).reasons
+    assert [reason.figure for reason in reasons] == [pytest.approx(along, rel=0.1)] * doubtful
+    assert all(f"at {angle} degrees" in reason.where for reason in reasons)
 
 
 @pytest.mark.parametrize(("n_pairs", "where"), [(2, []), (3, ["3 of 30 pairs of level 1, 40 px away"])])
