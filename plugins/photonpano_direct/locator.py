@@ -164,8 +164,7 @@ class _Alignment:
             return np.ascontiguousarray(np.eye(8)[:, list(free)]), free == ALL_PARAMETERS
         height, width = pyramid.layers[depth].image.shape
         matrix = unit_coordinates((height, width)) @ self._camera.scaled(0.5**depth).matrix
-        slopes = turn_slopes(np.eye(3), matrix)
-        return np.ascontiguousarray(slopes / np.linalg.norm(slopes, axis=0)), True
+        return np.ascontiguousarray(turn_slopes(np.eye(3), matrix)), True
 
     def _of_majority(
         self, moving: Pyramid, fixed: Pyramid, first: _Descent, start: Homography, judged: int, searches: bool

@@ -99,7 +99,7 @@ def test_start_is_a_path_of_shifts_that_agrees_with_its_motion_between_frames() 
         there, here = start.at([fixed, moving])
         expected = start.between(moving, fixed)
         assert expected is not None
-        np.testing.assert_allclose(inverse(there) @ here, expected, atol=0.5)
+        np.testing.assert_allclose(inverse(there) @ here, expected, atol=1e-6)
     np.testing.assert_allclose(start.at([10.0])[0], np.eye(3), atol=1e-9)
     np.testing.assert_allclose(start.at([30.0])[0, :2, 2], [-30, 10])
 

@@ -34,8 +34,7 @@ _SPANS = 16  # a window is divided into 16 spans: between two of them the image 
 _PEAK_PX = 1.0  # standard deviation of the peak of the phase correlation, in binned pixels
 # Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5.
 _SIGNIFICANT = 7.0
-# Least height of the peak of a hypothesis, relative to the highest, and of one that may be as likely.
-_HYPOTHESIS, _RIVAL = 0.35, 0.6
+_RIVAL = 0.6  # least height of the peak of a hypothesis, relative to the highest
 _LEAST_EXTENT = 0.05  # a part of the image that moves otherwise is a hypothesis if its extent is this share of the other part's
 _DISTINCT_PX = 4.0  # least difference of two motions over a window, in binned pixels
 # Shift between spans that is exact enough, in binned pixels; spans are doubled until then.
@@ -81,7 +80,8 @@ class StartingMotion:
         points = self._points(moving, fixed)
         if np.abs(points[:, None] - self.instants).min(axis=1).max() > self.reach:
             return None
-        shift = self._integral(self.velocities, points)
+        there, here = self._travelled(self.velocities, np.array([fixed, moving]))
+        shift = here - there
         if self.timeline is not None:
             shift += self.timeline.shift_between(fixed, moving)
         return translation(*-shift)
@@ -89,31 +89,31 @@ class StartingMotion:
     def at(self, frame_indices: ArrayLike) -> FloatArray:
         """Return the shifts of N instants to the frame of the first known one, as homographies: (N, 3, 3)."""
         instants = np.asarray(frame_indices, dtype=np.float64)
-        far = np.concatenate([[self.instants[0] - _FAR], self.instants, [self.instants[-1] + _FAR]])
-        velocities = np.pad(self.velocities, ((1, 1), (0, 0)), mode="edge")
-        # The trapezoid rule is exact, since velocities are linear between these instants.
-        travelled = np.concatenate(
-            [np.zeros((1, 2)), np.cumsum(np.diff(far)[:, None] * (velocities[1:] + velocities[:-1]) / 2, axis=0)]
-        )
-        before = np.clip(np.searchsorted(far, instants) - 1, 0, len(far) - 2)
-        here = np.stack([np.interp(instants, far, each) for each in velocities.T], axis=1)
-        shifts = travelled[before] + (instants - far[before])[:, None] * (velocities[before] + here) / 2 - travelled[1]
         found = np.tile(np.eye(3), (len(instants), 1, 1))
-        found[:, :2, 2] = -shifts
+        found[:, :2, 2] = -self._travelled(self.velocities, instants)
         return found
 
     def alternative_px(self, moving: float, fixed: float) -> float:
         """Return how far from that motion an equally likely one is, in px; 0 if there is none."""
-        points = self._points(moving, fixed)
         differences = np.nan_to_num(self.alternatives - self.velocities)
-        return float(np.linalg.norm(self._integral(differences, points)))
+        there, here = self._travelled(differences, np.array([fixed, moving]))
+        return float(np.linalg.norm(here - there))
 
     def _points(self, moving: float, fixed: float) -> FloatArray:
         return np.linspace(fixed, moving, 9)
 
-    def _integral(self, velocities: FloatArray, points: FloatArray) -> FloatArray:
-        at = np.stack([np.interp(points, self.instants, each) for each in velocities.T], axis=1)
-        return np.asarray(np.trapezoid(at, points, axis=0))
+    def _travelled(self, velocities: FloatArray, instants: FloatArray) -> FloatArray:
+        """Return the integral of (N, 2) velocities from the first of these instants to others: (M, 2)."""
+        far = np.concatenate([[self.instants[0] - _FAR], self.instants, [self.instants[-1] + _FAR]])
+        velocities = np.pad(velocities, ((1, 1), (0, 0)), mode="edge")
+        # The trapezoid rule is exact, since velocities are linear between these instants.
+        parts = np.diff(far)[:, None] * (velocities[1:] + velocities[:-1]) / 2
+        travelled = np.concatenate([np.zeros((1, 2)), np.cumsum(parts, axis=0)])
+        before = np.clip(np.searchsorted(far, instants) - 1, 0, len(far) - 2)
+        here = np.stack([np.interp(instants, far, each) for each in velocities.T], axis=1)
+        return np.asarray(
+            travelled[before] + (instants - far[before])[:, None] * (velocities[before] + here) / 2 - travelled[1]
+        )
 
 
 def starting_motion(
@@ -209,7 +209,7 @@ def _velocities(
     while len(spectra) >= 2:
         surface = _surface(spectra, shape)
         if surface is not None and surface.max() >= _SIGNIFICANT:
-            shifts, heights = correlation_peaks(surface, _HYPOTHESIS)
+            shifts, heights = correlation_peaks(surface, _RIVAL)
             return _refined(spectra, shape, shifts) / doubled, heights, doubled
         spectra, doubled = _summed_in_twos(spectra), 2 * doubled
     return None
@@ -266,7 +266,6 @@ def _continuous(windows: Sequence[Hypotheses]) -> tuple[FloatArray, FloatArray]:
     for index, (each, total) in enumerate(zip(windows, map(np.add, forward, reversed(backward)), strict=True)):
         best, *others = np.argsort(-total, kind="stable")
         velocities[index] = each.velocities[best]
-        others = [other for other in others if each.heights[other] >= _RIVAL]
         if others and total[best] - total[others[0]] < _TIE:
             alternatives[index] = each.velocities[others[0]]
     return velocities, alternatives
