@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import Camera, nearest_rotations, parameters, scaled_ahead, translation, unit_coordinates
+from photonpano.geometry import Camera, likely_rotations, parameters, scaled_ahead, translation, unit_coordinates
 from photonpano.locating import (
     ALL_PARAMETERS,
     NOTHING_SEEN,
@@ -111,7 +111,8 @@ class _Alignment:
         """Align from a start; `searches`: whether other motions are tried where the image has several."""
         n_layers = len(moving.layers)
         if self._camera is not None:
-            start = scaled_ahead(self._camera.homographies(nearest_rotations(self._camera.rotations(start))))
+            turned = likely_rotations(self._camera, start[None], moving.layers[0].image.shape)
+            start = scaled_ahead(self._camera.homographies(turned[0]))
         judged = min(JUDGED, n_layers - 1)
         coarse = self._descend(moving, fixed, start, start, range(judged, n_layers))
         moving, coarse = self._of_majority(moving, fixed, coarse, start, judged, searches)

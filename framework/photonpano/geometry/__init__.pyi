@@ -3,9 +3,11 @@ from .alignment import align_rotations as align_rotations
 from .camera import ROTATION_AXES as ROTATION_AXES
 from .camera import Camera as Camera
 from .camera import camera_matrix as camera_matrix
+from .camera import likely_rotations as likely_rotations
 from .camera import nearest_rotations as nearest_rotations
 from .camera import rotation_matrices as rotation_matrices
 from .camera import rotation_vectors as rotation_vectors
+from .camera import rotations_between as rotations_between
 from .canvas import PROJECTIONS as PROJECTIONS
 from .canvas import Canvas as Canvas
 from .canvas import Extent as Extent

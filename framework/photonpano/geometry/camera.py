@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from photonpano.geometry.homographies import BLOCK_FRAMES, rescaling
+from photonpano.geometry.homographies import BLOCK_FRAMES, corners, rescaling, transform_points
 from photonpano.values import FloatArray, Homography
 
 _ITERATIONS = 30
@@ -168,3 +168,20 @@ def nearest_rotations(matrices: ArrayLike) -> FloatArray:
         left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
         found.reshape(-1, 3, 3)[start : start + BLOCK_FRAMES] = left @ right
     return found
+
+
+def likely_rotations(camera: Camera, homographies: Homography, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return the rotations that move the corners of a frame most like (N, 3, 3) homographies: (N, 3, 3).
+
+    `nearest_rotations` of the matrices of a shift would move the corners by half of it.
+    """
+    here = corners(frame_shape)
+    if not np.all(homographies[:, 2] @ np.concatenate([here, np.ones((4, 1))], axis=1).T > 0):
+        return nearest_rotations(camera.rotations(homographies))  # some look backwards
+    return rotations_between(camera, here, transform_points(homographies, here))
+
+
+def rotations_between(camera: Camera, here: FloatArray, there: FloatArray) -> FloatArray:
+    """Return the rotations that bring (4, 2) ideal pixels to (N, 4, 2) others: (N, 3, 3), by least squares (Kabsch 1976)."""
+    seen = [Camera(camera.matrix).directions(points) for points in (np.broadcast_to(here, there.shape), there)]
+    return nearest_rotations(np.swapaxes(seen[1], -1, -2) @ seen[0])

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 from photonpano.geometry import (
     generators,
     inverse,
+    likely_rotations,
     normalised,
     parameters,
     scaled_ahead,
@@ -24,7 +25,7 @@ from photonpano.motion.evidence import Evidence, likeliest
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
 from photonpano.motion.planar import PlanarName, basis_of, moved, nearest
-from photonpano.motion.rotation_graph import RotationAdjustment, Rotations, likely_rotations
+from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, Located
 
 

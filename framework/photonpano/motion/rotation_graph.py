@@ -12,8 +12,8 @@ from photonpano.geometry import (
     camera_matrix,
     corners,
     generators,
-    nearest_rotations,
     rotation_matrices,
+    rotations_between,
     slopes,
     transform_points,
 )
@@ -184,7 +184,7 @@ class RotationAdjustment(Adjustment[Rotations]):
     def _cost_of(self, camera: Camera) -> float:
         chosen = np.unique(np.linspace(0, len(self._moving) - 1, _MOST_TRIED).astype(int))
         whitening, targets = self._whitening[chosen], self._targets[chosen]
-        rotations = _between(camera, self._corners, targets)
+        rotations = rotations_between(camera, self._corners, targets)
         moves = camera.homographies(ROTATION_AXES)
 
         def residuals_of(mapped: FloatArray) -> FloatArray:
@@ -200,20 +200,6 @@ class RotationAdjustment(Adjustment[Rotations]):
         residuals = residuals_of(camera.homographies(rotations))
         squares = (residuals**2).sum(axis=1)
         return float(np.log1p(squares / 8).sum() + (_away(camera, 0, 2 * self._half) / _PRIOR_STD) ** 2)
-
-
-def likely_rotations(camera: Camera, homographies: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
-    """Return the rotations that move the corners of a frame most like (N, 3, 3) homographies: (N, 3, 3)."""
-    here = corners(frame_shape)
-    if not np.all(homographies[:, 2] @ np.concatenate([here, np.ones((4, 1))], axis=1).T > 0):
-        return nearest_rotations(camera.rotations(homographies))  # some look backwards
-    return _between(camera, here, transform_points(homographies, here))
-
-
-def _between(camera: Camera, here: FloatArray, there: FloatArray) -> FloatArray:
-    """Return the rotations that bring (4, 2) ideal pixels to (N, 4, 2) others: (N, 3, 3), by least squares (Kabsch 1976)."""
-    seen = [Camera(camera.matrix).directions(points) for points in (np.broadcast_to(here, there.shape), there)]
-    return nearest_rotations(np.swapaxes(seen[1], -1, -2) @ seen[0])
 
 
 def _zoom(camera: Camera) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 from photonpano.contracts.protocols import Source
 from photonpano.contracts.results import REFINED
 from photonpano.contracts.rules import attributing
-from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, nearest_rotations
+from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, likely_rotations
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.level import Recorder
 from photonpano.pipeline.components import built, stage_context
@@ -74,7 +74,9 @@ def _refined(refiner: NamedRefiner, state: State, number: int) -> Refined | None
         found = REFINED.require(found, motion.std_px)
         homographies = inverse(found.homographies[motion.reference]) @ found.homographies
         if motion.camera is not None:
-            turned = nearest_rotations(motion.camera.rotations(homographies))
+            # Each correction is a small step of its frame, whose homography may be far from any of a plane.
+            steps = likely_rotations(motion.camera, inverse(motion.homographies) @ found.homographies, motion.frame_shape)
+            turned = motion.rotations @ steps
             return replace(found, homographies=motion.camera.homographies(turned[motion.reference].T @ turned))
         homographies /= homographies[:, 2:, 2:].copy()
         return replace(found, homographies=homographies)

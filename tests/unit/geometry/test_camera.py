@@ -14,6 +14,7 @@ from photonpano.geometry import (
     covered_by,
     from_parameters,
     level_horizon,
+    likely_rotations,
     nearest_rotations,
     rotation_matrices,
     rotation_vectors,
@@ -70,6 +71,20 @@ def test_rotation_vectors_invert_rotation_matrices() -> None:
 def test_nearest_rotations_ignores_scale_and_small_errors() -> None:
     rotations = rotation_matrices(np.random.default_rng(0).normal(size=(5, 3)))
     np.testing.assert_allclose(nearest_rotations(3 * rotations), rotations, atol=1e-12)
+
+
+def test_likely_rotations_move_a_frame_by_the_whole_of_a_shift() -> None:
+    """The nearest matrices that rotate would move it by half: a shift is no rotation of a plane, and the half is between."""
+    camera, frame = Camera.of(4464.0, (254, 496)), corners((254, 496))
+    [rotation] = likely_rotations(camera, translation(3.0, -1.0)[None], (254, 496))
+    moved = transform_points(camera.homographies(rotation), frame) - frame
+    np.testing.assert_allclose(moved, np.broadcast_to([3.0, -1.0], moved.shape), atol=0.03)
+
+
+def test_likely_rotations_of_a_camera_that_looks_backwards_are_the_nearest() -> None:
+    camera, rotations = Camera.of(330.0, (254, 496)), rotation_matrices([[0.1, 3.0, 0.0], [0.0, 0.2, 0.0]])
+    found = likely_rotations(camera, camera.homographies(rotations), (254, 496))
+    np.testing.assert_allclose(found, rotations, atol=1e-9)
 
 
 SHAPE = (40, 60)

@@ -14,7 +14,7 @@ import pytest
 from photonpano import FrameSpan, LocationError, Refined
 from photonpano.errors import CanvasTooLargeError
 from photonpano.execution.context import Context
-from photonpano.geometry import FrameTrajectory, inverse, translation
+from photonpano.geometry import Camera, FrameTrajectory, corner_displacements, inverse, likely_rotations, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut, Timeline
 from photonpano.pipeline.passes import Pass, Proposal, cut_at_jumps, later_levels, tried, worse_in_light
@@ -157,9 +157,11 @@ def source() -> ReadOnlySource:
 def run(source: ReadOnlySource) -> Callable[..., Explained]:
     """Refine a motion, the true one by default, by a refiner named "odd" that answers with a function."""
 
-    def run(answer: Callable[..., object] | Answering, offset_px: float = 0.0) -> Explained:
+    def run(answer: Callable[..., object] | Answering, offset_px: float = 0.0, camera: Camera | None = None) -> Explained:
         homographies = PATH.at(np.arange(FRAMES))
         homographies[: FRAMES // 2, 0, 2] += offset_px
+        if camera is not None:
+            homographies = camera.homographies(likely_rotations(camera, homographies, SHAPE))
         motion = FrameMotion(
             FrameTrajectory(homographies),
             FrameSpan(0, FRAMES),
@@ -168,6 +170,7 @@ def run(source: ReadOnlySource) -> Callable[..., Explained]:
             np.full(FRAMES, 0.05),
             FRAMES // 2,
             SHAPE,
+            camera,
         )
         component = answer if isinstance(answer, Answering) else Answering(answer)
         named = NamedRefiner("odd", component, "refiner 'odd' of toys 1.0")
@@ -209,6 +212,20 @@ def test_motion_that_explains_photons_better_is_used_until_none_is_left(run: Cal
     assert refinement.change_px == pytest.approx(0.5, rel=0.05)
     assert refinement_warnings(found.refinements) == []
     np.testing.assert_allclose(found.motion.homographies, PATH.at(np.arange(FRAMES)), atol=1e-9)
+
+
+def test_correction_by_a_shift_moves_a_camera_that_turns_by_the_whole_of_it(run: Callable[..., Explained]) -> None:
+    """Half of the frames are off by 1 px; the refiner answers with shifts, which no turn is exactly."""
+
+    def mend(homographies: np.ndarray, std_px: np.ndarray) -> Refined | None:
+        return Refined(PATH.at(np.arange(FRAMES)), std_px, "1 px") if refiner.calls == 1 else None
+
+    refiner = Answering(mend)
+    camera = Camera.of(1e4, SHAPE)
+    found = run(refiner, offset_px=1.0, camera=camera).motion.homographies
+    steps = [inverse(each[0]) @ each[FRAMES // 2] for each in (found, PATH.at(np.arange(FRAMES)))]
+    assert corner_displacements(*steps, SHAPE).max() < 0.02
+    np.testing.assert_allclose(np.linalg.det(found), 1)
 
 
 def test_small_correction_after_another_is_not_measured_again(
