@@ -73,11 +73,11 @@ def _refined(refiner: NamedRefiner, state: State, number: int) -> Refined | None
             return None
         found = REFINED.require(found, motion.std_px)
         homographies = inverse(found.homographies[motion.reference]) @ found.homographies
-        if motion.camera is not None:
+        if (rotations := motion.rotations) is not None and (camera := motion.camera) is not None:
             # Each correction is a small step of its frame, whose homography may be far from any of a plane.
-            steps = likely_rotations(motion.camera, inverse(motion.homographies) @ found.homographies, motion.frame_shape)
-            turned = motion.rotations @ steps
-            return replace(found, homographies=motion.camera.homographies(turned[motion.reference].T @ turned))
+            steps = likely_rotations(camera, inverse(motion.homographies) @ found.homographies, motion.frame_shape)
+            turned = rotations @ steps
+            return replace(found, homographies=camera.homographies(turned[motion.reference].T @ turned))
         homographies /= homographies[:, 2:, 2:].copy()
         return replace(found, homographies=homographies)
 
