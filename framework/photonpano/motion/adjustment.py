@@ -19,6 +19,8 @@ from photonpano.values import BoolArray, FloatArray, Located
 
 MAX_ITERATIONS = 30
 CONVERGED_PX = 1e-3  # largest motion of a corner in the last step
+# Fall of the cost by the last step, in squares of standard deviations. The first step, with equal weights, is never the last.
+NEGLIGIBLE = 1e-3
 MAX_HALVINGS = 8  # of a step that raises the cost
 NO_WORSE = 1e-6  # relative increase of the cost by rounding errors
 # Tuning constant of the Cauchy weights, in scales of the residuals: 95 % efficiency for Gaussian noise.
@@ -131,10 +133,10 @@ class Adjustment(ABC, Generic[StateT]):
         del state
         return np.zeros(self._n_shared), np.zeros((self._n_shared, self._n_shared))
 
-    def std_camera(self, state: StateT, std_shared: FloatArray) -> FloatArray:
-        """Return what `Assessment` holds of a camera, given the expected errors of the (s,) shared unknowns."""
-        del state
-        return std_shared
+    def std_camera(self, state: StateT, shared: FloatArray) -> FloatArray:
+        """Return what `Assessment` holds of a camera, given (s, S) draws of errors of the shared unknowns."""
+        del state, shared
+        return np.zeros(0)
 
     def relative(self, state: StateT) -> FloatArray:
         """Return the homography that a state expects of each edge: (E, 3, 3)."""
@@ -145,17 +147,18 @@ class Adjustment(ABC, Generic[StateT]):
         """Return the state of least cost, and the norm of the whitened residual of each edge, (E,); outliers are not `kept`."""
         # Equal weights at first: the start fits half of the edges exactly, so that robust weights would reject the others.
         weights = kept.astype(np.float64)
-        for _ in range(MAX_ITERATIONS):
+        for iteration in range(MAX_ITERATIONS):
             jacobians, residuals = self._linearised(state, weights)
-            free = self._free(state)
+            free, gradient = self._free(state), jacobians.T @ residuals
             step = np.zeros(len(free))
-            step[free] = -_solved((jacobians.T @ jacobians)[free][:, free], (jacobians.T @ residuals)[free])
+            step[free] = -_solved((jacobians.T @ jacobians)[free][:, free], gradient[free])
             stepped = self._stepped(state, step, weights, float(residuals @ residuals))
             if stepped is None:
                 break
             state, norms = stepped
             weights = self._robust_weights(norms, kept)
-            if np.abs(step).max() * self._half < CONVERGED_PX:
+            negligible = iteration > 0 and -step @ gradient < NEGLIGIBLE
+            if negligible or np.abs(step).max() * self._half < CONVERGED_PX:
                 break
         state = self.anchored(state)
         return state, self._norms(state)
@@ -196,9 +199,8 @@ class Adjustment(ABC, Generic[StateT]):
             right += rows.T @ rng.normal(size=(rows.shape[0], SAMPLES))
         changes[free] = _solved(normal[free][:, free], right[free], draws=True)
         changes += self._common_errors(normal, free, int(kept.sum()), rng)
-        std_shared = np.sqrt((changes[k * self._n_nodes :] ** 2).mean(axis=1))
-        std_px = self._corner_std_px(state, changes)
-        return Assessment(self.information(state, blocks), std_px, self.std_camera(state, std_shared))
+        std_camera = self.std_camera(state, changes[k * self._n_nodes :])
+        return Assessment(self.information(state, blocks), self._corner_std_px(state, changes), std_camera)
 
     def _common_errors(self, normal: sparse.csr_array, free: BoolArray, n_edges: int, rng: np.random.Generator) -> FloatArray:
         """Draw errors of the shared unknowns that all pairs have in common, and how the nodes follow: (k N + s, S).

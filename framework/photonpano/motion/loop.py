@@ -13,6 +13,7 @@ from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
+from photonpano.motion.known_motion import Knots, KnownMotion
 from photonpano.motion.level import Level, VirtualExposures, merge
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
@@ -56,6 +57,7 @@ def estimate_motion(
     previous: Trajectory | None = None,
     timeline: Timeline | None = None,
     model: MotionModel = HOMOGRAPHIES,
+    corrects: bool = False,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level (paper, section 4).
 
@@ -64,8 +66,8 @@ def estimate_motion(
     number of groups. An exposure that a fallback locator or a loop closure needs is merged again.
 
     The homography of the frame `reference` is the identity. With `until_converged`, the loop ends as soon as a level changes
-    the motion by no more than its expected error. `previous` is the motion known so far; without a timeline, no frame is
-    missing or repeated.
+    the motion by no more than its expected error. `previous` is the motion known so far, which each level replaces; one that
+    `corrects` keeps its tremor. Without a timeline, no frame is missing or repeated.
 
     Raises:
         LocationError: too few exposures could be located.
@@ -82,7 +84,7 @@ def estimate_motion(
         start = None if previous is not None else _start(seen, groups, context, timeline, clock)
         exposures = merge(turning, seen, groups, previous, clock, timeline, start)
         located = locate(exposures, graph, context, model, start)
-        trajectory = interpolate(level, located, timeline, reference, clock)
+        trajectory = interpolate(level, located, timeline, reference, clock, previous if corrects else None)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
         context.progress.note(_summary(results[-1]))
@@ -115,14 +117,26 @@ def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]
         return require_groups(level.resampler.groups(n_frames, level.number), n_frames)
 
 
-def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, reference: int, clock: Stopwatch) -> Trajectory:
+def interpolate(
+    level: Level,
+    located: LocatedLevel,
+    timeline: Timeline,
+    reference: int,
+    clock: Stopwatch,
+    corrected: Trajectory | None = None,
+) -> Trajectory:
     """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate"), between cuts.
+
+    A motion that is `corrected` is not replaced: what is interpolated is how far the exposures merged along it are from it.
 
     Raises:
         LocationError: the interpolator failed because exposures reach the horizon of the plane.
         PluginError: the interpolator failed, or its trajectory has nothing to do with these instants.
     """
-    rotations, shape = located.solution.rotations, located.frame_shape
+    turns, shape = located.solution.rotations, located.frame_shape
+    camera = None if turns is None else turns.camera
+    known = None if corrected is None else KnownMotion(corrected, len(timeline.taken), camera, shape)
+    homographies, information, rotations = Knots.of(located) if known is None else known.corrections(located)
 
     def kept(found: Trajectory, knots: slice, times: FloatArray, homographies: FloatArray) -> Trajectory:
         free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
@@ -130,26 +144,22 @@ def interpolate(level: Level, located: LocatedLevel, timeline: Timeline, referen
         return free
 
     def fitted(knots: slice, times: FloatArray) -> Trajectory:
-        information = None if located.information is None else located.information[knots].copy()
+        of_knots = None if information is None else information[knots].copy()
         if rotations is not None:
-            return fit_rotations(
-                level.interpolator, times, rotations.of(knots), information, partial(kept, knots=knots, times=times)
-            )
-        homographies = located.homographies[knots]
+            checked = partial(kept, knots=knots, times=times)
+            return fit_rotations(level.interpolator, times, rotations.of(knots), of_knots, checked)
         try:
-            found = level.interpolator.fit(times, homographies, information)
+            found = level.interpolator.fit(times, homographies[knots], of_knots)
         except Exception as error:
             require_in_front(level.number, located.groups, located.solution, shape, error)
             raise
-        return kept(found, knots, times, homographies)
+        return kept(found, knots, times, homographies[knots])
 
     with clock("interpolate"), level.attributing("interpolator"):
         free = timeline.fit(fitted, located.instants)
-        return (
-            ReferencedTrajectory(free, reference)
-            if rotations is None
-            else RotationTrajectory(free, rotations.camera, reference)
-        )
+        if known is not None:
+            free = known.corrected(free)
+        return ReferencedTrajectory(free, reference) if camera is None else RotationTrajectory(free, camera, reference)
 
 
 def _summary(result: LevelResult) -> str:

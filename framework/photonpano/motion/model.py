@@ -66,6 +66,12 @@ class MotionModel:
         """Whether the distortion of the lens is to be found."""
         return any(index > 0 for index in self.unknown)
 
+    def with_lens(self) -> MotionModel | None:
+        """Return rotations of a camera whose lens is to be found; None where the model allows none, or has one already."""
+        if self.kind not in ("auto", "rotation") or any(number != 0 for number in self.distortion):
+            return None
+        return replace(self, kind="rotation", distortion=_LENS)
+
     def camera(self, frame_shape: tuple[int, int]) -> Camera:
         """Return what is known of the camera so far; what is not begins at 3 sides of a frame, and without distortion."""
         if self.known is not None:

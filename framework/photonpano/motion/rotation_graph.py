@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from photonpano.geometry import (
     corners,
     generators,
     rotation_matrices,
+    rotation_vectors,
     rotations_between,
     slopes,
     transform_points,
@@ -23,9 +25,13 @@ from photonpano.values import BoolArray, FloatArray
 _FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # tried first, in sides of a frame
 # Prior of the focal length, in sides of a frame, and the standard deviation of its logarithm.
 _PRIOR_FOCAL, _PRIOR_STD = 3.0, 2.0
-_PRIOR_DISTORTION = 1.0  # prior standard deviation of the displacement of a corner by the lens, in half diagonals
+_PRIOR_DISTORTION = 0.1  # prior standard deviation of the displacement of a corner by the lens, in half diagonals
 _STEP = 1e-5  # step of numerical derivatives
 _MOST_TRIED = 400  # edges by which the first focal length is chosen
+# A rotation of a camera that turns by more, in radians, is another one seen from the other side: its vector cannot be scaled.
+_UNIQUE_TURN = 2.0
+_MOST_ZOOM = 10.0  # of one step
+_POWERS = np.array([2, 4, 1, 1])  # of the focal length, with which k1, k2, p1 and p2 grow if the lens bends pixels alike
 _GRID = 7  # points of a frame along each axis to which a homography is fitted
 
 
@@ -40,14 +46,23 @@ class Rotations:
         """Return the rotations of some nodes."""
         return Rotations(self.rotations[nodes], self.camera)
 
+    def seen_by(self, camera: Camera) -> Rotations:
+        """Return the rotations of a camera of another focal length that move the image alike, unless some turn far."""
+        vectors = rotation_vectors(self.rotations)
+        if camera.focal_px == self.camera.focal_px or np.linalg.norm(vectors, axis=-1).max() > _UNIQUE_TURN:
+            return Rotations(self.rotations, camera)
+        zoom = self.camera.focal_px / camera.focal_px
+        return Rotations(rotation_matrices(vectors * [zoom, zoom, 1.0]), camera)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensShift:
     """Change of the homographies of pairs caused by undistorting pixels with the wrong lens."""
 
-    frame_shape: tuple[int, int]  # (height, width) of a frame
     points: FloatArray  # (P, 2) all over a frame
     seen: BoolArray  # (E, P) which of them both exposures of each pair see
+    # (E, 8, 2 P) from the shifts of the points to those of the corners, by the small homography that fits those seen best
+    to_corners: FloatArray
 
     @classmethod
     def of(cls, frame_shape: tuple[int, int], observed: FloatArray) -> LensShift:
@@ -59,7 +74,14 @@ class LensShift:
         seen = np.all((mapped >= 0) & (mapped <= [width - 1, height - 1]), axis=-1)
         # Four points at least determine a homography; a pair that hardly overlaps takes all.
         seen[seen.sum(axis=1) < _GRID] = True
-        return cls(frame_shape, points, seen)
+
+        def slopes_at(places: FloatArray) -> FloatArray:
+            there = observed @ np.concatenate([places, np.ones((len(places), 1))], axis=1).T
+            return slopes(there, generators(frame_shape) @ there[:, None])
+
+        by_points = slopes_at(points)
+        weighted = np.swapaxes(by_points * np.repeat(seen, 2, axis=1)[..., None], -1, -2)
+        return cls(points, seen, slopes_at(corners(frame_shape)) @ np.linalg.solve(weighted @ by_points, weighted))
 
     def of_corners(self, relative: FloatArray, camera: Camera, assumed: Camera) -> FloatArray:
         """Return the change of corner displacement caused by undistorting with the wrong lens: (E, 4, 2) px.
@@ -68,26 +90,15 @@ class LensShift:
         """
         ideal = camera.ideal(assumed.distorted(self.points))
         there = assumed.ideal(camera.distorted(transform_points(relative, ideal)))
-        shift = there - transform_points(relative, self.points)
-        weights = (self.seen & np.isfinite(shift).all(axis=-1)).astype(float)
-        by_points = self._slopes(relative, self.points)
-        weighted = by_points * np.repeat(weights, 2, axis=1)[..., None]
-        right = np.einsum("epk,ep->ek", weighted, np.nan_to_num(shift).reshape(len(relative), -1))
-        change = np.linalg.solve(np.swapaxes(weighted, -1, -2) @ by_points, right[..., None])
-        moved = self._slopes(relative, corners(self.frame_shape)) @ change
-        return np.asarray(moved.reshape(len(relative), 4, 2))
-
-    def _slopes(self, relative: FloatArray, points: FloatArray) -> FloatArray:
-        """Return the derivatives of mapped points by the eight parameters of a small homography that follows: (E, 2 P, 8)."""
-        mapped = relative @ np.concatenate([points, np.ones((len(points), 1))], axis=1).T
-        return slopes(mapped, generators(self.frame_shape) @ mapped[:, None])
+        shift = np.nan_to_num(there - transform_points(relative, self.points)).reshape(len(relative), -1, 1)
+        return np.asarray(self.to_corners @ shift).reshape(-1, 4, 2)
 
 
 class RotationAdjustment(Adjustment[Rotations]):
     """The least-squares problem of a graph whose nodes are rotations of one camera.
 
     The unknowns of a node are a rotation vector in its own frame. Those of the camera that are not given are shared: the
-    logarithm of its focal length, and the distortion of its lens.
+    logarithm of its focal length, and the distortion of its lens. With another focal length, pixels move and are bent alike.
     """
 
     _n_node = 3
@@ -99,7 +110,11 @@ class RotationAdjustment(Adjustment[Rotations]):
         """
         super().__init__(problem, n_shared=len(unknown))
         self._assumed, self._unknown = assumed, unknown
-        self._lens = LensShift.of(problem.frame_shape, problem.observed)
+        self._observed = problem.observed
+
+    @cached_property
+    def _lens(self) -> LensShift:
+        return LensShift.of(self._frame_shape, self._observed)
 
     def homographies(self, state: Rotations) -> FloatArray:
         """Return K R K^-1, of determinant 1: (N, 3, 3)."""
@@ -112,11 +127,10 @@ class RotationAdjustment(Adjustment[Rotations]):
 
     def changed(self, state: Rotations, nodes: FloatArray, shared: FloatArray) -> Rotations:
         """Rotate each node, and change the camera."""
-        rotated = state.rotations @ rotation_matrices(nodes * (self._half / state.camera.focal_px))
-        camera = state.camera
-        for index, step in zip(self._unknown, shared * self._units(camera), strict=True):
-            camera = _changed(camera, index, float(step))
-        return Rotations(rotated, camera)
+        rotated = Rotations(state.rotations @ rotation_matrices(nodes * (self._half / state.camera.focal_px)), state.camera)
+        for index, step in zip(self._unknown, shared * self._units(state.camera), strict=True):
+            rotated = self._changed(rotated, index, float(step))
+        return rotated
 
     def mapped_corners(self, state: Rotations) -> FloatArray:
         """Return where the corners are seen: (E, 4, 2) px.
@@ -139,23 +153,22 @@ class RotationAdjustment(Adjustment[Rotations]):
 
     def shared_slopes(self, state: Rotations) -> FloatArray:
         """Return the derivatives of the corners by what is unknown of the camera: (E, 8, s)."""
-        here, found = self.mapped_corners(state), []
-        for index, unit in zip(self._unknown, self._units(state.camera), strict=True):
-            there = self.mapped_corners(Rotations(state.rotations, _changed(state.camera, index, _STEP * unit)))
-            found.append((there - here).reshape(len(here), 8) / _STEP)
-        return np.stack(found, axis=-1)
+        here = self.mapped_corners(state).reshape(-1, 8)
+        return np.stack([(self.mapped_corners(each).reshape(-1, 8) - here) / _STEP for each in self._nearby(state)], axis=-1)
 
     def shared_errors(self, state: Rotations) -> FloatArray:
         """Return how the corners of each frame move on the plane of the anchor by what is unknown of the camera: (N, 8, s)."""
-        homographies, zoom = self.homographies(state), _zoom(state.camera)
-        moved = (np.linalg.solve(homographies, zoom @ homographies) - zoom) @ self._rows
-        by_focal = slopes(np.broadcast_to(self._rows, moved.shape), moved[:, None])
-        frame, found = self._corners, []
-        for index, unit in zip(self._unknown, self._units(state.camera), strict=True):
-            changed = _changed(state.camera, index, _STEP * unit)
-            by_lens = ((changed.ideal(frame) - state.camera.ideal(frame)) / _STEP).reshape(1, 8, 1)
-            found.append(by_focal if index == 0 else np.broadcast_to(by_lens, by_focal.shape))
-        return np.concatenate(found, axis=-1)
+        back, here = np.linalg.inv(self.homographies(state)), state.camera.ideal(self._corners)
+        found = []
+        for each in self._nearby(state):
+            there = transform_points(back @ self.homographies(each), each.camera.ideal(self._corners))
+            found.append((there - here).reshape(-1, 8) / _STEP)
+        return np.stack(found, axis=-1)
+
+    def _nearby(self, state: Rotations) -> list[Rotations]:
+        """Return the state after a small step of each unknown of the camera."""
+        units = self._units(state.camera)
+        return [self._changed(state, index, _STEP * unit) for index, unit in zip(self._unknown, units, strict=True)]
 
     def prior(self, state: Rotations) -> tuple[FloatArray, FloatArray]:
         """Return what is known before: a focal length of some sides of a frame, and a lens that distorts by less than that."""
@@ -169,12 +182,29 @@ class RotationAdjustment(Adjustment[Rotations]):
         end = float(np.hypot(*self._frame_shape)) / 2 / camera.focal_px
         return np.array([1.0, end**-2, end**-4, end**-1, end**-1])[list(self._unknown)]
 
-    def std_camera(self, state: Rotations, std_shared: FloatArray) -> FloatArray:
+    def std_camera(self, state: Rotations, shared: FloatArray) -> FloatArray:
         """Return the expected errors of the focal length, in px, and of k1, k2, p1 and p2: (5,), 0 for what is given."""
-        found = np.zeros(5)
-        found[list(self._unknown)] = std_shared * self._units(state.camera)
-        found[0] *= state.camera.focal_px
-        return found
+        errors = np.zeros((5, shared.shape[1]))
+        errors[list(self._unknown)] = shared * self._units(state.camera)[:, None]
+        errors[1:] += (self._bent_alike * state.camera.distortion)[:, None] * errors[0]
+        errors[0] *= state.camera.focal_px
+        return np.asarray(np.sqrt((errors**2).mean(axis=1)))
+
+    @property
+    def _bent_alike(self) -> FloatArray:
+        """The powers of the focal length with which the distortion grows: (4,), 0 for what is given."""
+        return np.asarray(_POWERS * np.isin(np.arange(1, 5), self._unknown))
+
+    def _changed(self, state: Rotations, index: int, step: float) -> Rotations:
+        """Change the logarithm of the focal length (index 0), evenly in 1 / f^2, or another number of the distortion."""
+        camera = state.camera
+        if index == 0:
+            zoom = max(1 - 2 * step, _MOST_ZOOM**-2) ** -0.5
+            camera = replace(_with_focal(camera, camera.focal_px * zoom), distortion=camera.distortion * zoom**self._bent_alike)
+            return state.seen_by(camera)
+        distortion = camera.distortion.copy()
+        distortion[index - 1] += step
+        return Rotations(state.rotations, replace(camera, distortion=distortion))
 
     def likeliest_camera(self, camera: Camera) -> Camera:
         """Return the camera with the focal length that explains the edges best, each by itself."""
@@ -202,23 +232,8 @@ class RotationAdjustment(Adjustment[Rotations]):
         return float(np.log1p(squares / 8).sum() + (_away(camera, 0, 2 * self._half) / _PRIOR_STD) ** 2)
 
 
-def _zoom(camera: Camera) -> FloatArray:
-    """Return dK/d(log f) K^-1: (3, 3)."""
-    x, y = camera.centre_px
-    return np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 0.0]])
-
-
 def _with_focal(camera: Camera, focal_px: float) -> Camera:
     return replace(camera, matrix=camera_matrix(focal_px, camera.centre_px))
-
-
-def _changed(camera: Camera, index: int, step: float) -> Camera:
-    """Return a camera with another logarithm of its focal length (index 0), or another number of its distortion."""
-    if index == 0:
-        return _with_focal(camera, camera.focal_px * np.exp(step))
-    distortion = camera.distortion.copy()
-    distortion[index - 1] += step
-    return replace(camera, distortion=distortion)
 
 
 def _away(camera: Camera, index: int, side_px: float) -> float:

@@ -38,12 +38,14 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
         passes.in_changing_light,
         partial(passes.later_levels, journal=journal),
         *[passes.through_found_lens] * _MOST_LENSES,
+        passes.with_lens,
+        *[passes.through_found_lens] * _MOST_LENSES,
         passes.cut_at_jumps,
     )
     for each in tried:
         n_decisions, state = len(state.decisions), passes.tried(state, each).state
         journal += state.decisions[n_decisions:]
-    journal += [*state.timeline.decisions, *_model_decisions(plan, state.results)]
+    journal += state.timeline.decisions
     return state
 
 
@@ -78,7 +80,7 @@ def _start(source: Source, reference: int, journal: list[Decision], context: Con
     return ConstantVelocity(found.velocity, reference)
 
 
-def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:
+def model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:
     """Return which model `auto` took at the last level, for the record."""
     located = results[-1].located
     if plan.motion.model != "auto" or located.evidence is None:

@@ -24,6 +24,7 @@ from photonpano.values import Decision, Refined
 MAX_ROUNDS = 6  # maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against
 # A later correction that moves frames by less than this on average needs no new panorama: residuals change in proportion to it.
 _LINEAR_PX = 0.1
+_BLURRED_PX = 1.0  # mean correction by which the exposures were blurred so that it pays to locate them again
 
 
 def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
@@ -32,8 +33,11 @@ def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tup
     return tuple(NamedRefiner(choice.contribution.name, built(choice, context), choice.label) for choice in plan.refine)
 
 
-def refine(state: State, refiners: Sequence[NamedRefiner]) -> Explained:
-    """Correct the motion by refiners, each until it finds nothing, and measure what is left. For errors, see `run`."""
+def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Explained]:
+    """Correct the motion by refiners, each until it finds nothing, and measure what is left. For errors, see `run`.
+
+    Where the first correction moves frames by more than a pixel, it blurred the exposures: the last level runs again along it.
+    """
     refinements = []
     for place, refiner in enumerate(refiners):
         before, rounds, kept_out = state.motion, list[str](), ""
@@ -45,8 +49,14 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> Explained:
                 break
             rounds.append(summary)
             state.context.progress.note(f"{refiner.name}: {summary}")
+            if len(rounds) == 1 and _change_px(before, state.motion) > _BLURRED_PX:
+                state = tried(state, _relocated).state
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(before, state.motion), kept_out))
-    return state.fit.explained(refinements)
+    return state, state.fit.explained(refinements)
+
+
+def _relocated(state: State) -> Proposal:
+    return Proposal(state.relocated, rejection="the motion of the last level along the refined one is not used")
 
 
 def _corrected(state: State, refiner: NamedRefiner, place: int, number: int) -> Proposal | None:

@@ -15,6 +15,7 @@ from photonpano.motion.frame_motion import FrameMotion, motion_of_frames
 from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
+from photonpano.motion.rotations import RotationTrajectory
 from photonpano.motion.timeline import Timeline
 from photonpano.residuals.refinement import MotionFit
 from photonpano.specs.plan import Plan
@@ -59,13 +60,20 @@ class State:
     refined: FrameMotion | None = None
     known_fit: MotionFit | None = None
 
-    def located(self, levels: Sequence[Level], previous: Trajectory | None) -> State:
+    def located(self, levels: Sequence[Level], previous: Trajectory | None, corrects: bool = False) -> State:
         """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels."""
         if not levels:
             return self
         before = [each for each in self.results if each.level.number < levels[0].number]
         given = self.plan.graph, self.reference, self.context, self.plan.until_converged, previous, self.timeline, self.model
-        return replace(self, results=(*before, *estimate_motion(self.source, levels, *given)), outdated=False)
+        return replace(self, results=(*before, *estimate_motion(self.source, levels, *given, corrects)), outdated=False)
+
+    def relocated(self) -> State:
+        """Run the last level again along the refined motion, which it corrects: its exposures are then sharper."""
+        motion: Trajectory = self.motion.trajectory
+        if self.motion.camera is not None:
+            motion = RotationTrajectory(motion, self.motion.camera, self.reference)
+        return replace(self.located([self.results[-1].level], motion, corrects=True), refined=None, known_fit=None)
 
     def corrected(self, source: Source, correction: Vignette | Light, decision: Decision) -> State:
         """Return the state of a capture with one more correction, on which its checkpoints then depend."""

@@ -9,9 +9,12 @@ from scipy import sparse
 
 from photonpano.filtering import SYSTEMATIC_PX
 from photonpano.geometry import corners, transform_points
+from photonpano.motion.frame_motion import FrameMotion
 from photonpano.residuals.block_sums import BLOCK_PX
+from photonpano.residuals.measure import Residuals
 from photonpano.values import FloatArray
 
+_SIGNIFICANT = 5.0  # standard deviations
 _INSTANTS = 64  # instants of the motion at which the effect of a lens is computed
 
 
@@ -28,6 +31,12 @@ class LensDistortion:
     def sigmas(self) -> float:
         """How significant it is."""
         return abs(self.k1) / self.std
+
+
+def shown_lens(residuals: Residuals, motion: FrameMotion) -> LensDistortion | None:
+    """Return the distortion that the residuals of a motion show beyond doubt; None if they show none."""
+    found = lens_distortion(*residuals.block_shifts(), motion.homographies[motion.located], residuals.frame_shape)
+    return found if found is not None and found.sigmas > _SIGNIFICANT else None
 
 
 def lens_distortion(

@@ -16,12 +16,14 @@ from photonpano.errors import CanvasTooLargeError
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, corner_displacements, inverse, likely_rotations, translation
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import Cut, Timeline
-from photonpano.pipeline.passes import Pass, Proposal, cut_at_jumps, later_levels, tried, worse_in_light
+from photonpano.pipeline.passes import Pass, Proposal, cut_at_jumps, later_levels, tried, with_lens, worse_in_light
 from photonpano.pipeline.refiners import refine
 from photonpano.pipeline.state import State
 from photonpano.record.run_json import refinement_record
 from photonpano.record.run_warnings import refinement_warnings
+from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.refinement import Explained, MotionFit, NamedRefiner
 from photonpano.specs import parse_spec
@@ -132,6 +134,45 @@ def test_motion_is_not_cut_where_pieces_meet(
     assert (state and [cut.frame for cut in state.timeline.cuts]) == kept
 
 
+@pytest.mark.parametrize(
+    ("model", "shown", "left", "grew", "worse"),
+    [
+        (MotionModel("auto"), -0.02, -0.001, "", ""),
+        (MotionModel("rotation"), -0.02, None, "", ""),
+        (MotionModel("auto"), -0.02, -0.012, "", "the residuals show -1.20% at the corners with it, and -2.00% without"),
+        (MotionModel("auto"), -0.02, -0.001, "the scatter grew", "the scatter grew"),
+        (MotionModel("auto"), -0.0005, None, "", None),
+        (MotionModel("auto"), None, None, "", None),
+        (MotionModel("homography"), -0.02, None, "", None),
+        (MotionModel("auto", 300.0, distortion=(-0.1, 0.0, 0.0, 0.0)), -0.02, None, "", None),
+    ],
+    ids=["auto", "rotation", "half is left", "photons worse", "small", "none", "planar", "given"],
+)
+def test_lens_that_residuals_show_is_found_if_they_then_show_less_than_half_of_it(
+    model: MotionModel, shown: float | None, left: float | None, grew: str, worse: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`worse` is None where no lens is proposed."""
+    sizes = {"before": shown, "after": left}
+    before, after = (SimpleNamespace(residuals=each, motion=None, worse_than=lambda _: grew) for each in sizes)
+
+    def lens(residuals: str, _: None) -> LensDistortion | None:
+        size = sizes[residuals]
+        return None if size is None else LensDistortion(size, 0.001)
+
+    monkeypatch.setattr("photonpano.pipeline.passes.shown_lens", lens)
+    monkeypatch.setattr(State, "fit", before)
+    monkeypatch.setattr(State, "located", lambda state, *_: state)
+    state = replace(BEFORE, model=model, results=(SimpleNamespace(trajectory=None, level=None),))
+    proposal = with_lens(state)
+    if worse is None or proposal is None:
+        assert proposal is worse
+        return
+    found = proposal.make()
+    assert (found.model.kind, found.model.finds_lens) == ("rotation", True)
+    assert [decision.what for decision in found.decisions] == ["lens"]
+    assert proposal.worse(after, before) == worse
+
+
 SHAPE, FRAMES = (40, 64), 400
 PATH = KnownMotion(lambda frame: translation(0.05 * (frame - FRAMES // 2), 0))
 
@@ -175,7 +216,7 @@ def run(source: ReadOnlySource) -> Callable[..., Explained]:
         component = answer if isinstance(answer, Answering) else Answering(answer)
         named = NamedRefiner("odd", component, "refiner 'odd' of toys 1.0")
         state = State(PLAN, source, Context(), FRAMES // 2, (), Timeline.regular(FRAMES), refined=motion)
-        return refine(state, [named])
+        return refine(state, [named])[1]
 
     return run
 
@@ -211,6 +252,27 @@ def test_motion_that_explains_photons_better_is_used_until_none_is_left(run: Cal
     assert (refinement.rounds, refinement.kept_out, refiner.calls) == (("1 px",), "", 2)
     assert refinement.change_px == pytest.approx(0.5, rel=0.05)
     assert refinement_warnings(found.refinements) == []
+    np.testing.assert_allclose(found.motion.homographies, PATH.at(np.arange(FRAMES)), atol=1e-9)
+
+
+@pytest.mark.parametrize(("offset_px", "relocated"), [(1.5, []), (3.0, [1])], ids=["sharp", "blurred"])
+def test_last_level_runs_again_along_a_motion_corrected_by_more_than_a_pixel(
+    offset_px: float, relocated: list[int], run: Callable[..., Explained], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of the frames are off; the level that runs again would shift them all, which the photons refute."""
+    ran = list[int]()
+
+    def run_again(state: State) -> State:
+        ran.append(refiner.calls)
+        wrong = shaken(state.motion.homographies, state.motion.std_px).homographies
+        return replace(state, refined=replace(state.motion, homographies=wrong, trajectory=FrameTrajectory(wrong)))
+
+    monkeypatch.setattr(State, "relocated", run_again)
+    refiner = Answering(
+        lambda *_: Refined(PATH.at(np.arange(FRAMES)), np.full(FRAMES, 0.05), "some") if refiner.calls == 1 else None
+    )
+    found = run(refiner, offset_px=offset_px)
+    assert ran == relocated
     np.testing.assert_allclose(found.motion.homographies, PATH.at(np.arange(FRAMES)), atol=1e-9)
 
 

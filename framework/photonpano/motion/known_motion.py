@@ -1,0 +1,87 @@
+"""A motion that is known at every frame, such as a refined one, and what a level corrects of it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from photonpano.contracts.protocols import Trajectory
+from photonpano.geometry import (
+    Camera,
+    FrameTrajectory,
+    from_parameters,
+    inverse,
+    likely_rotations,
+    nearest_rotations,
+    parameters,
+    scaled_ahead,
+)
+from photonpano.motion.locate import LocatedLevel
+from photonpano.motion.rotation_graph import Rotations
+from photonpano.motion.rotations import RotationTrajectory
+from photonpano.values import FloatArray
+
+
+class Knots(NamedTuple):
+    """What an interpolator passes at the instants of N located exposures."""
+
+    homographies: FloatArray  # (N, 3, 3)
+    information: FloatArray | None  # see `LocatedLevel`
+    rotations: Rotations | None  # of a camera that turns; None for homographies
+
+    @classmethod
+    def of(cls, located: LocatedLevel) -> Knots:
+        """Return the motions of the exposures themselves."""
+        return cls(located.homographies, located.information, located.solution.rotations)
+
+
+class KnownMotion:
+    """A motion that is known at every frame, which exposures merged along it correct.
+
+    The corrections change slowly, even where the motion trembles faster than the exposures follow each other.
+    """
+
+    def __init__(self, motion: Trajectory, n_frames: int, camera: Camera | None, frame_shape: tuple[int, int]) -> None:
+        """Take the motion of the frames as that of a camera, if it turns: one of another focal length moves the image alike."""
+        known = motion.at(np.arange(n_frames))
+        if camera is not None:
+            if isinstance(motion, RotationTrajectory):
+                turned = Rotations(motion.camera.rotations(known), motion.camera).seen_by(camera).rotations
+            else:
+                turned = likely_rotations(camera, known, frame_shape)
+            known = camera.homographies(turned)
+        self._known = FrameTrajectory(known)
+
+    def corrections(self, located: LocatedLevel) -> Knots:
+        """Return the small motions of the frames after which the known motion is that of the exposures."""
+        homographies, information, rotations = Knots.of(located)
+        known, middle = self._known.at(located.instants), len(homographies) // 2
+        back = inverse(known) @ known[middle] @ inverse(homographies[middle])
+        found = scaled_ahead(back @ homographies)
+        if rotations is not None:
+            return Knots(found, information, Rotations(nearest_rotations(rotations.camera.rotations(found)), rotations.camera))
+        if information is not None:
+            to_corrections = np.linalg.inv(_slopes(back, homographies, found))
+            information = np.swapaxes(to_corrections, -1, -2) @ information @ to_corrections
+        return Knots(found, information, None)
+
+    def corrected(self, corrections: Trajectory) -> Trajectory:
+        """Return the known motion, each frame of which is corrected."""
+        return _Corrected(self._known, corrections)
+
+
+class _Corrected(NamedTuple):
+    known: Trajectory
+    corrections: Trajectory
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        return np.asarray(self.known.at(frame_indices) @ self.corrections.at(frame_indices))
+
+
+def _slopes(back: FloatArray, homographies: FloatArray, found: FloatArray) -> FloatArray:
+    """Return the derivatives of p1..p8 of `found` = back @ homographies by those of the homographies: (N, 8, 8)."""
+    depth = (back @ homographies)[:, None, 2:, 2:]
+    changes = (back[:, None] @ (from_parameters(np.eye(8)) - np.eye(3))) / depth
+    return np.swapaxes(parameters(np.eye(3) + changes - found[:, None] * changes[..., 2:, 2:]), -1, -2)
