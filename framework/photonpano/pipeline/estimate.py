@@ -45,7 +45,7 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
     for each in tried:
         n_decisions, state = len(state.decisions), passes.tried(state, each).state
         journal += state.decisions[n_decisions:]
-    journal += state.timeline.decisions
+    journal += [*state.timeline.decisions, *_model_decisions(plan, state.results)]
     return state
 
 
@@ -80,7 +80,7 @@ def _start(source: Source, reference: int, journal: list[Decision], context: Con
     return ConstantVelocity(found.velocity, reference)
 
 
-def model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:
+def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:
     """Return which model `auto` took at the last level, for the record."""
     located = results[-1].located
     if plan.motion.model != "auto" or located.evidence is None:

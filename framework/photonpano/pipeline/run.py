@@ -9,7 +9,7 @@ from photonpano.contracts.protocols import light_of
 from photonpano.errors import InputError
 from photonpano.execution.context import Progress, usual
 from photonpano.pipeline.checkpoints.work_folder import Continuation
-from photonpano.pipeline.estimate import estimate, model_decisions
+from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
 from photonpano.pipeline.following.follow import followed
 from photonpano.pipeline.kept_exposures import write_exposures
@@ -105,7 +105,6 @@ def make_panorama(run: BegunRun) -> None:
         with naming_obstacles(run.source, journal):
             state = estimate(plan, run.source, journal, context)
         state, explained = refine(state, build_refiners(plan, state.view.source, journal))
-        journal += model_decisions(plan, state.results)
         source, context = state.view
         verdict = judge(explained, state.results, journal)
         panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context)

@@ -69,11 +69,16 @@ class State:
         return replace(self, results=(*before, *estimate_motion(self.source, levels, *given, corrects)), outdated=False)
 
     def relocated(self) -> State:
-        """Run the last level again along the refined motion, which it corrects: its exposures are then sharper."""
+        """Run the last level again along the refined motion, which it corrects: its exposures are then sharper.
+
+        The model of the motion stays the one that was chosen, since tremor in each exposure is explained by any that is richer.
+        """
         motion: Trajectory = self.motion.trajectory
         if self.motion.camera is not None:
             motion = RotationTrajectory(motion, self.motion.camera, self.reference)
-        return replace(self.located([self.results[-1].level], motion, corrects=True), refined=None, known_fit=None)
+        result = self.results[-1]
+        again = replace(self, model=result.located.solution.model).located([result.level], motion, corrects=True)
+        return replace(again, refined=None, known_fit=None)
 
     def corrected(self, source: Source, correction: Vignette | Light, decision: Decision) -> State:
         """Return the state of a capture with one more correction, on which its checkpoints then depend."""

@@ -34,9 +34,15 @@ class LensDistortion:
 
 
 def shown_lens(residuals: Residuals, motion: FrameMotion) -> LensDistortion | None:
-    """Return the distortion that the residuals of a motion show beyond doubt; None if they show none."""
+    """Return the distortion that the residuals of a motion show beyond doubt; None if they show none.
+
+    Motion and light that are not explained, such as a tremor, move blocks by more than photon noise.
+    """
     found = lens_distortion(*residuals.block_shifts(), motion.homographies[motion.located], residuals.frame_shape)
-    return found if found is not None and found.sigmas > _SIGNIFICANT else None
+    if found is None:
+        return None
+    std = found.std * max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
+    return LensDistortion(found.k1, std) if abs(found.k1) > _SIGNIFICANT * std else None
 
 
 def lens_distortion(
