@@ -120,6 +120,7 @@ from .values import LostFrames as LostFrames
 from .values import NotLocated as NotLocated
 from .values import Panorama as Panorama
 from .values import PanoramaRows as PanoramaRows
+from .values import Patches as Patches
 from .values import PosedView as PosedView
 from .values import PoseEstimate as PoseEstimate
 from .values import Refined as Refined

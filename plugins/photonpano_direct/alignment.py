@@ -11,7 +11,7 @@ from threading import local
 
 import numpy as np
 
-from photonpano import FloatArray, Homography, NotLocated
+from photonpano import FloatArray, Homography, NotLocated, Patches
 from photonpano.compiling import compiled
 from photonpano.geometry import corners, generators, slopes, unit_coordinates, violation, why_implausible
 from photonpano.locating import NO_TEXTURE, information_on_turn
@@ -26,6 +26,7 @@ from photonpano_direct.curvature import (
     information_of,
 )
 from photonpano_direct.moments import Buffers, Layer, residuals_and_moments
+from photonpano_direct.patches import patches_of, sums_of_patches
 from photonpano_direct.small_matrices import applied, dot, inverse_homography, product, scaled_to_one, solve, transposed
 
 # Exit status: no texture is flat, an impossible homography diverges.
@@ -47,6 +48,7 @@ class Quality:
     noise_ratio: float  # mean squared residual relative to that of photon noise
     overlap: float  # fraction of the template that both see
     std_px: float  # expected error of a corner, in px of the layer
+    patches: Patches | None  # where patches lie, in px of the layer; None without texture
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +74,8 @@ class Aligned:
         # A Gaussian blur of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
         noise_ratio = self.squares / self.pixels * 4 * np.pi * self.template.blur_px**2
         shape = (self.template.image.shape[0], self.template.image.shape[1])
-        information, std_px = information_of(
+        sums = sums_of_patches(self.template, self.buffers)
+        information, std_px, common = information_of(
             self.template,
             self.buffers,
             self.homography,
@@ -81,9 +84,10 @@ class Aligned:
             noise_ratio,
             _coordinates(shape),
         )
+        patches = patches_of(sums, self.homography, shape, common, noise_ratio) if np.isfinite(std_px) else None
         if camera_matrix is not None and np.isfinite(std_px):
             information, std_px = information_on_turn(information, self.homography, camera_matrix, shape)
-        return Quality(information=information, noise_ratio=noise_ratio, overlap=self.overlap, std_px=std_px)
+        return Quality(information=information, noise_ratio=noise_ratio, overlap=self.overlap, std_px=std_px, patches=patches)
 
 
 def align(

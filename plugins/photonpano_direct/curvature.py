@@ -143,20 +143,22 @@ def information_of(
     weights: float,
     noise_ratio: float,
     coordinates: Coordinates,
-) -> tuple[FloatArray, float]:
+) -> tuple[FloatArray, float, float]:
     """Return the inverse covariance of p1..p8, (8, 8), and the expected error of a corner in px, infinite without texture.
 
-    Residual and weight of the buffers come from `residuals_and_moments`, and all are overwritten. `noise_ratio` is the mean
-    squared residual relative to that of photon noise.
+    The third result is the share of the template's curvature that both images have in common. Residual and weight of the
+    buffers come from `residuals_and_moments`, and all are overwritten. `noise_ratio` is the mean squared residual relative to
+    that of photon noise.
     """
-    _, hessian = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
+    own, hessian = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
     # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights and positions
     # hardly change within the blur, so M needs only blurred gradients.
     np.multiply(buffers.weight, buffers.weight, out=buffers.weight)
     np.multiply(buffers.weight, np.float32(pixels / weights), out=buffers.weight)
     scatter, root = _hessian(moving.smoothed, moving.smoothed, buffers.weight), np.zeros((8, 8))
     if not cholesky(scatter, root):
-        return PRIOR.copy(), np.inf
+        return PRIOR.copy(), np.inf, 0.0
+    common = float(np.trace(np.linalg.solve(own, hessian))) / 8
     solve_lower(root, hessian)
     information = hessian.T @ hessian / max(1.0, noise_ratio) + PRIOR
     std_px = expected_px(information, np.eye(8), coordinates.to_corners)
@@ -164,4 +166,4 @@ def information_of(
     changed = homography @ coordinates.generators
     to_parameters = (changed - homography * changed[:, 2:, 2:])[:, _ROWS, _COLUMNS].T
     to_step = np.linalg.inv(to_parameters)
-    return to_step.T @ information @ to_step, std_px if std_px > 0 else np.inf
+    return to_step.T @ information @ to_step, std_px if std_px > 0 else np.inf, common

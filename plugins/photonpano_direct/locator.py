@@ -241,7 +241,8 @@ class _Alignment:
             reason = f"the images leave the corners uncertain by {std_px:.2g} px, more than max_std_px = {config.max_std_px:g}"
         else:
             units = np.array([1, 1, 1, 1, scale, scale, 1 / scale, 1 / scale])
-            return Located(homography, quality.information * np.outer(units, units), std_px, evidence)
+            patches = quality.patches and quality.patches.rescaled(1 / scale)
+            return Located(homography, quality.information * np.outer(units, units), std_px, evidence, patches)
         return NotLocated(reason, evidence)
 
 

@@ -26,7 +26,7 @@ from photonpano.contracts.rules import (
     shown,
     text,
 )
-from photonpano.geometry import corner_displacements, corners, transform_points
+from photonpano.geometry import PATCHES, corner_displacements, corners, transform_points
 from photonpano.values import FloatArray, Group, Homography, Located, NotLocated, Response, VirtualExposure
 
 # A pair that moves the corners by less is nearly the identity; an image that moves by this much between exposures moves.
@@ -146,6 +146,17 @@ def _no_residual(found: Located, _: None) -> object:
     return residual_px is not None and not (_is_number(residual_px) and 0 <= residual_px < np.inf) and (residual_px,)
 
 
+def _no_patches(found: Located, _: None) -> object:
+    if found.patches is None:
+        return None
+    shapes = {"shifts": (PATCHES**2, 2), "information": (PATCHES**2, 2, 2)}
+    for name, shape in shapes.items():
+        array = getattr(found.patches, name)
+        if not is_real(array) or array.shape != shape or not np.isfinite(array).all():
+            return name, shape, shown(array)
+    return None
+
+
 _OF_A_PAIR: tuple[Rule, ...] = (
     instance("Located or NotLocated", Located, NotLocated),
     (
@@ -181,6 +192,7 @@ LOCATED: Contract[Located] = Contract(
             lambda found, _: found.information is not None and not is_inverse_covariance(found.information),
         ),
         ("residual_px is a finite number of at least 0, None if it is not known; got {!r:.60}", _no_residual),
+        ("patches are None, or finite arrays: {} of shape {}, got {}", _no_patches),
     ],
     strict=[
         _STRICT,

@@ -3,6 +3,7 @@ from .alignment import align_rotations as align_rotations
 from .camera import ROTATION_AXES as ROTATION_AXES
 from .camera import Camera as Camera
 from .camera import camera_matrix as camera_matrix
+from .camera import lenses_apart_px as lenses_apart_px
 from .camera import likely_rotations as likely_rotations
 from .camera import nearest_rotations as nearest_rotations
 from .camera import rotation_matrices as rotation_matrices
@@ -17,6 +18,7 @@ from .canvas import canvas_of as canvas_of
 from .canvas import canvas_of_box as canvas_of_box
 from .canvas import depths as depths
 from .homographies import BLOCK_FRAMES as BLOCK_FRAMES
+from .homographies import PATCHES as PATCHES
 from .homographies import FrameTrajectory as FrameTrajectory
 from .homographies import apply as apply
 from .homographies import corner_displacements as corner_displacements
@@ -27,6 +29,7 @@ from .homographies import inverse as inverse
 from .homographies import jacobian as jacobian
 from .homographies import normalised as normalised
 from .homographies import parameters as parameters
+from .homographies import patch_centres as patch_centres
 from .homographies import rescaled as rescaled
 from .homographies import rescaling as rescaling
 from .homographies import scaled_ahead as scaled_ahead

@@ -83,6 +83,14 @@ class Camera:
         # Beyond the radius at which the image folds over, the iteration ends anywhere.
         return self._in_px(np.where((away <= 1e-6)[..., None], found, np.nan))
 
+    def ideal_shift(self, points: ArrayLike, shift: FloatArray) -> FloatArray:
+        """Return how (..., 2) ideal pixels move if their images in a frame move by a small (..., 2) shift, to first order."""
+        if not self.distorts:
+            return shift
+        (a, b), (_, d) = self._slopes(self._in_focal_lengths(points))
+        x, y = np.moveaxis(shift, -1, 0)
+        return np.stack([d * x - b * y, a * y - b * x], axis=-1) / (a * d - b * b)[..., None]
+
     def directions(self, points: ArrayLike) -> FloatArray:
         """Return the unit vectors in which (..., 2) pixels of a frame look: (..., 3)."""
         ideal = self._in_focal_lengths(self.ideal(points))
@@ -157,6 +165,14 @@ def rotation_vectors(rotations: ArrayLike) -> FloatArray:
 
     rotations = np.asarray(rotations, dtype=np.float64)
     return np.asarray(Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()).reshape(rotations.shape[:-1])
+
+
+def lenses_apart_px(first: Camera, second: Camera, frame_shape: tuple[int, int]) -> float:
+    """Return the largest difference of where two cameras undistort a pixel of a frame to."""
+    frame = corners(frame_shape)
+    # From the middle to the corners: k1 and k2 may cancel each other somewhere.
+    places = frame.mean(axis=0) + np.linspace(0.25, 1, 4)[:, None, None] * (frame - frame.mean(axis=0))
+    return float(np.linalg.norm(first.ideal(places) - second.ideal(places), axis=-1).max())
 
 
 def nearest_rotations(matrices: ArrayLike) -> FloatArray:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from photonpano.values import FloatArray, Homography
 
 BLOCK_FRAMES = 8192  # what is computed of all frames of a capture is computed for this many at a time, which bounds the memory
+PATCHES = 12  # along each side of an image
 _PARAMETERS = ((0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1))  # row and column of p1..p8
 
 
@@ -149,6 +150,12 @@ def corners(shape: tuple[int, int]) -> FloatArray:
     points = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
     points.flags.writeable = False
     return points
+
+
+def patch_centres(shape: tuple[int, int]) -> FloatArray:
+    """Return the middles of the patches into which an image of (height, width) is divided, row by row: (P, 2), P = 12 x 12."""
+    y, x = ((np.arange(PATCHES) + 0.5) * side / PATCHES - 0.5 for side in shape)
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def corner_displacements(first: Homography, second: Homography, shape: tuple[int, int]) -> FloatArray:

@@ -59,6 +59,7 @@ class Cost:
     unknowns: int
     shared: int  # those of them that all nodes share
     left: int  # degrees of freedom of the residuals
+    explained: float = 0.0  # by how much a lens lowers the squared residuals of patches that homographies leave
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,8 +177,9 @@ class Adjustment(ABC, Generic[StateT]):
         """How many numbers are to be found."""
         return self._n_node * (self._n_nodes - 1) + self._n_shared
 
-    def cost(self, norms: FloatArray, kept: BoolArray) -> Cost:
+    def cost(self, state: StateT, norms: FloatArray, kept: BoolArray) -> Cost:
         """Return what a solution leaves of the edges that are kept, given the (E,) norms of their whitened residuals."""
+        del state
         squares = float(8 * (norms[kept] ** 2).sum())
         return Cost(squares, self.unknowns, self._n_shared, 8 * int(kept.sum()) - self.unknowns)
 

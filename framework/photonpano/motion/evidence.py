@@ -61,7 +61,7 @@ def likeliest(costs: Mapping[MotionModel, Cost]) -> MotionModel:
 
     def score(model: MotionModel) -> float:
         cost = costs[model]
-        return (cost.squares + _SHARED * cost.shared) / scale + _PRICE * (cost.unknowns - cost.shared)
+        return (cost.squares - cost.explained + _SHARED * cost.shared) / scale + _PRICE * (cost.unknowns - cost.shared)
 
     best = min((model for model in costs if model.kind != "translation"), key=score)
     shifts = (model for model in costs if model.kind == "translation" and best.kind == "euclidean")

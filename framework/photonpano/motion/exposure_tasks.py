@@ -208,7 +208,8 @@ class ExposureTasks:
             return motion
         groups = self.exposures.groups
         new = self.independent * max(1 - shared_share(groups[pair.moving].span, groups[pair.fixed].span), MIN_PAIR_WEIGHT)
-        return replace(motion, information=motion.information * new)
+        patches = motion.patches and replace(motion.patches, information=motion.patches.information * new)
+        return replace(motion, information=motion.information * new, patches=patches)
 
     def _features(self, index: int, locator: int, known: Descriptions, clock: Stopwatch) -> Any:
         """Return what a locator makes of an exposure; for a fallback, it is merged again."""

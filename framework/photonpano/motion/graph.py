@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from photonpano.geometry import (
+    Camera,
     generators,
     inverse,
+    lenses_apart_px,
     likely_rotations,
     normalised,
     parameters,
@@ -22,7 +24,7 @@ from photonpano.geometry import (
 )
 from photonpano.motion.adjustment import OUTLIER, Adjustment, Assessment, Cost, Problem
 from photonpano.motion.evidence import Evidence, likeliest
-from photonpano.motion.model import HOMOGRAPHIES, MotionModel
+from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
 from photonpano.motion.planar import PlanarName, basis_of, moved, nearest
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
@@ -93,7 +95,7 @@ def solve(
         return tied.alone(model)
     if model.kind == "auto":
         fits = _rivals(tied, start, model)
-        chosen = likeliest(_costs(fits))
+        chosen = _chosen(tied, fits)
         return tied.solution(fits[chosen], chosen, lambda: Evidence.of(_costs(fits)))
     fit = _fitted(tied, start, model)
     return tied.solution(fit, model, partial(_compared, tied, start, model, fit))
@@ -107,9 +109,22 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
             # No plane holds all frames of a camera that turns far.
             with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
                 fits[rival] = _fitted(tied, start, rival, list(fits.values()))
-        if fits and likeliest(_costs(fits)).is_simple:
+        if fits and _chosen(tied, fits).is_simple:
             break
     return fits
+
+
+def _chosen(tied: _Tied, fits: Mapping[MotionModel, _Fit]) -> MotionModel:
+    """Return the likeliest model; a lens must move pixels enough to matter."""
+
+    def matters(model: MotionModel) -> bool:
+        if not model.finds_lens:
+            return True
+        camera: Camera = fits[model].state.camera
+        return lenses_apart_px(camera, Camera(camera.matrix), tied.frame_shape) >= SAME_LENS_PX
+
+    costs = _costs(fits)
+    return likeliest({model: costs[model] for model in costs if len(fits) == 1 or matters(model)})
 
 
 def _compared(tied: _Tied, start: FloatArray | None, model: MotionModel, fit: _Fit) -> Evidence | None:
@@ -127,7 +142,7 @@ def _compared(tied: _Tied, start: FloatArray | None, model: MotionModel, fit: _F
 def _costs(fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, Cost]:
     """Return the costs of models for the edges that the one with most unknowns keeps."""
     richest = max(fits.values(), key=lambda fit: fit.adjustment.unknowns)
-    return {model: fit.adjustment.cost(np.minimum(fit.norms, OUTLIER), richest.kept) for model, fit in fits.items()}
+    return {model: fit.adjustment.cost(fit.state, np.minimum(fit.norms, OUTLIER), richest.kept) for model, fit in fits.items()}
 
 
 def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel, fits: Sequence[_Fit] = ()) -> _Fit:

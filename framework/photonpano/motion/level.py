@@ -110,7 +110,8 @@ class Level:
             units = np.array([1, 1, 1, 1, self.scale, self.scale, 1 / self.scale, 1 / self.scale])
             information = information * np.outer(units, units)
         residual_px = None if motion.residual_px is None else motion.residual_px / self.scale
-        return replace(motion, homography=homography, information=information, residual_px=residual_px)
+        patches = None if motion.patches is None else motion.patches.rescaled(1 / self.scale)
+        return replace(motion, homography=homography, information=information, residual_px=residual_px, patches=patches)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

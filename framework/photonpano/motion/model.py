@@ -14,6 +14,7 @@ ModelName = Literal["auto", "translation", "euclidean", "similarity", "affine", 
 # Initial focal length, in longer sides of a frame.
 _FIRST_FOCAL = 3.0
 _LENS = (None, None, 0.0, 0.0)  # what "auto" finds of a lens: k1 and k2
+SAME_LENS_PX = 0.05  # largest difference of what two lenses do to a frame that does not matter
 _FAR_FOCAL = 1e4  # that of a camera whose turns shift and roll the image
 
 
@@ -65,12 +66,6 @@ class MotionModel:
     def finds_lens(self) -> bool:
         """Whether the distortion of the lens is to be found."""
         return any(index > 0 for index in self.unknown)
-
-    def with_lens(self) -> MotionModel | None:
-        """Return rotations of a camera whose lens is to be found; None where the model allows none, or has one already."""
-        if self.kind not in ("auto", "rotation") or any(number != 0 for number in self.distortion):
-            return None
-        return replace(self, kind="rotation", distortion=_LENS)
 
     def camera(self, frame_shape: tuple[int, int]) -> Camera:
         """Return what is known of the camera so far; what is not begins at 3 sides of a frame, and without distortion."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,14 +14,16 @@ from photonpano.geometry import (
     camera_matrix,
     corners,
     generators,
+    patch_centres,
     rotation_matrices,
     rotation_vectors,
     rotations_between,
     slopes,
     transform_points,
 )
-from photonpano.motion.adjustment import Adjustment, Problem
-from photonpano.values import BoolArray, FloatArray
+from photonpano.motion.adjustment import CAUCHY, Adjustment, Cost, Problem
+from photonpano.robust import robust_std
+from photonpano.values import BoolArray, FloatArray, Located
 
 _FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # tried first, in sides of a frame
 # Prior of the focal length, in sides of a frame, and the standard deviation of its logarithm.
@@ -32,7 +35,8 @@ _MOST_TRIED = 400  # edges by which the first focal length is chosen
 _UNIQUE_TURN = 2.0
 _MOST_ZOOM = 10.0  # of one step
 _POWERS = np.array([2, 4, 1, 1])  # of the focal length, with which k1, k2, p1 and p2 grow if the lens bends pixels alike
-_GRID = 7  # points of a frame along each axis to which a homography is fitted
+_FEWEST = 7  # patches that determine a homography
+_DAMPING, _TINY = 1e-9, 1e-30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,41 +61,70 @@ class Rotations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensShift:
-    """Change of the homographies of pairs caused by undistorting pixels with the wrong lens."""
+    """What undistorting pixels with the wrong lens does to pairs: it changes their homographies, and bends their patches."""
 
-    points: FloatArray  # (P, 2) all over a frame
-    seen: BoolArray  # (E, P) which of them both exposures of each pair see
-    # (E, 8, 2 P) from the shifts of the points to those of the corners, by the small homography that fits those seen best
-    to_corners: FloatArray
+    points: FloatArray  # (P, 2) middles of the patches
+    shifts: FloatArray  # (E, P, 2) where the patches of each pair lie beyond its homography, px; 0 where they are not known
+    roots: FloatArray  # (E, P, 2, 2) R of their information R' R
+    of_homography: FloatArray  # (E, 2 P, 8) derivatives of the patches by a small homography of each pair
+    fitted: FloatArray  # (E, 8, 2 P) from shifts of the patches to the homography that explains them best
+    to_corners: FloatArray  # (E, 8, 8) from that to the shifts of the corners
+    # standard deviation of the residuals of the patches: below 1 where information leaves out photons that pairs share
+    noise: float = 1.0
 
     @classmethod
-    def of(cls, frame_shape: tuple[int, int], observed: FloatArray) -> LensShift:
-        """Lay points over the frames of pairs with (E, 3, 3) homographies."""
-        height, width = frame_shape
-        x, y = ((np.arange(_GRID) + 0.5) / _GRID * side - 0.5 for side in (width, height))
-        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        mapped = transform_points(observed, points)
-        seen = np.all((mapped >= 0) & (mapped <= [width - 1, height - 1]), axis=-1)
-        # Four points at least determine a homography; a pair that hardly overlaps takes all.
-        seen[seen.sum(axis=1) < _GRID] = True
+    def of(cls, frame_shape: tuple[int, int], motions: Sequence[Located]) -> LensShift:
+        """Take the patches of pairs; without them, those that both exposures see count alike."""
+        (height, width), points = frame_shape, patch_centres(frame_shape)
+        observed = np.array([motion.homography for motion in motions])
 
         def slopes_at(places: FloatArray) -> FloatArray:
             there = observed @ np.concatenate([places, np.ones((len(places), 1))], axis=1).T
             return slopes(there, generators(frame_shape) @ there[:, None])
 
+        mapped = transform_points(observed, points)
+        seen = np.all((mapped >= 0) & (mapped <= [width - 1, height - 1]), axis=-1)
+        # Four points at least determine a homography; a pair that hardly overlaps takes all.
+        seen[seen.sum(axis=1) < _FEWEST] = True
+        shifts, weights = np.zeros((*seen.shape, 2)), seen[..., None, None] * np.eye(2)
+        roots = np.zeros_like(weights)
+        for edge, patches in enumerate(motion.patches for motion in motions):
+            if patches is not None and (patches.information[:, 0, 0] > 0).sum() >= _FEWEST:
+                shifts[edge], weights[edge] = patches.shifts, patches.information
+                values, vectors = np.linalg.eigh(patches.information)
+                roots[edge] = np.sqrt(np.maximum(values, 0))[..., None] * np.swapaxes(vectors, -1, -2)
         by_points = slopes_at(points)
-        weighted = np.swapaxes(by_points * np.repeat(seen, 2, axis=1)[..., None], -1, -2)
-        return cls(points, seen, slopes_at(corners(frame_shape)) @ np.linalg.solve(weighted @ by_points, weighted))
+        weighted = weights @ by_points.reshape(*seen.shape, 2, 8)
+        weighted = np.swapaxes(weighted.reshape(by_points.shape), -1, -2)
+        normal = weighted @ by_points
+        normal += _DAMPING * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(8)
+        found = cls(points, shifts, roots, by_points, np.linalg.solve(normal, weighted), slopes_at(corners(frame_shape)))
+        noise = robust_std(found.unexplained()[roots.any(axis=(2, 3)).repeat(2)])
+        return replace(found, roots=roots / max(noise, 1.0), noise=min(noise, 1.0))
 
-    def of_corners(self, relative: FloatArray, camera: Camera, assumed: Camera) -> FloatArray:
-        """Return the change of corner displacement caused by undistorting with the wrong lens: (E, 4, 2) px.
+    def of_patches(self, relative: FloatArray, camera: Camera, assumed: Camera) -> FloatArray:
+        """Return how patches are shifted by undistorting with the wrong lens: (E, 2 P) px.
 
         `relative` (E, 3, 3) map ideal pixels of the true camera; pixels were undistorted with the one that was `assumed`.
         """
-        ideal = camera.ideal(assumed.distorted(self.points))
-        there = assumed.ideal(camera.distorted(transform_points(relative, ideal)))
-        shift = np.nan_to_num(there - transform_points(relative, self.points)).reshape(len(relative), -1, 1)
-        return np.asarray(self.to_corners @ shift).reshape(-1, 4, 2)
+        there = transform_points(relative, self.points)
+        seen = camera.distorted(transform_points(relative, camera.ideal(assumed.distorted(self.points))))
+        shift = assumed.ideal_shift(there, seen - assumed.distorted(there))
+        return np.nan_to_num(shift).reshape(len(relative), -1)
+
+    def of_corners(self, shift: FloatArray) -> FloatArray:
+        """Return by how much shifts of the patches, (E, 2 P), displace the corners of the homography: (E, 4, 2) px."""
+        return np.asarray(self.to_corners @ (self.fitted @ shift[..., None])).reshape(-1, 4, 2)
+
+    def unexplained(self, shift: FloatArray | None = None) -> FloatArray:
+        """Return what shifts leave of those that were seen, beyond homographies: (2 E P,) of unit variance, outliers less."""
+        left = self.shifts
+        if shift is not None:
+            bent = shift - (self.of_homography @ (self.fitted @ shift[..., None]))[..., 0]
+            left = left - bent.reshape(left.shape)
+        whitened = np.einsum("epij,epj->epi", self.roots, left)
+        squares = (whitened**2).sum(axis=-1, keepdims=True) / CAUCHY**2
+        return np.asarray(whitened * np.sqrt(np.log1p(squares) / np.maximum(squares, _TINY))).ravel()
 
 
 class RotationAdjustment(Adjustment[Rotations]):
@@ -110,11 +143,14 @@ class RotationAdjustment(Adjustment[Rotations]):
         """
         super().__init__(problem, n_shared=len(unknown))
         self._assumed, self._unknown = assumed, unknown
-        self._observed = problem.observed
+        self._motions = problem.motions
+        # What was computed of the current state, and of states near it.
+        self._near: tuple[Rotations, list[Rotations]] | None = None
+        self._shifts: dict[Rotations, FloatArray] = {}
 
     @cached_property
     def _lens(self) -> LensShift:
-        return LensShift.of(self._frame_shape, self._observed)
+        return LensShift.of(self._frame_shape, self._motions)
 
     def homographies(self, state: Rotations) -> FloatArray:
         """Return K R K^-1, of determinant 1: (N, 3, 3)."""
@@ -135,13 +171,10 @@ class RotationAdjustment(Adjustment[Rotations]):
     def mapped_corners(self, state: Rotations) -> FloatArray:
         """Return where the corners are seen: (E, 4, 2) px.
 
-        If pixels were undistorted with the wrong lens, no homography holds exactly; it is the one that fits best where both
-        exposures see the scene.
+        If pixels were undistorted with the wrong lens, no homography holds exactly; it is the one that fits the patches best.
         """
         mapped = super().mapped_corners(state)
-        if not (state.camera.distorts or self._assumed.distorts):
-            return mapped
-        return mapped + self._lens.of_corners(self.relative(state), state.camera, self._assumed)
+        return mapped + self._lens.of_corners(self._shift(state)) if self._bends(state) else mapped
 
     def generators(self, state: Rotations) -> FloatArray:
         """Return the derivatives by rotations that move the middle of the frame by about half its side: (3, 3, 3)."""
@@ -167,15 +200,48 @@ class RotationAdjustment(Adjustment[Rotations]):
 
     def _nearby(self, state: Rotations) -> list[Rotations]:
         """Return the state after a small step of each unknown of the camera."""
-        units = self._units(state.camera)
-        return [self._changed(state, index, _STEP * unit) for index, unit in zip(self._unknown, units, strict=True)]
+        if self._near is None or self._near[0] is not state:
+            units = self._units(state.camera)
+            steps = [self._changed(state, index, _STEP * unit) for index, unit in zip(self._unknown, units, strict=True)]
+            self._near = state, steps
+            self._shifts = {key: shift for key, shift in self._shifts.items() if key is state}
+        return self._near[1]
+
+    def _bends(self, state: Rotations) -> bool:
+        return state.camera.distorts or self._assumed.distorts
+
+    def _shift(self, state: Rotations) -> FloatArray:
+        """Return how patches are shifted if this is the camera: (E, 2 P)."""
+        if state not in self._shifts:
+            self._shifts[state] = self._lens.of_patches(self.relative(state), state.camera, self._assumed)
+        return self._shifts[state]
+
+    def _unexplained(self, state: Rotations) -> FloatArray:
+        return self._lens.unexplained(self._shift(state) if self._bends(state) else None)
+
+    @property
+    def _finds_lens(self) -> bool:
+        return any(index > 0 for index in self._unknown)
+
+    def cost(self, state: Rotations, norms: FloatArray, kept: BoolArray) -> Cost:
+        """Return what a solution leaves; a lens also explains why patches lie beside homographies."""
+        cost = super().cost(state, norms, kept)
+        if not self._finds_lens:
+            return cost
+        before, after = (float((each**2).sum()) for each in (self._lens.unexplained(), self._unexplained(state)))
+        return replace(cost, explained=(before - after) / max(self._lens.noise, _TINY) ** 2)
 
     def prior(self, state: Rotations) -> tuple[FloatArray, FloatArray]:
-        """Return what is known before: a focal length of some sides of a frame, and a lens that distorts by less than that."""
+        """Return what is known before: a focal length of some sides of a frame, a small distortion, and where patches lie."""
         units = self._units(state.camera)
         away = [_away(state.camera, index, 2 * self._half) for index in self._unknown]
         stds = np.where(np.array(self._unknown) == 0, _PRIOR_STD, _PRIOR_DISTORTION * units)
-        return np.asarray(away / stds), np.diag(units / stds)
+        known, of_known = np.asarray(away / stds), np.diag(units / stds)
+        if not self._finds_lens:
+            return known, of_known
+        left = self._unexplained(state)
+        of_left = np.stack([(self._unexplained(each) - left) / _STEP for each in self._nearby(state)], axis=-1)
+        return np.concatenate([known, left]), np.concatenate([of_known, of_left])
 
     def _units(self, camera: Camera) -> FloatArray:
         """Return the change of each unknown that moves the ends of a frame by about half its side."""

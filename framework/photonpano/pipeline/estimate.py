@@ -38,8 +38,6 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
         passes.in_changing_light,
         partial(passes.later_levels, journal=journal),
         *[passes.through_found_lens] * _MOST_LENSES,
-        passes.with_lens,
-        *[passes.through_found_lens] * _MOST_LENSES,
         passes.cut_at_jumps,
     )
     for each in tried:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -21,22 +20,19 @@ from photonpano.corrections.lighting import (
     measure_pixel_gain,
 )
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.geometry import Camera, corners
+from photonpano.geometry import Camera, lenses_apart_px
+from photonpano.motion.model import SAME_LENS_PX
 from photonpano.motion.timeline import Cut
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.state import State
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.residuals.cuts import SMALLEST_PX, find_cuts
-from photonpano.residuals.lens import shown_lens
 from photonpano.residuals.refinement import MotionFit
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Light
 
 logger = logging.getLogger(__name__)
 
-_LEAST_LENS = 0.001  # displacement of a corner, relative to its distance from the centre, by a lens that is worth finding
-_LENS_LEFT = 0.5  # a lens is used if the residuals then show less than this part of it
-_SAME_LENS_PX = 0.05  # largest difference of what two lenses do to a frame that does not matter
 _EXPLAINED = 0.9  # changing light is accepted if it lowers the reduced chi-square of the photons to this fraction
 
 
@@ -102,37 +98,10 @@ def through_found_lens(state: State) -> Proposal | None:
     found, result = camera_of_motion(state.trajectory), state.results[-1]
     if found is None or not found.distorts:
         return None
-    seen, frame = camera_of(result.exposures.source) or Camera(found.matrix), corners(state.source.info.frame_shape)
-    # From the middle to the corners: k1 and k2 may cancel each other somewhere.
-    places = frame.mean(axis=0) + np.linspace(0.25, 1, 4)[:, None, None] * (frame - frame.mean(axis=0))
-    if np.linalg.norm(found.ideal(places) - seen.ideal(places), axis=-1).max() < _SAME_LENS_PX:
+    seen = camera_of(result.exposures.source) or Camera(found.matrix)
+    if lenses_apart_px(found, seen, state.source.info.frame_shape) < SAME_LENS_PX:
         return None
     return Proposal(lambda: state.located([result.level], state.trajectory), worse=None)
-
-
-def with_lens(state: State) -> Proposal | None:
-    """Run the last level again with a lens that is to be found, where the residuals show one that the pairs did not.
-
-    It is used if the residuals then show less than half of that, and the photons are explained no worse.
-    """
-    model, found = state.model.with_lens(), camera_of_motion(state.trajectory)
-    if model is None or (found is not None and found.distorts):
-        return None
-    fit = state.fit
-    if (shown := shown_lens(fit.residuals, fit.motion)) is None or abs(shown.k1) < _LEAST_LENS:
-        return None
-    bent, std = shown.k1, shown.std
-
-    def worse(proposed: MotionFit, before: MotionFit) -> str:
-        left = shown_lens(proposed.residuals, proposed.motion)
-        if left is not None and abs(left.k1) > _LENS_LEFT * abs(bent):
-            return f"the residuals show {left.k1:.2%} at the corners with it, and {bent:.2%} without"
-        return proposed.worse_than(before)
-
-    reason = f"the residuals of the motion without a lens show {bent:.2%} ± {std:.2%} at the corners"
-    decided = replace(state, model=model, decisions=(*state.decisions, Decision("lens", "to be found", reason)))
-    make = partial(decided.located, [state.results[-1].level], state.trajectory)
-    return Proposal(make, worse, rejection="the lens that the residuals show is not used")
 
 
 def without_shading(state: State) -> Proposal | None:

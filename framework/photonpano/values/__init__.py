@@ -5,7 +5,7 @@ from photonpano.values.capture import Bayer, CaptureSummary, Decision, DecisionV
 from photonpano.values.exposure import Panorama, PanoramaRows, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, true_spans
 from photonpano.values.light import Light
-from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated, Refined, SpanResiduals
+from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated, Patches, Refined, SpanResiduals
 from photonpano.values.poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "NotLocated",
     "Panorama",
     "PanoramaRows",
+    "Patches",
     "PoseEstimate",
     "PosedView",
     "Refined",

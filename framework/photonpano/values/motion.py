@@ -10,6 +10,24 @@ from photonpano.values.frames import FrameSpan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Patches:
+    """Where the patches of one image lie in another, beyond the homography between the images: a lens shows itself there.
+
+    Attributes:
+        shifts: (P, 2) from where the homography maps the middle of a patch to where it lies, x and y in pixels of the fixed
+            image. The middles are those of `photonpano.geometry.patch_centres`.
+        information: (P, 2, 2) their inverse covariances, 0 for a patch that shows nothing.
+    """
+
+    shifts: FloatArray
+    information: FloatArray
+
+    def rescaled(self, scale: float) -> Patches:
+        """Return them in pixels of images that are rescaled."""
+        return Patches(self.shifts * scale, self.information / scale**2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Located:
     """A pairwise motion that was found.
 
@@ -22,12 +40,14 @@ class Located:
             (section 4, "Interpolate"), None if the locator has none.
         residual_px: root mean square of the residuals after the fit, in pixels of the fixed image; None if unknown.
         evidence: counts of the locator by name (keypoints, matches, inliers, ...), for records and messages.
+        patches: where patches of the moving image lie; None if the locator does not look at them.
     """
 
     homography: Homography
     information: FloatArray | None = None
     residual_px: float | None = None
     evidence: Mapping[str, float] = field(default_factory=dict)
+    patches: Patches | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from photonpano.geometry import (
     corners,
     inverse,
     jacobian,
+    patch_centres,
     rotation_matrices,
     scaled_ahead,
     translation,
@@ -106,6 +107,39 @@ def test_direct_reaches_cramer_rao_bound_within_40_percent(seen_from: Callable, 
         also_seen = (x < SHAPE[1]) & (y >= 0) & (y < SHAPE[0])
         bounds.append(pair_bound_px(0.2 * street[rows, columns], BinaryResponse(), 250, np.where(also_seen, 250.0, 0.0)))
     assert np.sqrt(np.mean(errors)) < 1.4 * np.sqrt(np.mean(np.square(bounds)))
+
+
+def test_patches_lie_where_the_motion_has_them_by_their_information(seen_from: Callable) -> None:
+    true, places, squares = translation(10, -3), patch_centres(SHAPE), list[np.ndarray]()
+    for seed in range(12):
+        located = register(seen_from(true, seed=2 * seed), seen_from(STILL, seed=2 * seed + 1), true)
+        assert isinstance(located, Located)
+        assert located.patches is not None
+        away = apply(located.homography, places) + located.patches.shifts - apply(true, places)
+        each = np.einsum("pi,pij,pj->p", away, located.patches.information, away) / 2
+        squares.append(each[np.trace(located.patches.information, axis1=1, axis2=2) > 0])
+    assert np.concatenate(squares).size > 12 * 100
+    assert 0.5 < np.mean(np.concatenate(squares)) < 2
+
+
+def test_patches_show_what_no_homography_follows(street: np.ndarray, photograph: Callable) -> None:
+    """The moving image is bent as by a lens, by up to 0.6 px beyond the homography that follows it best."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float32)
+
+    def bend(points: np.ndarray) -> np.ndarray:
+        return 2e-5 * (points[..., 1:] - 80) * (points[..., :1] - 120) ** 2 * np.array([0, 1 / 60])
+
+    points = np.stack([x, y], axis=-1)
+    still = cv2.warpPerspective(street, inverse(translation(400, 280)), SHAPE[::-1])
+    seen = cv2.remap(street, *np.moveaxis((points + bend(points) + [400, 280]).astype(np.float32), -1, 0), cv2.INTER_LINEAR)
+    located = register(photograph(seen, 0), photograph(still, 1), STILL)
+    assert isinstance(located, Located)
+    assert located.patches is not None
+    places = patch_centres(SHAPE)
+    expected = places + bend(places) - apply(located.homography, places)
+    weights = located.patches.information[:, 1, 1]
+    slope = (weights * expected[:, 1] * located.patches.shifts[:, 1]).sum() / (weights * expected[:, 1] ** 2).sum()
+    assert slope == pytest.approx(1, abs=0.15)
 
 
 def test_pair_without_overlap_is_rejected_with_reason(seen_from: Callable) -> None:

@@ -16,15 +16,18 @@ from photonpano.geometry import (
     jacobian,
     normalised,
     parameters,
+    patch_centres,
     rotation_matrices,
     rotation_vectors,
+    scaled_ahead,
     transform_points,
 )
+from photonpano.locating import fit_homography
 from photonpano.motion.graph import GraphSolution, solve
 from photonpano.motion.model import MotionModel
 from photonpano.motion.rotation_graph import LensShift, Rotations
 from photonpano.motion.rotations import RotationTrajectory, fit_rotations
-from photonpano.values import Edge, FloatArray, Located, NotLocated
+from photonpano.values import Edge, FloatArray, Located, NotLocated, Patches
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators.interpolating import GeodesicInterpolator, LieInterpolator, LucasKanadeInterpolator
 from photonpano_core.interpolators.smoothing_spline import SmoothingSplineInterpolator
@@ -136,30 +139,75 @@ LENS = (-0.1, 0.0, 0.0, 0.0)
 RELATIVE = rotation_matrices([[0.02, 0.15, 0.05], [0.0, -0.3, 0.0]])
 
 
-def test_known_lens_leaves_homographies_as_they_are() -> None:
-    camera = Camera.of(330.0, SHAPE, LENS)
-    relative = camera.homographies(RELATIVE)
-    np.testing.assert_allclose(LensShift.of(SHAPE, relative).of_corners(relative, camera, camera), 0, atol=1e-8)
+NEAR = (-0.105, 0.028, 0.0, 0.0)
+
+
+def bent(rotations: FloatArray, camera: Camera, seen_by: Camera) -> list[Edge]:
+    """Return pairs of neighbours, with patches, as pixels show them that were undistorted with another camera."""
+    points, rng, std_px = patch_centres(SHAPE), np.random.default_rng(0), 0.05
+    here, found = camera.ideal(seen_by.distorted(points)), []
+    for moving in range(len(rotations)):
+        for fixed in range(max(0, moving - 3), moving):
+            relative = camera.homographies(rotations[fixed].T @ rotations[moving])
+            there = seen_by.ideal(camera.distorted(transform_points(relative, here)))
+            there += std_px * rng.normal(size=there.shape)
+            fit = fit_homography(points, there, np.ones(len(points)), scaled_ahead(relative))
+            shifts = there - transform_points(fit.homography, points)
+            patches = Patches(shifts, np.tile(np.eye(2) / std_px**2, (len(points), 1, 1)))
+            found.append(Edge(moving, fixed, Located(fit.homography, fit.information, fit.residual_px, patches=patches)))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "seen_by"),
+    [(330.0, (333.0, *NEAR)), (2000.0, (2000.0, 0.0, 0.0, 0.0, 0.0))],
+    ids=["a lens nearly known", "a weak lens"],
+)
+def test_patches_of_pairs_show_the_lens_that_their_homographies_follow(focal_px: float, seen_by: tuple[float, ...]) -> None:
+    camera, assumed = Camera.of(focal_px, SHAPE, (-0.11, 0.03, 0, 0)), Camera.of(seen_by[0], SHAPE, seen_by[1:])
+    model = MotionModel("auto").knowing(assumed) if assumed.distorts else MotionModel("auto")
+    solution = solve(20, bent(turn(20, 2e4 / focal_px), camera, assumed), 10, SHAPE, model=model)
+    assert solution.model.name == "rotation with a lens"
+    assert solution.rotations is not None
+    found, std = solution.rotations.camera.numbers, solution.assess().std_camera
+    assert np.abs((found - camera.numbers)[:3] / std[:3]).max() < 4
+    assert std[0] < 0.05 * focal_px
+
+
+def test_patches_without_a_lens_show_none() -> None:
+    camera = Camera.of(330.0, SHAPE)
+    solution = solve(20, bent(turn(20, 60.0), camera, camera), 10, SHAPE, model=MotionModel("auto"))
+    assert solution.model.name == "rotation"
+
+
+def test_patches_that_move_by_themselves_do_not_bend_the_lens() -> None:
+    """A quarter of the frame moves by 3 px in each pair, as a person who walks."""
+    camera, assumed = Camera.of(330.0, SHAPE, (-0.11, 0.03, 0, 0)), Camera.of(333.0, SHAPE, NEAR)
+    edges = bent(turn(20, 60.0), camera, assumed)
+    for edge in edges:
+        assert isinstance(edge.motion, Located)
+        assert edge.motion.patches is not None
+        edge.motion.patches.shifts[:36, 0] += 3.0
+    rotations = solve(20, edges, 10, SHAPE, model=MotionModel("auto").knowing(assumed)).rotations
+    assert rotations is not None
+    np.testing.assert_allclose(rotations.camera.numbers[:3], camera.numbers[:3], rtol=0.1)
 
 
 def test_unknown_lens_moves_corners_as_the_best_homography_between_distorted_pixels() -> None:
     """Between pixels that are taken for ideal, the homography with the least squares over common points is fitted."""
     camera, seen_by = Camera.of(330.0, SHAPE, LENS), Camera.of(330.0, SHAPE)
     relative = camera.homographies(RELATIVE)
-    lens = LensShift.of(SHAPE, relative)
-    found = transform_points(relative, corners(SHAPE)) + lens.of_corners(relative, camera, seen_by)
+    lens = LensShift.of(SHAPE, [Located(scaled_ahead(each)) for each in relative])
+    np.testing.assert_allclose(lens.of_patches(relative, camera, camera), 0, atol=1e-8)
+    found = transform_points(relative, corners(SHAPE)) + lens.of_corners(lens.of_patches(relative, camera, seen_by))
     for number, homography in enumerate(relative):
-        points = lens.points[lens.seen[number]]
+        there = transform_points(homography, patch_centres(SHAPE))
+        points = patch_centres(SHAPE)[np.all((there >= 0) & (there <= [SHAPE[1] - 1, SHAPE[0] - 1]), axis=-1)]
         there = camera.distorted(transform_points(homography, camera.ideal(points)))
-        x, y, (u, v), one, zero = *points.T, there.T, np.ones(len(points)), np.zeros(len(points))
-        rows = [
-            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], 1),
-            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], 1),
-        ]
-        best = np.append(np.linalg.lstsq(np.concatenate(rows), np.concatenate([u, v]), rcond=None)[0], 1).reshape(3, 3)
+        best = fit_homography(points, there, np.ones(len(points)), scaled_ahead(homography)).homography
         moved = np.abs(transform_points(best, corners(SHAPE)) - transform_points(homography, corners(SHAPE))).max()
         assert moved > 5
-        # Least squares of the equations weigh points otherwise than least squares of distances.
+        # To first order, and without robust weights.
         assert np.abs(found[number] - transform_points(best, corners(SHAPE))).max() < 0.2 * moved
 
 

@@ -16,14 +16,12 @@ from photonpano.errors import CanvasTooLargeError
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, corner_displacements, inverse, likely_rotations, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import Cut, Timeline
-from photonpano.pipeline.passes import Pass, Proposal, cut_at_jumps, later_levels, tried, with_lens, worse_in_light
+from photonpano.pipeline.passes import Pass, Proposal, cut_at_jumps, later_levels, tried, worse_in_light
 from photonpano.pipeline.refiners import refine
 from photonpano.pipeline.state import State
 from photonpano.record.run_json import refinement_record
 from photonpano.record.run_warnings import refinement_warnings
-from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.refinement import Explained, MotionFit, NamedRefiner
 from photonpano.specs import parse_spec
@@ -132,45 +130,6 @@ def test_motion_is_not_cut_where_pieces_meet(
     monkeypatch.setattr(State, "fit", None)
     state = cut_at_jumps(BEFORE).make()
     assert (state and [cut.frame for cut in state.timeline.cuts]) == kept
-
-
-@pytest.mark.parametrize(
-    ("model", "shown", "left", "grew", "worse"),
-    [
-        (MotionModel("auto"), -0.02, -0.001, "", ""),
-        (MotionModel("rotation"), -0.02, None, "", ""),
-        (MotionModel("auto"), -0.02, -0.012, "", "the residuals show -1.20% at the corners with it, and -2.00% without"),
-        (MotionModel("auto"), -0.02, -0.001, "the scatter grew", "the scatter grew"),
-        (MotionModel("auto"), -0.0005, None, "", None),
-        (MotionModel("auto"), None, None, "", None),
-        (MotionModel("homography"), -0.02, None, "", None),
-        (MotionModel("auto", 300.0, distortion=(-0.1, 0.0, 0.0, 0.0)), -0.02, None, "", None),
-    ],
-    ids=["auto", "rotation", "half is left", "photons worse", "small", "none", "planar", "given"],
-)
-def test_lens_that_residuals_show_is_found_if_they_then_show_less_than_half_of_it(
-    model: MotionModel, shown: float | None, left: float | None, grew: str, worse: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """`worse` is None where no lens is proposed."""
-    sizes = {"before": shown, "after": left}
-    before, after = (SimpleNamespace(residuals=each, motion=None, worse_than=lambda _: grew) for each in sizes)
-
-    def lens(residuals: str, _: None) -> LensDistortion | None:
-        size = sizes[residuals]
-        return None if size is None else LensDistortion(size, 0.001)
-
-    monkeypatch.setattr("photonpano.pipeline.passes.shown_lens", lens)
-    monkeypatch.setattr(State, "fit", before)
-    monkeypatch.setattr(State, "located", lambda state, *_: state)
-    state = replace(BEFORE, model=model, results=(SimpleNamespace(trajectory=None, level=None),))
-    proposal = with_lens(state)
-    if worse is None or proposal is None:
-        assert proposal is worse
-        return
-    found = proposal.make()
-    assert (found.model.kind, found.model.finds_lens) == ("rotation", True)
-    assert [decision.what for decision in found.decisions] == ["lens"]
-    assert proposal.worse(after, before) == worse
 
 
 SHAPE, FRAMES = (40, 64), 400

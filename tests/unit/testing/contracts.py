@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from photonpano import FrameSpan, Group, Located, NotLocated, Refined
+from photonpano import FrameSpan, Group, Located, NotLocated, Patches, Refined
 from photonpano.geometry import inverse, normalised, translation
 from photonpano.testing import MemorySource
 
@@ -187,6 +187,16 @@ BROKEN: Mapping[str, Mapping[str, Change]] = {
                 "text": np.eye(8).astype(str),
                 "a half": np.eye(8) + np.triu(np.ones((8, 8)), 1) / 9,
                 "one number": 5.0,
+            }.items()
+        },
+        **{
+            f"patches of {name}": motion(patches=Patches(*each))
+            for name, each in {
+                "NaN": (np.full((144, 2), np.nan), np.zeros((144, 2, 2))),
+                "infinite information": (np.zeros((144, 2)), np.full((144, 2, 2), np.inf)),
+                "one variance": (np.zeros((144, 2)), np.zeros((144, 2))),
+                "a list": ([[0.0, 0.0]] * 144, np.zeros((144, 2, 2))),
+                "another grid": (np.zeros((5, 2)), np.zeros((5, 2, 2))),
             }.items()
         },
         "evidence of text": motion(evidence={"inliers": "many"}),
