@@ -115,16 +115,14 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
 
 
 def _chosen(tied: _Tied, fits: Mapping[MotionModel, _Fit]) -> MotionModel:
-    """Return the likeliest model; a lens must move pixels enough to matter."""
-
-    def matters(model: MotionModel) -> bool:
-        if not model.finds_lens:
-            return True
-        camera: Camera = fits[model].state.camera
-        return lenses_apart_px(camera, Camera(camera.matrix), tied.frame_shape) >= SAME_LENS_PX
-
+    """Return the likeliest model; a lens that is not asked for must move pixels enough to matter."""
     costs = _costs(fits)
-    return likeliest({model: costs[model] for model in costs if len(fits) == 1 or matters(model)})
+    if any(model.kind == "rotation" and not model.finds_lens for model in fits):
+        for model in [each for each in fits if each.kind == "rotation" and each.finds_lens]:
+            camera: Camera = fits[model].state.camera
+            if lenses_apart_px(camera, Camera(camera.matrix), tied.frame_shape) < SAME_LENS_PX:
+                del costs[model]
+    return likeliest(costs)
 
 
 def _compared(tied: _Tied, start: FloatArray | None, model: MotionModel, fit: _Fit) -> Evidence | None:
