@@ -35,6 +35,9 @@ _MOST_TRIED = 400  # edges by which the first focal length is chosen
 _UNIQUE_TURN = 2.0
 _MOST_ZOOM = 10.0  # of one step
 _POWERS = np.array([2, 4, 1, 1])  # of the focal length, with which k1, k2, p1 and p2 grow if the lens bends pixels alike
+# Share of the patches that counts, since pairs have photons in common: of 20 captures without a lens, the most that one seemed
+# to explain was 84 before, and the least of 10 with a lens 103.
+_INDEPENDENT = 0.5
 _FEWEST = 7  # patches that determine a homography
 _DAMPING, _TINY = 1e-9, 1e-30
 
@@ -229,7 +232,7 @@ class RotationAdjustment(Adjustment[Rotations]):
         if not self._finds_lens:
             return cost
         before, after = (float((each**2).sum()) for each in (self._lens.unexplained(), self._unexplained(state)))
-        return replace(cost, explained=(before - after) / max(self._lens.noise, _TINY) ** 2)
+        return replace(cost, explained=_INDEPENDENT * (before - after) / max(self._lens.noise, _TINY) ** 2)
 
     def prior(self, state: Rotations) -> tuple[FloatArray, FloatArray]:
         """Return what is known before: a focal length of some sides of a frame, a small distortion, and where patches lie."""
