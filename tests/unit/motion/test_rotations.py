@@ -24,8 +24,9 @@ from photonpano.geometry import (
 )
 from photonpano.locating import fit_homography
 from photonpano.motion.graph import GraphSolution, solve
+from photonpano.motion.lens_shift import LensShift
 from photonpano.motion.model import MotionModel
-from photonpano.motion.rotation_graph import LensShift, Rotations
+from photonpano.motion.rotation_graph import Rotations
 from photonpano.motion.rotations import RotationTrajectory, fit_rotations
 from photonpano.values import Edge, FloatArray, Located, NotLocated, Patches
 from photonpano_core.configs import InterpolatorConfig
