@@ -151,7 +151,7 @@ def _no_patches(found: Located, _: None) -> object:
         return None
     shapes = {"shifts": (PATCHES**2, 2), "information": (PATCHES**2, 2, 2)}
     for name, shape in shapes.items():
-        array = getattr(found.patches, name)
+        array: Any = getattr(found.patches, name, None)
         if not is_real(array) or array.shape != shape or not np.isfinite(array).all():
             return name, shape, shown(array)
     return None

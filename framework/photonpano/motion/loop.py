@@ -13,10 +13,10 @@ from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
-from photonpano.motion.known_motion import Knots, KnownMotion
 from photonpano.motion.level import Level, VirtualExposures, merge
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
+from photonpano.motion.refined_motion import Knots, RefinedMotion
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
 from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking import StartingMotion, starting_motion
@@ -123,11 +123,11 @@ def interpolate(
     timeline: Timeline,
     reference: int,
     clock: Stopwatch,
-    corrected: Trajectory | None = None,
+    refined: Trajectory | None = None,
 ) -> Trajectory:
     """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate"), between cuts.
 
-    A motion that is `corrected` is not replaced: what is interpolated is how far the exposures merged along it are from it.
+    A `refined` motion is not replaced: what is interpolated is how far the exposures merged along it are from it.
 
     Raises:
         LocationError: the interpolator failed because exposures reach the horizon of the plane.
@@ -135,7 +135,7 @@ def interpolate(
     """
     turns, shape = located.solution.rotations, located.frame_shape
     camera = None if turns is None else turns.camera
-    known = None if corrected is None else KnownMotion(corrected, len(timeline.taken), camera, shape)
+    known = None if refined is None else RefinedMotion(refined, len(timeline.taken), camera, shape)
     homographies, information, rotations = Knots.of(located) if known is None else known.corrections(located)
 
     def kept(found: Trajectory, knots: slice, times: FloatArray, homographies: FloatArray) -> Trajectory:

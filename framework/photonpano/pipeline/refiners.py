@@ -36,7 +36,8 @@ def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tup
 def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Explained]:
     """Correct the motion by refiners, each until it finds nothing, and measure what is left. For errors, see `run`.
 
-    Where the first correction moves frames by more than a pixel, it blurred the exposures: the last level runs again along it.
+    Where the first correction moves frames by more than a pixel, that motion had blurred the exposures of the last level, which
+    then runs again along the corrected motion.
     """
     refinements = []
     for place, refiner in enumerate(refiners):

@@ -9,12 +9,9 @@ from scipy import sparse
 
 from photonpano.filtering import SYSTEMATIC_PX
 from photonpano.geometry import corners, transform_points
-from photonpano.motion.frame_motion import FrameMotion
 from photonpano.residuals.block_sums import BLOCK_PX
-from photonpano.residuals.measure import Residuals
 from photonpano.values import FloatArray
 
-_SIGNIFICANT = 5.0  # standard deviations
 _INSTANTS = 64  # instants of the motion at which the effect of a lens is computed
 
 
@@ -31,18 +28,6 @@ class LensDistortion:
     def sigmas(self) -> float:
         """How significant it is."""
         return abs(self.k1) / self.std
-
-
-def shown_lens(residuals: Residuals, motion: FrameMotion) -> LensDistortion | None:
-    """Return the distortion that the residuals of a motion show beyond doubt; None if they show none.
-
-    Motion and light that are not explained, such as a tremor, move blocks by more than photon noise.
-    """
-    found = lens_distortion(*residuals.block_shifts(), motion.homographies[motion.located], residuals.frame_shape)
-    if found is None:
-        return None
-    std = found.std * max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
-    return LensDistortion(found.k1, std) if abs(found.k1) > _SIGNIFICANT * std else None
 
 
 def lens_distortion(

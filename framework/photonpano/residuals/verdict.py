@@ -15,7 +15,7 @@ from photonpano.geometry import corners, jacobian
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
-from photonpano.residuals.lens import shown_lens
+from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.refinement import Explained
 from photonpano.values import BoolArray, Decision, Located
 
@@ -207,9 +207,14 @@ def _hot_pixels(run: _Run) -> _Found:
     "frames before, or use their middle only (corrections: crop)",
 )
 def _lens(run: _Run) -> _Found | None:
+    residuals, motion = run.explained.residuals, run.explained.motion
     # Half of the threshold is seen without a lens; even a small distortion bends a long path.
-    found = shown_lens(run.explained.residuals, run.explained.motion)
-    return None if found is None else _Found(abs(found.k1), f"about {found.k1:.1%} at the corners")
+    found = lens_distortion(*residuals.block_shifts(), motion.homographies[motion.located], residuals.frame_shape)
+    # What else is not explained, such as a tremor, moves blocks by more than photon noise.
+    misfit = max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
+    if found is None or found.sigmas <= 5 * misfit:
+        return None
+    return _Found(abs(found.k1), f"about {found.k1:.1%} at the corners")
 
 
 @_doubtful_above(

@@ -199,6 +199,7 @@ BROKEN: Mapping[str, Mapping[str, Change]] = {
                 "another grid": (np.zeros((5, 2)), np.zeros((5, 2, 2))),
             }.items()
         },
+        "patches of text": motion(patches="many"),
         "evidence of text": motion(evidence={"inliers": "many"}),
         "evidence of a list": motion(evidence=[3]),
         "evidence of complex": motion(evidence={"score": np.complex64(1)}),

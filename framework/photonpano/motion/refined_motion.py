@@ -1,4 +1,4 @@
-"""A motion that is known at every frame, such as a refined one, and what a level corrects of it."""
+"""A refined motion, which is known at every frame, and what a level corrects of it."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Knots(NamedTuple):
         return cls(located.homographies, located.information, located.solution.rotations)
 
 
-class KnownMotion:
-    """A motion that is known at every frame, which exposures merged along it correct.
+class RefinedMotion:
+    """A refined motion, which exposures merged along it correct.
 
     The corrections change slowly, even where the motion trembles faster than the exposures follow each other.
     """

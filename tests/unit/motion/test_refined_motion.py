@@ -15,7 +15,7 @@ from photonpano.geometry import (
     parameters,
     rotation_matrices,
 )
-from photonpano.motion.known_motion import KnownMotion
+from photonpano.motion.refined_motion import RefinedMotion
 from photonpano.motion.rotation_graph import Rotations
 from photonpano.motion.rotations import RotationTrajectory
 from photonpano.values import FloatArray
@@ -49,10 +49,10 @@ def apart_px(first: FloatArray, second: FloatArray) -> float:
     return float(corner_displacements(*(inverse(each[middle]) @ each for each in (first, second)), SHAPE).max())
 
 
-def test_corrections_of_a_turn_leave_out_its_tremor_and_bring_the_known_motion_to_the_true_one() -> None:
+def test_corrections_of_a_turn_leave_out_its_tremor_and_bring_the_refined_motion_to_the_true_one() -> None:
     true = turned(2.5)
     known = CAMERA.homographies(true @ np.swapaxes(DRIFT, -1, -2))
-    motion = KnownMotion(RotationTrajectory(FrameTrajectory(known), CAMERA, 100), FRAMES, CAMERA, SHAPE)
+    motion = RefinedMotion(RotationTrajectory(FrameTrajectory(known), CAMERA, 100), FRAMES, CAMERA, SHAPE)
     knots = motion.corrections(located(CAMERA.homographies(true[INSTANTS]), CAMERA))
     assert knots.rotations is not None
     np.testing.assert_allclose(normalised(CAMERA.homographies(knots.rotations.rotations)), knots.homographies, atol=1e-6)
@@ -64,7 +64,7 @@ def test_corrections_of_a_turn_leave_out_its_tremor_and_bring_the_known_motion_t
 def test_known_turn_of_a_camera_of_another_focal_length_moves_the_image_alike() -> None:
     known, other = Camera.of(800.0, SHAPE), Camera.of(740.0, SHAPE)
     true = known.homographies(turned(0.1))
-    motion = KnownMotion(RotationTrajectory(FrameTrajectory(true), known, 100), FRAMES, other, SHAPE)
+    motion = RefinedMotion(RotationTrajectory(FrameTrajectory(true), known, 100), FRAMES, other, SHAPE)
     seen = motion.corrected(FrameTrajectory(np.eye(3)[None])).at(ALL)
     assert apart_px(seen, true) < 0.1 * apart_px(other.homographies(turned(0.1)), true)
 
@@ -72,7 +72,7 @@ def test_known_turn_of_a_camera_of_another_focal_length_moves_the_image_alike() 
 def test_known_homographies_become_turns_of_a_camera_that_move_the_corners_alike() -> None:
     true = turned(0.5)
     known = normalised(CAMERA.homographies(true))
-    seen = KnownMotion(FrameTrajectory(known), FRAMES, CAMERA, SHAPE).corrected(FrameTrajectory(np.eye(3)[None])).at(ALL)
+    seen = RefinedMotion(FrameTrajectory(known), FRAMES, CAMERA, SHAPE).corrected(FrameTrajectory(np.eye(3)[None])).at(ALL)
     assert apart_px(seen, known) < 1e-6
     np.testing.assert_allclose(np.linalg.det(seen), 1)
 
@@ -82,7 +82,7 @@ def test_information_is_carried_from_the_homographies_to_their_corrections() -> 
     rng = np.random.default_rng(0)
     scales = np.array([1e-2, 1e-2, 1e-2, 1e-2, 1, 1, 1e-4, 1e-4])
     true = from_parameters(rng.normal(size=(FRAMES, 8)) * scales)
-    known = KnownMotion(
+    known = RefinedMotion(
         FrameTrajectory(true @ from_parameters(0.1 * rng.normal(size=(FRAMES, 8)) * scales)), FRAMES, None, SHAPE
     )
     roots = rng.normal(size=(len(INSTANTS), 8, 8)) / scales
