@@ -30,12 +30,12 @@ import cv2
 import numpy as np
 from harness import Study, chosen, command, packed, passing, record_of, simulator
 from harness import table as table_of
-from joint_bound import Model, joint_bound, lens_at_corners
-from trust import figures_of, reasons, status
+from joint_bound import Model, joint_bound
+from trust import figures_of_run, reasons, status
 
 from photonpano import InputError, PhotonpanoError, open_source, parse_spec
 from photonpano.capture.writing import truth_path
-from photonpano.evaluation import load_run_trajectory, load_truth
+from photonpano.evaluation import load_truth
 from photonpano.geometry import Camera
 
 HEIGHT, SHAPE = 900, (254, 496)
@@ -111,11 +111,7 @@ def measured(task: tuple[Path, str, float, str], frames: int, captures: Path) ->
         record = record_of(folder)
         result |= {"verdict": record.get("verdict"), "warnings": list(record["warnings"]), "decisions": record["decisions"]}
         result["cuts"] = sum(each["what"] == "cut" for each in record["decisions"])
-        found, camera = load_run_trajectory(folder), load_run_trajectory(folder).camera
-        # Where the corners of frames lie, through the lens that the run has found.
-        lens = np.eye(3) if camera is None else lens_at_corners(camera, SHAPE)
-        estimated = {name: getattr(found, name) for name in ("frame_shape", "located", "std_px")}
-        return result | figures_of(estimated | {"homographies": found.homographies @ lens}, load_truth(truth_path(cube)))
+        return result | figures_of_run(folder, load_truth(truth_path(cube)))
 
 
 def row(result: dict[str, Any]) -> Iterator[str]:

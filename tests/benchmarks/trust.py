@@ -31,11 +31,12 @@ import cv2
 import numpy as np
 from harness import RATE_HZ, Study, chosen, command, middles, packed, passing, record_of, scores_of, simulator
 from harness import table as table_of
+from joint_bound import lens_at_corners
 from trust_captures import CUT_ROWS, FULL, ROWS, SMALL, TINY, Row, Size, bases
 
 from photonpano import PhotonpanoError, SpecError
 from photonpano.capture.writing import truth_path
-from photonpano.evaluation import Truth, corner_errors, load_truth
+from photonpano.evaluation import Truth, corner_errors, load_run_trajectory, load_truth
 from photonpano.geometry import inverse
 
 WITHIN_2, WITHIN_3, WIDEST = 0.95, 0.99, 3.0
@@ -107,8 +108,8 @@ def measured(row: Row, name: str, seed: int, size: Size) -> Result:
             return result
         record = record_of(folder)
         result |= {"warnings": list(record["warnings"]), "verdict": record.get("verdict")}
-        with np.load(folder / "trajectory.npz") as found, np.load(truth_path(cube)) as truth:
-            result |= figures_of(dict(found), load_truth(truth_path(cube)))
+        with np.load(truth_path(cube)) as truth:
+            result |= figures_of_run(folder, load_truth(truth_path(cube)))
             if "mean_px" in result:
                 result |= cuts_of([int(each["value"]) for each in record["decisions"] if each["what"] == "cut"], dict(truth))
         if "mean_px" in result:
@@ -166,6 +167,14 @@ def figures_of(estimated: dict[str, np.ndarray], truth: Truth) -> Result:
         "within_3": float(np.mean(errors <= 3 * std)),
         "located": score.located_share,
     }
+
+
+def figures_of_run(folder: Path, truth: Truth) -> Result:
+    """Return the figures of a run, of where the corners of frames lie through the lens that it has found."""
+    found = load_run_trajectory(folder)
+    lens = np.eye(3) if found.camera is None else lens_at_corners(found.camera, found.frame_shape)
+    estimated = {name: getattr(found, name) for name in ("frame_shape", "located", "std_px")}
+    return figures_of(estimated | {"homographies": found.homographies @ lens}, truth)
 
 
 def status(result: Result) -> str:

@@ -80,8 +80,11 @@ class Camera:
                 if not (np.abs(step) >= _EXACT).any():
                     break
             away = np.abs(self._distorted(found) - seen).max(axis=-1)
-        # Beyond the radius at which the image folds over, the iteration ends anywhere.
-        return self._in_px(np.where((away <= 1e-6)[..., None], found, np.nan))
+            (a, b), (_, d) = self._slopes(found)
+            # Beyond the radius at which the image folds over, the iteration ends anywhere, and further out the same pixel is
+            # seen again: mirrored, or from the other side.
+            imaged = (away <= 1e-6) & (a * d > b * b) & ((found * seen).sum(axis=-1) >= 0)
+        return self._in_px(np.where(imaged[..., None], found, np.nan))
 
     def ideal_shift(self, points: ArrayLike, shift: FloatArray) -> FloatArray:
         """Return how (..., 2) ideal pixels move if their images in a frame move by a small (..., 2) shift, to first order."""
@@ -168,7 +171,7 @@ def rotation_vectors(rotations: ArrayLike) -> FloatArray:
 
 
 def lenses_apart_px(first: Camera, second: Camera, frame_shape: tuple[int, int]) -> float:
-    """Return the largest difference of where two cameras undistort a pixel of a frame to."""
+    """Return the largest difference of where two cameras undistort a pixel of a frame to; NaN if one images no place there."""
     frame = corners(frame_shape)
     # From the middle to the corners: k1 and k2 may cancel each other somewhere.
     places = frame.mean(axis=0) + np.linspace(0.25, 1, 4)[:, None, None] * (frame - frame.mean(axis=0))

@@ -115,12 +115,12 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
 
 
 def _chosen(tied: _Tied, fits: Mapping[MotionModel, _Fit]) -> MotionModel:
-    """Return the likeliest model; a lens that is not asked for must move pixels enough to matter."""
+    """Return the likeliest model; a lens that is not asked for must move pixels enough to matter, and not fold the frame."""
     costs = _costs(fits)
     if any(model.kind == "rotation" and not model.finds_lens for model in fits):
         for model in [each for each in fits if each.kind == "rotation" and each.finds_lens]:
             camera: Camera = fits[model].state.camera
-            if lenses_apart_px(camera, Camera(camera.matrix), tied.frame_shape) < SAME_LENS_PX:
+            if not lenses_apart_px(camera, Camera(camera.matrix), tied.frame_shape) >= SAME_LENS_PX:
                 del costs[model]
     return likeliest(costs)
 

@@ -60,14 +60,13 @@ class LensShift:
         return replace(found, roots=roots / max(noise, 1.0), noise=min(noise, 1.0))
 
     def of_patches(self, relative: FloatArray, camera: Camera, assumed: Camera) -> FloatArray:
-        """Return how patches are shifted by undistorting with the wrong lens: (E, 2 P) px.
+        """Return how patches are shifted by undistorting with the wrong lens: (E, 2 P) px, NaN if that folds the frame.
 
         `relative` (E, 3, 3) map ideal pixels of the true camera; pixels were undistorted with the one that was `assumed`.
         """
         there = transform_points(relative, self.points)
         seen = camera.distorted(transform_points(relative, camera.ideal(assumed.distorted(self.points))))
-        shift = assumed.ideal_shift(there, seen - assumed.distorted(there))
-        return np.nan_to_num(shift).reshape(len(relative), -1)
+        return assumed.ideal_shift(there, seen - assumed.distorted(there)).reshape(len(relative), -1)
 
     def of_corners(self, shift: FloatArray) -> FloatArray:
         """Return by how much shifts of the patches, (E, 2 P), displace the corners of the homography: (E, 4, 2) px."""

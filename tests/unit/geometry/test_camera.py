@@ -68,6 +68,14 @@ def test_rotation_vectors_invert_rotation_matrices() -> None:
     np.testing.assert_allclose(rotation_vectors(rotation_matrices(vectors)), vectors, atol=1e-12)
 
 
+def test_pixels_that_a_lens_images_only_from_the_other_side_have_no_ideal_place() -> None:
+    """With this lens, nothing inside the fold is imaged beyond 11.1 focal lengths; outside, opposite places are."""
+    camera = Camera.of(8.0, (128, 192), (-0.0012, 0, 0, 0))
+    rays = np.array([[11.0, 0.0], [11.3, 0.0], [-14.0, 0.0], [9.0, 9.0]])
+    found = camera.ideal(rays * 8 + camera.matrix[:2, 2])
+    np.testing.assert_array_equal(np.isnan(found).any(axis=1), [False, True, True, True])
+
+
 def test_nearest_rotations_ignores_scale_and_small_errors() -> None:
     rotations = rotation_matrices(np.random.default_rng(0).normal(size=(5, 3)))
     np.testing.assert_allclose(nearest_rotations(3 * rotations), rotations, atol=1e-12)
