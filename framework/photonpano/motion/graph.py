@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, Protocol
 
@@ -14,6 +14,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from photonpano.geometry import (
     Camera,
+    align_planes,
+    corner_displacements,
     generators,
     inverse,
     lenses_apart_px,
@@ -96,7 +98,9 @@ def solve(
     if model.kind == "auto":
         fits = _rivals(tied, start, model)
         chosen = _chosen(tied, fits)
-        return tied.solution(fits[chosen], chosen, lambda: Evidence.of(_costs(fits)))
+        solution = tied.solution(fits[chosen], chosen, lambda: Evidence.of(_costs(fits)))
+        turned = next((fit for model, fit in fits.items() if chosen.is_simple and model.kind == "rotation"), None)
+        return solution if turned is None else replace(solution, assess=partial(_doubting, tied, solution, turned))
     fit = _fitted(tied, start, model)
     return tied.solution(fit, model, partial(_compared, tied, start, model, fit))
 
@@ -123,6 +127,15 @@ def _chosen(tied: _Tied, fits: Mapping[MotionModel, _Fit]) -> MotionModel:
             if not lenses_apart_px(camera, Camera(camera.matrix), tied.frame_shape) >= SAME_LENS_PX:
                 del costs[model]
     return likeliest(costs)
+
+
+def _doubting(tied: _Tied, solution: GraphSolution, turned: _Fit) -> Assessment:
+    """Assess shifts and rolls as well as pairs can tell them from turns: perspective may be too weak to be worth its price."""
+    assessed = solution.assess()
+    simple, rival = solution.homographies[tied.located], scaled_ahead(turned.adjustment.homographies(turned.state))
+    aligned = align_planes(simple, rival, tied.frame_shape) @ simple
+    apart_px = np.sqrt((corner_displacements(inverse(rival) @ aligned, np.eye(3), tied.frame_shape) ** 2).mean(axis=-1))
+    return replace(assessed, std_px=np.hypot(assessed.std_px, apart_px))
 
 
 def _compared(tied: _Tied, start: FloatArray | None, model: MotionModel, fit: _Fit) -> Evidence | None:
