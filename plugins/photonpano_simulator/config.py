@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from photonpano import Bayer, Config, SpecPath
-from photonpano_simulator.recording import Drift, Drops, FrameCount, FrameRate, FrameShape, Repeats
+from photonpano_simulator.recording import Drift, Drops, FrameCount, FrameRate, FrameShape, Part, Repeats
 
 
 class StreetScene(Config):
@@ -50,6 +50,9 @@ Rate = Annotated[float, Field(gt=0, le=100)]
 Size = Annotated[float, Field(gt=0, le=10)]
 Place = Annotated[float, Field(ge=-10, le=10)]
 Speed = Annotated[float, Field(ge=-100, le=100)]
+Metres = Annotated[float, Field(ge=-100, le=100)]
+Angle = Annotated[float, Field(ge=-360, le=360)]
+Length = Annotated[float, Field(gt=0, le=100)]
 
 
 class Shake(Config):
@@ -66,8 +69,36 @@ class Shake(Config):
     )
 
 
-class _Path(Config):
+class Jump(Config):
+    """A place where the capture is cut: two shots of one path."""
+
+    at: float = Field(gt=0, lt=1, description="when the camera jumps, as a share of the capture")
+    by: float = Field(
+        ge=-10, le=10, description="how far it jumps ahead, or below 0 back, as a share of the length of the path"
+    )
+
+
+class MovingPath(Config):
+    """A path that leads somewhere."""
+
     shake: Shake | None = Field(None, description="tremor of the camera, added to the path; none by default")
+    rests: tuple[Part, ...] = Field(
+        (),
+        max_length=100,
+        description="when the camera rests: [start, stop], as shares of the capture. It slows down before, and the path stays "
+        "the same",
+    )
+    jumps: tuple[Jump, ...] = Field(
+        (),
+        max_length=100,
+        description="jumps along the path: the capture has several shots, which still begin and end with the path. What it "
+        "skips by jumps ahead is not seen, and what it jumps back is seen twice",
+    )
+    travel_m: tuple[Metres, Metres, Metres] = Field(
+        (0.0, 0.0, 0.0),
+        description="(x, y, z) of the way that the camera travels along the path, smoothly, in m: to the right, down and ahead "
+        "of a camera before the middle of the scene, which is infinitely far; it moves boards, clutter and people in the frame",
+    )
 
 
 class _Aimed(Config):
@@ -76,7 +107,7 @@ class _Aimed(Config):
     )
 
 
-class _Line(_Path, _Aimed):
+class _Line(MovingPath, _Aimed):
     length_px: float = Field(
         300.0, gt=0, le=1e6, description="length of the path of the frame centre over the scene, without the shake, in px"
     )
@@ -119,7 +150,7 @@ class HandShakePath(_Aimed):
     shake: Shake = Field(Shake(rms_px=5.0), description="the tremor")
 
 
-class TurnPath(_Path):
+class TurnPath(MovingPath):
     """A turn about the vertical axis at constant speed, by any angle; the scene surrounds the camera.
 
     The scene is an equirectangular panorama: its width is 360 degrees, its ends meet, and the horizon is its middle row. The
@@ -135,7 +166,7 @@ class TurnPath(_Path):
     wobbles: float = Field(5.0, ge=0, le=1e4, description="periods of these wobbles during the turn")
 
 
-class FilePath(_Path):
+class FilePath(MovingPath):
     """Homographies from a file."""
 
     kind: Literal["file"] = Field("file", description="homographies from a file")
@@ -269,6 +300,50 @@ class FrameObject(Config):
     frames: int | None = Field(None, ge=1, description="number of frames in which it is there; by default all that follow")
 
 
+class Board(Config):
+    """A textured board at a distance, upright."""
+
+    distance_m: float = Field(2.0, ge=0.1, le=1e4, description="horizontal distance of its middle from the first camera, in m")
+    at_deg: tuple[Angle, Annotated[float, Field(ge=-80, le=80)]] = Field(
+        (0.0, 0.0),
+        description="(x, y) of its middle, to the right and down from the middle of the scene, in degrees: it is fixed to the "
+        "scene",
+    )
+    size_m: tuple[Length, Length] = Field((0.5, 0.5), description="width and height in m")
+    slant_deg: float = Field(
+        0.0, ge=-85, le=85, description="turn about its upright axis, in degrees: above 0, its right edge is nearer"
+    )
+    flux: float = Field(1.0, ge=0, le=1000, description="its mean flux, relative to the mean of the scene")
+    seed: int = Field(0, ge=0, description="another seed is another texture")
+
+
+class _Near(Config):
+    share: float = Field(gt=0, le=0.9, description="share of the pixels that they cover, on average over the capture")
+    nearest_m: float = Field(1.5, ge=0.1, le=1e4, description="distance of the nearest, in m")
+    farthest_m: float = Field(4.0, ge=0.1, le=1e4, description="distance of the farthest, in m")
+    seed: int = Field(0, ge=0, description="another seed places and paints them anew")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.nearest_m > self.farthest_m:
+            raise ValueError(f"nearest_m of {self.nearest_m:g} is above farthest_m of {self.farthest_m:g}; exchange them")
+        return self
+
+
+class Clutter(_Near):
+    """Boards at random places and distances, all along the path."""
+
+    number: int = Field(6, ge=1, le=50, description="number of boards")
+
+
+class People(_Near):
+    """People who walk through the scene, to and fro: who leaves the frame comes in again from its other side."""
+
+    number: int = Field(3, ge=1, le=50, description="number of people")
+    speed_px: float = Field(0.1, ge=0, le=100, description="how fast they walk through the scene, in px per frame")
+    pauses: float = Field(0.0, ge=0, le=1, description="share of the time in which they stand still before the scene")
+
+
 class Lamp(Config):
     """A lamp on the mains, whose light flickers as a sine."""
 
@@ -332,6 +407,16 @@ class SimulationConfig(Config):
         Distortion(), description="distortion of the lens by OpenCV's model, in place of k1 and k2 of `lens`"
     )
     objects: tuple[FrameObject, ...] = Field((), max_length=100, description="rectangles and discs in front of the scene")
+    boards: tuple[Board, ...] = Field(
+        (), max_length=50, description="textured boards before the scene; nearer ones hide others"
+    )
+    clutter: Clutter | None = Field(None, description="boards at random places; none by default")
+    people: People | None = Field(None, description="people who walk through the scene; none by default")
+    shutter: tuple[Part, ...] = Field(
+        (),
+        max_length=100,
+        description="when the shutter is closed: [start, stop], as shares of the capture. There are only dark counts then",
+    )
     drops: Drops = ()
     repeats: Repeats = ()
     seed: int | None = Field(None, ge=0, description="seed of photons, pixels and shake; by default the seed of the run")
@@ -340,6 +425,15 @@ class SimulationConfig(Config):
     def _one_distortion(self) -> Self:
         if any(self.distortion.coefficients) and (self.lens.k1 or self.lens.k2):
             raise ValueError("lens and distortion both distort the image; leave out one of the two models")
+        return self
+
+    @model_validator(mode="after")
+    def _known_rotations(self) -> Self:
+        if isinstance(self.path, FilePath) and (self.boards or self.clutter or self.people):
+            raise ValueError(
+                "boards, clutter and people need the rotation of the camera, which homographies from a file do not give; "
+                "take another path, or objects"
+            )
         return self
 
 

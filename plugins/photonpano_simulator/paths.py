@@ -9,6 +9,7 @@ Convention:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ from photonpano_simulator.config import (
     FilePath,
     HandShakePath,
     LoopPath,
+    MovingPath,
     PanPath,
     ScanPath,
     Shake,
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 _DENSE = 100_000  # points of a curve before it is resampled at constant speed; the error is far below 0.001 px
 _POINTS_OF_A_SIDE = 17  # points along each side of a frame that must lie in the panorama
 _BLOCK = 8192  # frames that are checked at a time, which bounds the memory
+_RAMP = 0.02  # share of the capture in which a camera slows down before it rests, and gets going afterwards
 _SPLINE_REACH = (1.0, 0.5)  # how far a random path reaches along x and y, relative to each other
 
 
@@ -50,13 +53,13 @@ def camera_path(config: SimulationConfig, scene_shape: tuple[int, int], seed: in
     if isinstance(path, TurnPath):
         return _turn(config, path, scene_shape, seed)
     if isinstance(path, FilePath):
-        homographies = _read_homographies(path.file, config.n_frames)
+        homographies = _along(path, _read_homographies(path.file, config.n_frames))
     else:
         to_scene = rescaling(config.scene_scale)
         in_frame_px = scene_shape[0] / config.scene_scale, scene_shape[1] / config.scene_scale
         middle = middle_of(in_frame_px)
         target = middle if path.centre is None else transform_points(inverse(to_scene), np.array([path.centre], np.float64))[0]
-        rotations = _rotations(target - middle + _centres(path, config.n_frames), focal)
+        rotations = _rotations(target - middle + _along(path, _centres(path, config.n_frames)), focal)
         homographies = to_scene @ _intrinsics(in_frame_px, focal) @ rotations @ np.linalg.inv(frame)
     if path.shake is not None:
         shaking = shake_rotations(path.shake, config.n_frames, config.frame_rate_hz, focal, generator(seed, Draw.SHAKE))
@@ -81,6 +84,57 @@ def camera_rotations(config: SimulationConfig, homographies: FloatArray, scene_s
     return ours.rotations(ours.matrix @ np.linalg.inv(scene) @ homographies)
 
 
+def progress_of(path: MovingPath | HandShakePath, n_frames: int) -> FloatArray:
+    """Return how far along its path the camera is in each frame: (n_frames,), from 0 to 1.
+
+    Raises an `InputError` if the camera never moves, or jumps off the path.
+    """
+    time = np.linspace(0, 1, n_frames)
+    if isinstance(path, HandShakePath) or not (path.rests or path.jumps):
+        return time
+    progress = np.concatenate([[0.0], np.cumsum(pace(path.rests, n_frames)[1:])])
+    if not progress[-1]:
+        raise InputError("path.rests leave the camera no time to move; shorten them")
+    progress *= (1 - sum(jump.by for jump in path.jumps)) / progress[-1]
+    for jump in path.jumps:
+        progress += jump.by * (time >= jump.at)
+    outside = np.abs(progress - 0.5) - 0.5
+    if outside.max() > 1e-9 or progress[-1] < 0:
+        worst = int(outside.argmax())
+        raise InputError(
+            f"path.jumps lead off the path: {time[worst]:.0%} of the capture along, the camera is at {progress[worst]:.0%} "
+            "of it; jump less far, or later"
+        )
+    return np.asarray(np.clip(progress, 0, 1))
+
+
+def pace(rests: Sequence[tuple[float, float]], n_frames: int) -> FloatArray:
+    """Return the speed of something that rests in parts of the capture, relative to its speed else: (n_frames,), 0 to 1."""
+    time, speed = np.linspace(0, 1, n_frames), np.ones(n_frames)
+    for start, stop in rests:
+        away = np.clip(np.maximum(start - time, time - stop) / _RAMP, 0, 1)
+        speed *= away * away * (3 - 2 * away)
+    return speed
+
+
+def camera_positions(path: MovingPath | HandShakePath, n_frames: int) -> FloatArray:
+    """Return where the camera is in each frame, before the middle of the scene and relative to its start: (n_frames, 3) m."""
+    if isinstance(path, HandShakePath):
+        return np.zeros((n_frames, 3))
+    progress = progress_of(path, n_frames)
+    return np.outer(progress * progress * (3 - 2 * progress), path.travel_m)
+
+
+def _along(path: MovingPath | HandShakePath, samples: FloatArray) -> FloatArray:
+    """Return samples (T, ...) of a path at constant speed where the camera is in each frame."""
+    n_frames = len(samples)
+    progress, flat = progress_of(path, n_frames), samples.reshape(n_frames, -1)
+    if np.array_equal(progress, np.linspace(0, 1, n_frames)):
+        return samples
+    place = progress * (n_frames - 1)
+    return np.stack([np.interp(place, np.arange(n_frames), each) for each in flat.T], axis=-1).reshape(samples.shape)
+
+
 def scene_motion(homographies: FloatArray, frame_shape: tuple[int, int], path: object) -> FloatArray:
     """Return how far the scene has moved through the middle of the frame since the first frame: (T, 2) px."""
     middle = middle_of(frame_shape)
@@ -98,7 +152,7 @@ def _turn(config: SimulationConfig, path: TurnPath, scene_shape: tuple[int, int]
             f"a scene of {scene_shape[1]} px all around is too coarse for a focal length of {focal:g} px, which sees "
             f"{2 * np.pi * focal * config.scene_scale:,.0f} px; take a wider scene, or lower focal_length_px"
         )
-    progress = np.linspace(0, 1, config.n_frames)
+    progress = progress_of(path, config.n_frames)
     phase, zero = 2 * np.pi * path.wobbles * progress, np.zeros(config.n_frames)
     pitch = -np.deg2rad(path.pitch_wobble_deg) * np.sin(phase)
     roll = np.deg2rad(path.roll_wobble_deg) * np.cos(phase)

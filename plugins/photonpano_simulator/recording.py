@@ -6,7 +6,7 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from photonpano import Config, InputError
 
@@ -36,6 +36,24 @@ Repeats: TypeAlias = Annotated[
     tuple[FrameRange, ...],
     Field(description="frames that the capture holds twice: all of the range, and then all of it again"),
 ]
+
+
+def _ordered(part: tuple[float, float]) -> tuple[float, float]:
+    if part[0] >= part[1]:
+        raise ValueError(f"{list(part)} is no part of the capture: its start is not before its stop; give [start, stop]")
+    return part
+
+
+_Share = Annotated[float, Field(ge=0, le=1)]
+Part: TypeAlias = Annotated[tuple[_Share, _Share], AfterValidator(_ordered)]
+
+
+def within(parts: tuple[tuple[float, float], ...], n_frames: int) -> NDArray[np.bool_]:
+    """Return which frames lie in parts of the capture, given as shares of its length: (n_frames,)."""
+    found = np.zeros(n_frames, dtype=bool)
+    for start, stop in parts:
+        found[round(start * n_frames) : round(stop * n_frames)] = True
+    return found
 
 
 def delivered(n_frames: int, drops: tuple[FrameRange, ...], repeats: tuple[FrameRange, ...]) -> NDArray[np.int64]:

@@ -30,6 +30,8 @@ class Draw(IntEnum):
     TEXTURE = 6
     SCENE = 7
     GAZE = 8
+    CLUTTER = 9
+    PEOPLE = 10
 
 
 def generator(seed: int, draw: Draw, index: int = 0) -> np.random.Generator:

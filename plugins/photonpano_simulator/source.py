@@ -9,13 +9,16 @@ from photonpano import FloatArray, FrameSpan, SourceContext, StreamInfo
 from photonpano.geometry import corner_displacements, corners, inverse
 from photonpano.reading import SingleFrameSource
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig, TurnPath
+from photonpano_simulator.foreground import Foreground
 from photonpano_simulator.lens import camera, distorts, transmission, undistorted
-from photonpano_simulator.paths import camera_path, camera_rotations, scene_motion
-from photonpano_simulator.recording import delivered
+from photonpano_simulator.paths import camera_path, camera_positions, camera_rotations, scene_motion
+from photonpano_simulator.recording import delivered, within
 from photonpano_simulator.scenes import brightness, scene_flux, shares
 from photonpano_simulator.sensor import Draw, IntensityCamera, SpadSensor, bayer_of, filter_array, generator
 from photonpano_simulator.travel_config import TravelConfig
 from photonpano_simulator.views import DrawnObject, Views
+
+_LABELLED_EVERY, _LABELLED_AT_MOST = 25, 400  # frames
 
 
 class SimulatedSource(SingleFrameSource):
@@ -70,6 +73,9 @@ class SimulatorSource(SimulatedSource):
             else np.zeros((config.n_frames, 2))
         )
         self._objects = [DrawnObject(each, config.frame_shape, flux, motion) for each in config.objects]
+        rotations = camera_rotations(config, self._homographies, (height, width))
+        self._foreground = Foreground(config, rotations, flux)
+        self._is_dark = within(config.shutter, config.n_frames)
         self._lamps = shares(config.lamps, (height, width), is_round)
         self._lit_parts = [self._views.averaged(np.ascontiguousarray((self._scene.T * share.T).T)) for share in self._lamps]
         self._lamp_light = np.zeros((len(config.lamps), config.n_frames))
@@ -104,8 +110,14 @@ class SimulatorSource(SimulatedSource):
             counts per frame period, and `hot_pixels` (H, W) bool. Captures that are disturbed have more: `distortion`, (4,)
             k1, k2, p1, p2 of OpenCV or (2,) k1 and k2 of `lens`, and `undistorted_corners` (4, 2), where a lens without
             distortion images the corners of the frame; `gains` (H, W) float32, vignetting, sensitivity and dirt; `light` (T,),
-            relative to the first frame; `lamps` (N, Hs, Ws) float32, the share of each lamp in the light of each place, and
-            `lamp_light` (N, T), 1 on average; `taken` (T,), the index of each frame before drops and repeats.
+            relative to the first frame; `shutter_open` (T,) bool; `camera_positions` (T, 3), in m from the first, x right, y
+            down, z ahead; `lamps` (N, Hs, Ws) float32, the share of each lamp in the light of each place, and
+            `lamp_light` (N, T), 1 on average; `taken` (T,), the index of each frame before drops and repeats. With boards,
+            people or objects, of every 25th frame, or of 400 frames: `labelled_frames` (N,), their indices; `labels`
+            (N, H, W) uint8, 0 where they see the scene, else a place in `label_kinds`, which begins with "scene";
+            `background` (N, H, ceil(W / 8)) uint8, packed along the width, 1 where they see the scene and the shutter is open;
+            with boards or people, `depth` (N, H, W) float32, along the optical axis in m, infinite for the scene and NaN for
+            objects.
         """
         truth: dict[str, NDArray[np.generic]] = {
             "homographies": self._homographies[self._taken],
@@ -126,11 +138,40 @@ class SimulatorSource(SimulatedSource):
             truth["gains"] = self._gains
         if (self._light != 1).any():
             truth["light"] = self._light[self._taken]
+        if self._is_dark.any():
+            truth["shutter_open"] = ~self._is_dark[self._taken]
+        if any(getattr(self._config.path, "travel_m", ())):
+            truth["camera_positions"] = camera_positions(self._config.path, self._config.n_frames)[self._taken]
+        if self._foreground.kinds or self._objects:
+            truth |= self._labels()
         if len(self._lamps):
             truth["lamps"], truth["lamp_light"] = self._lamps, self._lamp_light[:, self._taken]
         if not np.array_equal(self._taken, np.arange(len(self._homographies))):
             truth["taken"] = self._taken
         return truth
+
+    def _labels(self) -> dict[str, NDArray[np.generic]]:
+        """Return what covers the pixels of some frames."""
+        n_frames, shape = self.info.n_frames, self.info.frame_shape
+        frames = np.arange(0, n_frames, max(_LABELLED_EVERY, -(-n_frames // _LABELLED_AT_MOST)))
+        labels = np.zeros((len(frames), *shape), np.uint8)
+        depth = np.full(labels.shape, np.inf, np.float32)
+        for taken, of_frame, far in zip(self._taken[frames], labels, depth, strict=True):
+            self._foreground.mark(of_frame, far, taken)
+            for place, each in enumerate(self._objects, len(self._foreground.kinds) + 1):
+                there = each.covered(shape, taken) > 0.5
+                of_frame[there], far[there] = place, np.nan
+        is_seen = (labels == 0) & ~self._is_dark[self._taken[frames], None, None]
+        kinds = np.array(["scene", *self._foreground.kinds, *["object"] * len(self._objects)])
+        found: dict[str, NDArray[np.generic]] = {
+            "labelled_frames": frames,
+            "labels": labels,
+            "label_kinds": kinds,
+            "background": np.packbits(is_seen, axis=-1),
+        }
+        if self._foreground.kinds:
+            found["depth"] = depth
+        return found
 
     def sharp_view(self, frame: int) -> NDArray[np.float32]:
         """Return the flux of a frame, (H, W), without noise, dark counts and differences between pixels but their filters."""
@@ -140,8 +181,11 @@ class SimulatorSource(SimulatedSource):
 
     def _flux(self, taken: int) -> NDArray[np.float32]:
         """Return the flux of a frame that the camera takes, before its gains: (H, W)."""
+        if self._is_dark[taken]:
+            return np.zeros(self.info.frame_shape, np.float32)
         views = [self._lit_view(taken, homography) for homography in self._while_open(taken)]
         flux = views[0] if len(views) == 1 else np.mean(views, axis=0)
+        self._foreground.draw(flux, taken)
         for each in self._objects:
             each.draw(flux, taken)
         return flux

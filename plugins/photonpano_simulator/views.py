@@ -143,12 +143,18 @@ class DrawnObject:
             return
         left, top = self._corners[frame]
         height, width = view.shape
-        columns = _covered(left, self._size[0], width)
-        rows = _covered(top, self._size[1], height)
         there = np.array([[1, 0, left + 0.5], [0, 1, top + 0.5]])
         seen = cv2.warpAffine(self._texture, there, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        covered = _disc(left, top, self._size, view.shape) if self._is_disc else np.outer(rows, columns)
-        view += covered.astype(np.float32) * (seen - view)
+        view += self.covered(view.shape, frame).astype(np.float32) * (seen - view)
+
+    def covered(self, shape: tuple[int, ...], frame: int) -> FloatArray:
+        """Return the share of each pixel that it covers in a frame: (H, W)."""
+        if frame not in self._frames:
+            return np.zeros(shape)
+        left, top = self._corners[frame]
+        if self._is_disc:
+            return _disc(left, top, self._size, shape)
+        return np.outer(_covered(top, self._size[1], shape[0]), _covered(left, self._size[0], shape[1]))
 
 
 def _covered(start: float, length: float, n_pixels: int) -> FloatArray:
@@ -157,7 +163,7 @@ def _covered(start: float, length: float, n_pixels: int) -> FloatArray:
     return np.asarray(np.clip(np.minimum(pixels + 0.5, start + length) - np.maximum(pixels - 0.5, start), 0, 1))
 
 
-def _disc(left: float, top: float, size: FloatArray, shape: tuple[int, int]) -> FloatArray:
+def _disc(left: float, top: float, size: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Return the share of each pixel, (H, W), that the largest disc in a rectangle covers: its edge is a ramp of one pixel."""
     y, x = np.ogrid[: shape[0], : shape[1]]
     from_middle = np.hypot(x - (left + size[0] / 2), y - (top + size[1] / 2))
