@@ -245,6 +245,19 @@ class Sensor(Config):
         description="standard deviation of the sensitivity of the pixels, relative to its mean; it does not change with time",
     )
     dirt: Dirt | None = Field(None, description="specks on the window of the sensor; none by default")
+    afterpulsing: float = Field(
+        0.0, ge=0, le=1, description="probability that a pixel that detected a photon, or a dark count, fires in the next frame"
+    )
+    crosstalk: float = Field(
+        0.0, ge=0, le=1, description="probability that a pixel that fires triggers each of its four neighbours in this frame"
+    )
+    dead_time: float = Field(
+        0.0,
+        ge=0,
+        le=0.5,
+        description="time for which a pixel is blind after each detection, in frame periods; after a late one, at the "
+        "start of the next frame",
+    )
     filters: Bayer | SpecPath | None = Field(
         None,
         description="colour filters before the pixels: rggb, bggr, grbg or gbrg for a Bayer array, or a file as that of the "

@@ -86,6 +86,15 @@ class Cover:
         return np.array(parts) * height - np.array([1, 0, 1, 0, 0]) * (height - width) / 2
 
 
+class _Grid:
+    """Pixels (2, H, W) of a lens without distortion, and how far each column and each row reaches."""
+
+    def __init__(self, points: FloatArray) -> None:
+        self.points = np.ascontiguousarray(points)
+        self.leftmost, self.rightmost = points[0].min(axis=0), points[0].max(axis=0)
+        self.highest, self.lowest = points[1].min(axis=1), points[1].max(axis=1)
+
+
 class _Seen(NamedTuple):
     """A box of pixels; and for each the share that a cover takes, the texel that is seen, and its depth, (h, w) each."""
 
@@ -108,7 +117,7 @@ class Foreground:
         if rotations is not None and (config.boards or config.clutter or config.people):
             self._positions = camera_positions(config.path, config.n_frames)
             self._matrix, self._rotations = camera(config).matrix, rotations
-            self._points = np.moveaxis(undistorted(config, pixel_grid(config.frame_shape)), -1, 0)
+            self._grid = _Grid(np.moveaxis(undistorted(config, pixel_grid(config.frame_shape)), -1, 0))
             covers = [*_placed(config, flux)]
             if config.clutter is not None:
                 clutter = _clutter(config, config.clutter, rotations)
@@ -122,20 +131,20 @@ class Foreground:
     def draw(self, view: NDArray[np.float32], frame: int) -> None:
         """Replace the flux of the pixels, or of the parts of pixels, that are covered in a frame; `view` is (H, W)."""
         for _, cover in self._covers:
-            if (seen := self._seen(cover, frame, self._points)) is not None:
+            if (seen := self._seen(cover, frame, self._grid)) is not None:
                 flux = cv2.remap(cover.texture, seen.across, seen.down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
                 view[seen.box] += seen.share * (flux - view[seen.box])
 
     def mark(self, labels: NDArray[np.uint8], depth: NDArray[np.float32], frame: int) -> None:
         """Write which cover takes more than half of each pixel, and its depth along the optical axis in m: (H, W) each."""
         for label, cover in self._covers:
-            if (seen := self._seen(cover, frame, self._points)) is not None:
+            if (seen := self._seen(cover, frame, self._grid)) is not None:
                 there = seen.share > 0.5
                 labels[seen.box][there] = label
                 depth[seen.box][there] = seen.depth[there]
 
-    def _seen(self, cover: Cover, frame: int, points: FloatArray) -> _Seen | None:
-        """Return what pixels `points` (2, H, W), of a lens without distortion, see of a cover."""
+    def _seen(self, cover: Cover, frame: int, grid: _Grid) -> _Seen | None:
+        """Return what pixels see of a cover."""
         plane = cover.plane(frame)
         plane[:, 2] -= self._positions[frame]
         to_pixels = self._matrix @ self._rotations[frame].T @ plane
@@ -143,15 +152,15 @@ class Foreground:
         edges = to_pixels @ np.array([[-1, width, -1, width], [-1, -1, height, height], [1, 1, 1, 1]])
         if edges[2].max() <= 0 or abs(np.linalg.det(to_pixels)) < 1e-300:
             return None
-        box = np.s_[0 : points.shape[1], 0 : points.shape[2]]
+        box = np.s_[:, :]
         if edges[2].min() > 0:
             (left, top), (right, bottom) = (edges[:2] / edges[2]).min(axis=1), (edges[:2] / edges[2]).max(axis=1)
-            columns = np.flatnonzero((points[0].max(axis=0) >= left) & (points[0].min(axis=0) <= right))
-            rows = np.flatnonzero((points[1].max(axis=1) >= top) & (points[1].min(axis=1) <= bottom))
+            columns = np.flatnonzero((grid.rightmost >= left) & (grid.leftmost <= right))
+            rows = np.flatnonzero((grid.lowest >= top) & (grid.highest <= bottom))
             if not (len(columns) and len(rows)):
                 return None
             box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        near = points[:, box[0], box[1]]
+        near = grid.points[:, *box]
         found = np.empty((4, *near.shape[1:]), np.float32)
         _look(near, np.linalg.inv(to_pixels), cover.capsules(frame), width, height, *found)
         return _Seen(box, *found)
@@ -160,15 +169,15 @@ class Foreground:
         self, make: Callable[[float, float], list[Cover]], share: float, key: str, noun: str, flux: float
     ) -> list[Cover]:
         """Return covers of the size at which they cover a share of the pixels; `make` takes this size, and the flux or 0."""
-        points = np.ascontiguousarray(self._points[:, _COARSE // 2 :: _COARSE, _COARSE // 2 :: _COARSE])
+        grid = _Grid(self._grid.points[:, _COARSE // 2 :: _COARSE, _COARSE // 2 :: _COARSE])
         frames = np.unique(np.linspace(0, len(self._positions) - 1, _SAMPLES).astype(int))
 
         def covered(size: float) -> float:
             covers, total = make(size, 0.0), 0
             for frame in frames:
-                hidden = np.zeros(points.shape[1:], bool)
+                hidden = np.zeros(grid.points.shape[1:], bool)
                 for cover in covers:
-                    if (seen := self._seen(cover, frame, points)) is not None:
+                    if (seen := self._seen(cover, frame, grid)) is not None:
                         hidden[seen.box] |= seen.share > 0.5
                 total += hidden.sum()
             return total / (len(frames) * hidden.size)
@@ -295,9 +304,12 @@ def _look(
     `to_texels` is the inverse of K R^T [a, b, o - c], which maps texels to pixels times their depth. The plane is taken where
     it lies in one of the capsules, or within `width` and `height` if there are none; its edge is a ramp of one texel.
     """
+    sides = capsules[:, 2:4] - capsules[:, :2]
+    per_square = 1 / np.maximum((sides * sides).sum(axis=1), 1e-12)
     for i in range(points.shape[1]):
-        for j in range(points.shape[2]):
-            x, y = points[0, i, j], points[1, i, j]
+        xs, ys = points[0, i], points[1, i]
+        for j in range(len(xs)):
+            x, y = xs[j], ys[j]
             nearness = to_texels[2, 0] * x + to_texels[2, 1] * y + to_texels[2, 2]
             if nearness <= 0:
                 share[i, j], across[i, j], down[i, j], depth[i, j] = 0.0, 0.0, 0.0, np.inf
@@ -306,12 +318,14 @@ def _look(
             v = (to_texels[1, 0] * x + to_texels[1, 1] * y + to_texels[1, 2]) / nearness
             outside = max(max(-0.5 - u, u - width + 0.5), max(-0.5 - v, v - height + 0.5))
             if len(capsules) and outside < 0.5:
-                outside = np.inf
+                outside = 0.5
                 for k in range(len(capsules)):
-                    x0, y0 = capsules[k, 0], capsules[k, 1]
+                    x0, y0, radius = capsules[k, 0], capsules[k, 1], capsules[k, 4]
                     dx, dy = capsules[k, 2] - x0, capsules[k, 3] - y0
-                    along = min(max(((u - x0) * dx + (v - y0) * dy) / max(dx * dx + dy * dy, 1e-12), 0.0), 1.0)
+                    along = min(max(((u - x0) * dx + (v - y0) * dy) * per_square[k], 0.0), 1.0)
                     beside, below = u - x0 - along * dx, v - y0 - along * dy
-                    outside = min(outside, np.sqrt(beside * beside + below * below) - capsules[k, 4])
+                    squared = beside * beside + below * below
+                    if squared < (radius + 0.5) ** 2:
+                        outside = min(outside, np.sqrt(squared) - radius)
             share[i, j] = min(max(0.5 - outside, 0.0), 1.0)
             across[i, j], down[i, j], depth[i, j] = u, v, 1 / nearness

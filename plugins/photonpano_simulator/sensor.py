@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
+from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,10 @@ from photonpano import Bayer, InputError
 from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano.reading import COLOURS, bayer_array, read_array, read_filter_array
 from photonpano_simulator.config import Dirt, IntensitySensor, Sensor
+
+_KEPT = 16  # frames that are remembered for those that follow them, read by several threads
+Incident: TypeAlias = Callable[[int], NDArray[np.float32]]
+"""Returns the photons that are detected per pixel in a frame that is taken, without dark counts: (H, W), a new array."""
 
 # The range of the draws, negated: 2^32 - 2^8 is the largest number below 2^32 that float32 represents.
 _MINUS_RANGE = np.float32(2.0**8 - 2.0**32)
@@ -32,6 +38,9 @@ class Draw(IntEnum):
     GAZE = 8
     CLUTTER = 9
     PEOPLE = 10
+    AFTERPULSES = 11
+    CROSSTALK = 12
+    DEAD_TIME = 13
 
 
 def generator(seed: int, draw: Draw, index: int = 0) -> np.random.Generator:
@@ -56,6 +65,10 @@ class SpadSensor:
 
     def __init__(self, config: Sensor, frame_shape: tuple[int, int], seed: int) -> None:
         self.response = BinaryResponse()
+        self._config, self._seed = config, seed
+        if config.afterpulsing:
+            self._detected = lru_cache(_KEPT)(self._detected)  # type: ignore[method-assign]
+        self._rate, self._blind_after = lru_cache(_KEPT)(self._rate_of), lru_cache(_KEPT)(self._blinded)
         rng = generator(seed, Draw.HOT_PIXELS)
         self.hot: NDArray[np.bool_] = rng.random(frame_shape) < config.hot_fraction
         if config.hot_pixels is not None:
@@ -74,6 +87,52 @@ class SpadSensor:
         """Return the ground truth of the sensor: `dark_rates` and `hot_pixels`."""
         return {"dark_rates": self.dark_rates, "hot_pixels": self.hot}
 
+    def frame(self, index: int, incident: Incident) -> NDArray[np.bool_]:
+        """Take a frame with afterpulses and crosstalk, which depends on this frame and those before alone.
+
+        Only detections have afterpulses, and these trigger no further ones; neither does crosstalk.
+        """
+        fired, shape = self._detected(index, incident), self.dark_rates.shape
+        if self._config.afterpulsing and index:
+            draws = generator(self._seed, Draw.AFTERPULSES, index).random(shape, np.float32)
+            fired = fired | (self._detected(index - 1, incident) & (draws < self._config.afterpulsing))
+        if self._config.crosstalk:
+            draws = generator(self._seed, Draw.CROSSTALK, index).random((4, *shape), np.float32)
+            right, left, down, up = (fired & (each < self._config.crosstalk) for each in draws)
+            fired = fired.copy()
+            fired[:, 1:] |= right[:, :-1]
+            fired[:, :-1] |= left[:, 1:]
+            fired[1:] |= down[:-1]
+            fired[:-1] |= up[1:]
+        return fired
+
+    def _detected(self, index: int, incident: Incident) -> NDArray[np.bool_]:
+        """Return which pixels detect a photon, or a dark count: (H, W)."""
+        rng = generator(self._seed, Draw.PHOTONS, index)
+        if not self._config.dead_time:
+            return self.expose(incident(index), rng)
+        # A detection in the last dead time of a frame is drawn first. A pixel that has none is dark with the probability with
+        # which it is dark in all of the frame, exp(-rate * seeing), divided by that of none there.
+        rate, late = self._rate(index, incident), self._blind_after(index, incident) > 0
+        seeing = 1 - self._blind_after(index - 1, incident) if index else np.float32(1)
+        dark = np.exp(-rate * seeing) * (1 + self._config.dead_time * rate)
+        return np.asarray(late | (rng.random(rate.shape, np.float32) >= dark))
+
+    def _rate_of(self, index: int, incident: Incident) -> NDArray[np.float32]:
+        return incident(index) + self.dark_rates
+
+    def _blinded(self, index: int, incident: Incident) -> NDArray[np.float32]:
+        """Return for how long pixels are blind in the next frame, in frame periods: (H, W).
+
+        A pixel that is blind for d after each detection detects rate / (1 + d rate) photons, and at most one in the time d: as
+        many in the last d of a frame, each at any time there.
+        """
+        dead = np.float32(self._config.dead_time)
+        expected = dead * self._rate(index, incident)
+        chance = np.maximum(expected / (1 + expected), np.finfo(np.float32).tiny)
+        draws = generator(self._seed, Draw.DEAD_TIME, index).random(chance.shape, np.float32)
+        return np.where(draws < chance, dead * (1 - draws / chance), np.float32(0))
+
     def expose(self, flux: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
         """Take a frame of (H, W) photons that are detected per pixel, without dark counts; `flux` is overwritten."""
         # -p: the probability that no photon is detected, minus 1.
@@ -90,7 +149,8 @@ class IntensityCamera:
 
     kind: Literal["intensity"] = "intensity"
 
-    def __init__(self, config: IntensitySensor, frame_shape: tuple[int, int]) -> None:
+    def __init__(self, config: IntensitySensor, frame_shape: tuple[int, int], seed: int) -> None:
+        self._seed = seed
         self.bits, self.exposure = config.bits, config.exposure
         self._top, self._read_noise = 2**config.bits - 1, config.read_noise
         photons_per_level = config.full_well / (self._top - config.black_level)
@@ -98,6 +158,10 @@ class IntensityCamera:
         self.response = IntensityResponse(photons_per_level, config.black_level, self._top, noise)
         self.valid: NDArray[np.bool_] = np.ones(frame_shape, np.bool_)
         self.gains: NDArray[np.float32] = np.ones(frame_shape, np.float32)
+
+    def frame(self, index: int, incident: Incident) -> NDArray[np.uint16]:
+        """Take a frame."""
+        return self.expose(incident(index), generator(self._seed, Draw.PHOTONS, index))
 
     def expose(self, flux: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint16]:
         """Take a frame of (H, W) expected detected photons per pixel."""

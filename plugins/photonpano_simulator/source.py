@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,14 +16,14 @@ from photonpano_simulator.lens import camera, distorts, transmission, undistorte
 from photonpano_simulator.paths import camera_path, camera_positions, camera_rotations, scene_motion
 from photonpano_simulator.recording import delivered, within
 from photonpano_simulator.scenes import brightness, scene_flux, shares
-from photonpano_simulator.sensor import Draw, IntensityCamera, SpadSensor, bayer_of, filter_array, generator
+from photonpano_simulator.sensor import IntensityCamera, SpadSensor, bayer_of, filter_array
 from photonpano_simulator.travel_config import TravelConfig
 from photonpano_simulator.views import DrawnObject, Views
 
 _LABELLED_EVERY, _LABELLED_AT_MOST = 25, 400  # frames
 
 
-class SimulatedSource(SingleFrameSource):
+class SimulatedSource(SingleFrameSource, ABC):
     """A simulated camera, whose frames depend only on the config, the seed and their index."""
 
     def __init__(self, config: SimulatorConfig | CameraSimulatorConfig | TravelConfig, context: SourceContext) -> None:
@@ -30,7 +32,7 @@ class SimulatedSource(SingleFrameSource):
         self._light: FloatArray = config.drift ** np.linspace(0, 1, config.n_frames)
         self._sensor: SpadSensor | IntensityCamera
         if isinstance(config.sensor, IntensitySensor):
-            self._sensor = IntensityCamera(config.sensor, config.frame_shape)
+            self._sensor = IntensityCamera(config.sensor, config.frame_shape, self._seed)
         else:
             self._sensor = SpadSensor(config.sensor, config.frame_shape, self._seed)
         kind, bits, bayer = self._sensor.kind, self._sensor.bits, bayer_of(config.sensor)
@@ -48,9 +50,13 @@ class SimulatedSource(SingleFrameSource):
             **self._sensor.truth(),
         }
 
-    def _exposed(self, flux: NDArray[np.float32], taken: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
-        """Return a frame of the flux at its pixels, (H, W), which is overwritten."""
-        return self._sensor.expose(flux, generator(self._seed, Draw.PHOTONS, taken))
+    def frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
+        """Return a frame: (H, W) of zeros and ones, or of grey levels."""
+        return self._sensor.frame(int(self._taken[index]), self._incident)
+
+    @abstractmethod
+    def _incident(self, taken: int) -> NDArray[np.float32]:
+        """Return the flux at the pixels in a frame that the camera takes, after their gains: (H, W), a new array."""
 
 
 class SimulatorSource(SimulatedSource):
@@ -84,13 +90,11 @@ class SimulatorSource(SimulatedSource):
         self._gains = transmission(config.lens, config.frame_shape) * self._sensor.gains
         self._is_uniform = bool(np.all(self._gains == 1)) and config.drift == 1
 
-    def frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
-        """Return a frame: (H, W) of zeros and ones, or of grey levels."""
-        taken = int(self._taken[index])
+    def _incident(self, taken: int) -> NDArray[np.float32]:
         flux = self._flux(taken)
         if not self._is_uniform:
             flux *= self._gains * np.float32(self._light[taken])
-        return self._exposed(flux, taken)
+        return flux
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
         """Return the ground truth of the frames.

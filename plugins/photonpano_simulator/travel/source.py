@@ -35,13 +35,14 @@ class TravelSource(SimulatedSource):
             with_objects(scene, config.objects, poses[0], matrix, config.frame_shape, mean),
             config.flux * config.sensor.quantum_efficiency / mean,
         )
+        self._order = np.argsort(self._taken, kind="stable")
         # Rendered from the first thread on, it is made once.
         _ = self._truth.view
 
-    def frame(self, index: int) -> NDArray[np.bool_] | NDArray[np.uint16]:
-        """Return a frame: (H, W) of zeros and ones."""
-        flux = sharp_view(self._truth, index) * self._sensor.gains
-        return self._exposed(flux, int(self._taken[index]))
+    def _incident(self, taken: int) -> NDArray[np.float32]:
+        # Of a frame that is missing in the capture, the next one.
+        place = min(int(np.searchsorted(self._taken, taken, sorter=self._order)), len(self._order) - 1)
+        return sharp_view(self._truth, int(self._order[place])) * self._sensor.gains
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
         """Return the ground truth of the frames: `docs/how-to/simulate-depth.md` lists the arrays.

@@ -301,7 +301,7 @@ def test_archive_is_refused_as_a_mask(tmp_path: Path) -> None:
 
 
 def exposed(flux: float, **keys: float) -> tuple[IntensityCamera, np.ndarray]:
-    camera = IntensityCamera(IntensitySensor(**keys), CAMERA_SHAPE)
+    camera = IntensityCamera(IntensitySensor(**keys), CAMERA_SHAPE, seed=0)
     return camera, camera.expose(np.full(CAMERA_SHAPE, flux, np.float32), generator(0, Draw.PHOTONS))
 
 
