@@ -138,7 +138,7 @@ def _list(schema: Schema, root: Schema, depth: int) -> tuple[str, str]:
     kinds = [schema["items"]] if "items" in schema else schema.get("prefixItems", [])
     inner = {option for kind in kinds for option in _options(kind, root, depth + 1)}
     noun, bounds = inner.pop() if len(inner) == 1 else ("", "")
-    kind, each = noun.partition(" ")[0], f"each {bounds}" if bounds else ""
+    kind, each = noun.partition(" ")[0], f"each {bounds.removeprefix('each ')}" if bounds else ""
     plural = f"{kind}s" if kind in _NOUNS else ""
     least, most = schema.get("minItems"), schema.get("maxItems")
     if least is not None and least == most:
