@@ -25,8 +25,8 @@ from photonpano_simulator.views import texture_of
 
 _FINEST = 4096  # largest side of a texture, in texels
 _SAMPLES, _COARSE = 100, 4  # frames, and px between pixels, in which the share that people or boards cover is measured
-_SIZES = (0.02, 8.0)  # smallest and largest size of people and boards, in heights of a frame
-_HALVINGS = 16
+_SIZES = np.geomspace(0.02, 8.0, 16)  # of people and boards that are tried, in heights of a frame
+_HALVINGS = 10  # between two of them
 _PAUSES = 3  # of each person during a capture
 _SWING, _STRIDE = 0.4, 0.8  # amplitude of the legs in radians, and length of two steps in heights of a person
 _MARGIN = 1.1  # people turn round this far outside, in fields of view
@@ -182,12 +182,18 @@ class Foreground:
                 total += hidden.sum()
             return total / (len(frames) * hidden.size)
 
-        low, high = _SIZES
-        if (most := covered(high)) < share:
+        # People who are too large seldom are in the frame: their share may decrease again.
+        reached = []
+        for size in _SIZES:
+            reached.append(covered(size))
+            if reached[-1] >= share:
+                break
+        else:
             raise InputError(
-                f"{noun} cover at most {most:.0%} of the pixels, and {key}.share is {share:.0%}; raise {key}.number, or lower "
-                f"{key}.share"
+                f"{noun} cover at most {max(reached):.0%} of the pixels, and {key}.share is {share:.0%}; raise {key}.number, "
+                f"or lower {key}.share"
             )
+        low, high = size * _SIZES[0] / _SIZES[1], size
         for _ in range(_HALVINGS):
             middle = (low * high) ** 0.5
             low, high = (middle, high) if covered(middle) < share else (low, middle)
