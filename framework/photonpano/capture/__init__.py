@@ -1,6 +1,6 @@
 """One record of a capture as a run sees it: what its source gives, and what was found about it."""
 
-from photonpano.capture.capture import Capture, Colours, capture_of, in_light, part_of, seen_through
+from photonpano.capture.capture import Capture, Colours, before, capture_of, in_light, part_of, seen_through
 from photonpano.capture.pixels import MISSING, Gather, Index, LinearCorrection, numbered
 from photonpano.capture.plugin_source import PluginSource
 
@@ -12,6 +12,7 @@ __all__ = [
     "Index",
     "LinearCorrection",
     "PluginSource",
+    "before",
     "capture_of",
     "in_light",
     "numbered",

@@ -13,7 +13,7 @@ from photonpano.capture.pixels import Gather
 from photonpano.capture.plugin_source import PluginSource
 from photonpano.contracts.protocols import Closing
 from photonpano.photometry import MAX_FRAMES, packed_counts
-from photonpano.values import BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, StreamInfo
+from photonpano.values import Background, BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, StreamInfo
 
 if TYPE_CHECKING:
     from photonpano.capture.plugin_source import PluginSource
@@ -56,6 +56,8 @@ class Capture(Closing):
         light: the gain of each frame; None for steady light. Frames are weighted by it, and predicted flux is multiplied by it.
         camera: frames are warped through its lens, and homographies map ideal pixels; None if it is not known.
         colour: what the filters of a filter array show; None for a grey capture.
+        background: which parts of frames show the background; None if all do. Others are left out of merging, and of what is
+            compared with the panorama.
         decisions: what was decided because of what the frames show.
     """
 
@@ -69,6 +71,7 @@ class Capture(Closing):
     light: Light | None = None
     camera: Camera | None = None
     colour: Colours | None = None
+    background: Background | None = None
     decisions: tuple[Decision, ...] = ()
 
     @property
@@ -144,6 +147,7 @@ class Capture(Closing):
         """Return a capture for each colour, see `Colours`; none for a grey capture."""
         parts = {} if self.colour is None else self.colour.parts
         seen = {"info": self.info, "first": self.first, "light": self.light, "camera": self.camera}
+        seen["background"] = self.background
         return {name: replace(part, **seen) for name, part in parts.items()}  # type: ignore[arg-type]  # mixed values
 
     def clear_mix(self) -> FloatArray:
@@ -229,11 +233,18 @@ def seen_through(source: Source, camera: Camera) -> Capture:
     return replace(capture_of(source), camera=camera)
 
 
+def before(source: Source, background: Background | None) -> Capture:
+    """Return a capture in which what hides the background is left out; None for nothing. Counts stay as they are."""
+    return replace(capture_of(source), background=background)
+
+
 def part_of(source: Source, span: FrameSpan) -> Capture:
     """Return the frames of a span as a capture of its own, whose first frame has the index 0."""
     whole = capture_of(source)
     light = None if whole.light is None else whole.light.part(span)
-    return replace(whole, info=replace(whole.info, n_frames=len(span)), first=whole.first + span.start, light=light)
+    background = None if whole.background is None else whole.background.part(span)
+    info = replace(whole.info, n_frames=len(span))
+    return replace(whole, info=info, first=whole.first + span.start, light=light, background=background)
 
 
 def _capture_of(source: PluginSource) -> Capture:

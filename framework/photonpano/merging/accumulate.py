@@ -170,11 +170,14 @@ def _sum_on(
         masked = masked.astype(np.uint8)  # sums in bytes stay in bytes
     grid, seen_by = Grid.zeros(canvas, 1 if terms is None else terms.number), _Seen(source.info.frame_shape, masked)
     for chunk, footprint in visible:
+        shown = None if source.background is None else source.background.pixels(chunk.span)
+        weight = masked if shown is None else shown if masked is None else masked * shown
         amounts = np.array([float(len(chunk.span))]) if terms is None else terms.amounts(chunk.span)
         raw = counts_of(chunk.span)
         counts: FluxImage | Counts = raw if corrected is None else corrected(raw, len(chunk.span))
-        image = Texture.of(average_squares(counts if masked is None else counts * masked, footprint.shrink))
-        add_warped(image, seen_by(footprint.shrink, image.texels.dtype), amounts, footprint, grid)
+        image = Texture.of(average_squares(counts if weight is None else counts * weight, footprint.shrink))
+        seen = seen_by(footprint.shrink, image.texels.dtype, None if shown is None else weight)
+        add_warped(image, seen, amounts, footprint, grid)
         advance(len(chunk.span))
     return grid.total, grid.coverages
 
@@ -194,14 +197,23 @@ class _Seen:
         self._frame_shape, self._masked = frame_shape, masked
         self._textures: dict[tuple[int, object], Texture | None] = {}
 
-    def __call__(self, shrink: int, texel: np.dtype[Any]) -> Texture | None:
-        """Return it for squares of `shrink` pixels a side, in texels of the same kind as the image; None if it is 1 for all."""
+    def __call__(self, shrink: int, texel: np.dtype[Any], share: FluxImage | NDArray[np.uint8] | None = None) -> Texture | None:
+        """Return it for squares of `shrink` pixels a side, in texels of the same kind as the image; None if it is 1 for all.
+
+        `share` (H, W) is that of a chunk in which it is not what it is for all others.
+        """
+        if share is not None:
+            return _texture(share, shrink, texel)
         if (shrink, texel) not in self._textures:
             whole = self._masked is None and not any(side % shrink for side in self._frame_shape)
-            share = np.ones(self._frame_shape, np.float32) if self._masked is None else self._masked
-            like = share.astype(np.uint8) if texel == np.uint32 else share.astype(np.float32)
-            self._textures[shrink, texel] = None if whole else Texture.of(average_squares(like, shrink))
+            seen = np.ones(self._frame_shape, np.float32) if self._masked is None else self._masked
+            self._textures[shrink, texel] = None if whole else _texture(seen, shrink, texel)
         return self._textures[shrink, texel]
+
+
+def _texture(share: FluxImage | NDArray[np.uint8], shrink: int, texel: np.dtype[Any]) -> Texture:
+    like = share.astype(np.uint8) if texel == np.uint32 else share.astype(np.float32)
+    return Texture.of(average_squares(like, shrink))
 
 
 def divided(length: int, parts: int) -> list[range]:

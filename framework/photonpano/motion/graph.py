@@ -25,12 +25,16 @@ from photonpano.geometry import (
     scaled_ahead,
 )
 from photonpano.motion.adjustment import OUTLIER, Adjustment, Assessment, Cost, Problem
+from photonpano.motion.consensus import TOLERANCES_PX, agreeing, contradicting, layers
 from photonpano.motion.evidence import Evidence, likeliest
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
 from photonpano.motion.planar import PlanarName, basis_of, moved, nearest
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, Located
+
+# Share of the patches that contradict a camera that only turns, above which they are told from the background.
+_CONTRADICTED = 0.002
 
 
 class GraphOptions(Protocol):
@@ -69,6 +73,9 @@ class GraphSolution:
     rotations: Rotations | None = None  # of the L located nodes, and their camera; None for homographies
     # returns how well rival models explain the edges, None without rivals; for rotations it takes as long as solving the graph
     compare: Callable[[], Evidence | None] = lambda: None
+    # (N, P) how far patches of each node lie from where the motion lets expect them, as mean squares in variances, 1 for noise;
+    # 0 where nothing is known, and None where patches do not contradict the motion
+    layers: FloatArray | None = None
 
 
 def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
@@ -96,12 +103,13 @@ def solve(
     if not len(tied.motions):
         return tied.alone(model)
     if model.kind == "auto":
-        fits = _rivals(tied, start, model)
+        tied, fits = _of_background(tied, start, _rivals(tied, start, model))
         chosen = _chosen(tied, fits)
         solution = tied.solution(fits[chosen], chosen, lambda: Evidence.of(_costs(fits)))
         turned = next((fit for model, fit in fits.items() if chosen.is_simple and model.kind == "rotation"), None)
         return solution if turned is None else replace(solution, assess=partial(_doubting, tied, solution, turned))
-    fit = _fitted(tied, start, model)
+    tied, fits = _of_background(tied, start, {model: _fitted(tied, start, model)})
+    fit = fits[model]
     return tied.solution(fit, model, partial(_compared, tied, start, model, fit))
 
 
@@ -116,6 +124,33 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
         if fits and _chosen(tied, fits).is_simple:
             break
     return fits
+
+
+def _of_background(
+    tied: _Tied, start: FloatArray | None, fits: dict[MotionModel, _Fit]
+) -> tuple[_Tied, dict[MotionModel, _Fit]]:
+    """Have pairs follow the patches that agree with one camera, if others contradict it: what moves by itself, or is near.
+
+    Returns the pairs by these patches, and all models fitted to them.
+    """
+    costs = {model: cost for model, cost in _costs(fits).items() if model.kind == "rotation"}
+    if not costs:
+        return tied, fits
+    turning = likeliest(costs)
+    first, fit = fits[turning].adjustment, fits[turning]
+    assert isinstance(first, RotationAdjustment)
+    if not turning.layered and contradicting(tied.motions, first.beside(fit.state)) < _CONTRADICTED:
+        return tied, fits
+    background = tied
+    for tolerance_px in TOLERANCES_PX:
+        motions = agreeing(tied.motions, first.beside(fit.state), tolerance_px, tied.frame_shape)
+        background = replace(tied, motions=motions)
+        adjustment = RotationAdjustment(background.problem, turning.seen_by(tied.frame_shape), turning.unknown)
+        fit = background.fit(adjustment, fit.state)
+    found = layers(tied.pairs, tied.motions, first.beside(fit.state), len(tied.located))
+    background = replace(background, layers=found)
+    others = [model for model in fits if model is not turning]
+    return background, {model: _fitted(background, start, model) for model in others} | {turning: fit}
 
 
 def _chosen(tied: _Tied, fits: Mapping[MotionModel, _Fit]) -> MotionModel:
@@ -188,6 +223,7 @@ class _Tied:
     pairs: NDArray[np.integer]  # (E, 2) their nodes
     motions: Sequence[Located]  # their motions
     frame_shape: tuple[int, int]  # (height, width) of a frame
+    layers: FloatArray | None = None  # see `GraphSolution`
 
     @classmethod
     def of(cls, n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> _Tied:
@@ -248,7 +284,7 @@ class _Tied:
         outliers = tuple(int(position) for position in self.positions[~fit.kept])
         assess = partial(adjustment.assess, found, fit.norms, fit.kept)
         rotations = found if isinstance(found, Rotations) else None
-        return GraphSolution(homographies, self.located, outliers, residual_px, assess, model, rotations, compare)
+        return GraphSolution(homographies, self.located, outliers, residual_px, assess, model, rotations, compare, self.layers)
 
     def alone(self, model: MotionModel) -> GraphSolution:
         """Return the solution of a single node."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from photonpano.capture import seen_through
+from photonpano.capture import capture_of, seen_through
 from photonpano.contracts.loop import KNOTS, AttributedTrajectory, knot_errors, require_groups
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.execution.context import Context
@@ -77,7 +77,7 @@ def estimate_motion(
     timeline = timeline or Timeline.regular(source.info.n_frames)
     for level in levels:
         clock = Stopwatch(context.threads)
-        model = model.knowing(camera_of_motion(previous))
+        model = replace(model.knowing(camera_of_motion(previous)), layered=capture_of(source).background is not None)
         groups = timeline.parts(resample(level, source.info.n_frames, clock))
         turning = level.turning(model.turning_camera(source.info.frame_shape))
         seen = through_lens(source, model)

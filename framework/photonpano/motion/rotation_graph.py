@@ -73,7 +73,7 @@ class RotationAdjustment(Adjustment[Rotations]):
         """
         super().__init__(problem, n_shared=len(unknown))
         self._assumed, self._unknown = assumed, unknown
-        self._motions = problem.motions
+        self._motions, self._observed = problem.motions, problem.observed
         # What was computed of the current state, and of states near it.
         self._near: tuple[Rotations, list[Rotations]] | None = None
         self._shifts: dict[Rotations, FloatArray] = {}
@@ -148,6 +148,12 @@ class RotationAdjustment(Adjustment[Rotations]):
 
     def _unexplained(self, state: Rotations) -> FloatArray:
         return self._lens.unexplained(self._shift(state) if self._bends(state) else None)
+
+    def beside(self, state: Rotations) -> FloatArray:
+        """Return where patches lie beside where they are expected: (E, P, 2) px; meaningless for those that show nothing."""
+        lens = self._lens
+        expected = transform_points(self.relative(state), lens.points) + self._shift(state).reshape(lens.shifts.shape)
+        return np.asarray(transform_points(self._observed, lens.points) + lens.shifts - expected)
 
     @property
     def _finds_lens(self) -> bool:

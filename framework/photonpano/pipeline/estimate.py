@@ -7,7 +7,9 @@ from functools import partial
 
 import numpy as np
 
+from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source
+from photonpano.corrections.movers import decision_of as background_decision
 from photonpano.execution.context import Context
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
@@ -35,14 +37,18 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
     tried: tuple[passes.Pass, ...] = (
         passes.through_found_lens,
         passes.without_shading,
+        passes.without_movers,
         passes.in_changing_light,
         partial(passes.later_levels, journal=journal),
         *[passes.through_found_lens] * _MOST_LENSES,
+        passes.again_without_movers,
         passes.cut_at_jumps,
     )
     for each in tried:
         n_decisions, state = len(state.decisions), passes.tried(state, each).state
         journal += state.decisions[n_decisions:]
+    if (background := capture_of(state.source).background) is not None:
+        journal.append(background_decision(background))
     journal += [*state.timeline.decisions, *_model_decisions(plan, state.results)]
     return state
 

@@ -9,6 +9,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from photonpano.capture import before, capture_of
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
 from photonpano.corrections.lighting import (
@@ -19,12 +20,13 @@ from photonpano.corrections.lighting import (
     measure_light,
     measure_pixel_gain,
 )
+from photonpano.corrections.movers import find_background, without_layers
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import Camera, lenses_apart_px
 from photonpano.motion.model import SAME_LENS_PX
 from photonpano.motion.timeline import Cut
 from photonpano.pipeline.components import build_levels
-from photonpano.pipeline.state import State
+from photonpano.pipeline.state import State, within
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.residuals.cuts import SMALLEST_PX, find_cuts
 from photonpano.residuals.refinement import MotionFit
@@ -180,14 +182,45 @@ def worse_in_light(proposed: MotionFit, before: MotionFit) -> str:
 def later_levels(state: State, journal: list[Decision]) -> Proposal:
     """Run the levels that are left; a single one again, if the capture was corrected since.
 
-    In light that flickers, group sizes that are chosen from the capture are chosen anew: whole periods of the light.
+    In light that flickers, group sizes that are chosen from the capture are chosen anew: whole periods of the light. What hides
+    the background is looked for again after each level, which knows the motion better.
     """
     levels, light = state.levels, light_of(state.source)
     if light is not None and light.frequency:
         journal[:] = [each for each in journal if each.what != "group_size"]
         levels = build_levels(state.plan, state.source, journal)
     left = levels if state.outdated and len(levels) == 1 else levels[1:]
-    return Proposal(lambda: replace(state, levels=levels).located(left, state.trajectory), worse=None)
+
+    def make() -> State:
+        located = replace(state, levels=levels)
+        if capture_of(state.source).background is None:
+            return located.located(left, state.trajectory)
+        for level in left:
+            located = tried(located.located([level], located.trajectory), without_movers).state
+        return located
+
+    return Proposal(make, worse=None)
+
+
+def without_movers(state: State) -> Proposal | None:
+    """Leave out what hides the background by the motion known so far: pairs that show both follow something in between."""
+    found = find_background(before(state.view.source, None), state.trajectory, state.motion.span, state.context)
+    located = state.results[-1].located
+    if (layers := located.solution.layers) is not None:
+        there = located.solution.located
+        found = without_layers(found, located.instants, layers[there], state.source.info.frame_shape)
+    if found is None:
+        return None
+    # Residuals of what is left out, and not, cannot be compared.
+    hiding = replace(state, source=before(state.source, found), context=within(state.context, found), outdated=True)
+    return Proposal(lambda: hiding, worse=None)
+
+
+def again_without_movers(state: State) -> Proposal | None:
+    """Run the last level again, if what hides the background was looked for since."""
+    if not state.outdated or capture_of(state.source).background is None:
+        return None
+    return Proposal(lambda: state.located([state.results[-1].level], state.trajectory), worse=None)
 
 
 def cut_at_jumps(state: State) -> Proposal | None:

@@ -12,6 +12,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from photonpano.capture import before, capture_of
 from photonpano.contracts.protocols import Exporter, Renderer, Source, Trajectory, camera_of, light_of
 from photonpano.contracts.results import FILES, require_panorama
 from photonpano.contracts.rules import BrokenContract, attributing
@@ -48,6 +49,8 @@ def render_into(
     `source` is divided by the vignette and in its light. Returns the panorama, and the decisions of renderer and exporters.
     """
     decisions: list[Decision] = []
+    if (background := capture_of(source).background) is not None:
+        source = before(source, background.complete)
     renderer = build_renderer(plan, source, decisions, context.in_order)
     exporters = build_exporters(plan, source, decisions)
     with naming_key_of_canvas(plan):

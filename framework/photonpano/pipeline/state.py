@@ -82,7 +82,7 @@ class State:
 
     def corrected(self, source: Source, correction: Vignette | Light, decision: Decision) -> State:
         """Return the state of a capture with one more correction, on which its checkpoints then depend."""
-        context, decisions = _within(self.context, correction), (*self.decisions, decision)
+        context, decisions = within(self.context, correction), (*self.decisions, decision)
         return replace(self, source=source, context=context, outdated=True, decisions=decisions)
 
     @property
@@ -96,7 +96,7 @@ class State:
         camera = camera_of_motion(self.trajectory) if self.results else None
         if camera is None:
             return View(through_lens(self.source, self.model), self.context)
-        return View(seen_through(self.source, camera), _within(self.context, camera))
+        return View(seen_through(self.source, camera), within(self.context, camera))
 
     @cached_property
     def motion(self) -> FrameMotion:
@@ -120,6 +120,6 @@ def _given(number: float | Literal["find"]) -> float | None:
     return None if number == "find" else number
 
 
-def _within(context: Context, given: object) -> Context:
+def within(context: Context, given: object) -> Context:
     """Return a context whose checkpoints depend on one more value."""
     return replace(context, checkpoints=context.checkpoints.within(given))

@@ -218,9 +218,11 @@ class _Colour:
         masked = None if capture.valid.all() else np.where(capture.valid, np.float32(0), np.float32(np.nan))
         return cls(capture, prediction, masked, corrected, dark, np.maximum(dark, 0), slope)
 
-    def counted(self, raw: Counts, n_frames: int) -> NDArray[np.float32] | NDArray[np.uint8]:
-        """Return the counts of a span, corrected, NaN where masked: (H, W)."""
-        counts: Any = raw if self.corrected is None else self.corrected(raw, n_frames)
+    def counted(self, raw: Counts, span: FrameSpan) -> NDArray[np.float32] | NDArray[np.uint8]:
+        """Return the counts of a span, corrected, NaN where masked, or where something hides the background: (H, W)."""
+        counts: Any = raw if self.corrected is None else self.corrected(raw, len(span))
+        if self.capture.background is not None and (shown := self.capture.background.pixels(span)) is not None:
+            counts = np.where(shown, counts, np.float32(np.nan))
         if counts.dtype != np.uint8:
             counts = np.ascontiguousarray(counts, np.float32)
         found: NDArray[np.float32] | NDArray[np.uint8] = counts if self.masked is None else counts + self.masked
@@ -258,7 +260,7 @@ def _measured(
         raw = capture.chunk(span)
         sums[:] = 0
         for colour in colours:
-            counts = colour.counted(raw, len(span))
+            counts = colour.counted(raw, span)
             colour.prediction.view(homography, images, span)
             add_block_sums(counts, colour.noise_beside(images[0]), float(len(span)), images[0], images[1], sums)
             if index % _PIXEL_STRIDE == 0:

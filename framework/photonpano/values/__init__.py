@@ -1,6 +1,7 @@
 """Frozen values that stages exchange; this package imports numpy only."""
 
 from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Frames, Homography
+from photonpano.values.background import CELL_PX, Background
 from photonpano.values.capture import Bayer, CaptureSummary, Decision, DecisionValue, StreamInfo
 from photonpano.values.exposure import Panorama, PanoramaRows, Response, VirtualExposure
 from photonpano.values.frames import FrameSpan, Group, true_spans
@@ -9,7 +10,9 @@ from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated, Patch
 from photonpano.values.poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
 
 __all__ = [
+    "CELL_PX",
     "Ambiguity",
+    "Background",
     "Bayer",
     "BoolArray",
     "CameraGuess",

@@ -94,10 +94,10 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
         near = depths(motions, shape).min(axis=1) > _LEAST_DEPTH
         spans, motions = [span for span, is_near in zip(spans, near, strict=True) if is_near], motions[near]
     half = int(np.clip(min(shape) // _CELLS, 2, _LARGEST_PX)) // 2
-    canvas = _canvas(trajectory, motions, shape, 1 / half)
+    canvas = scene_canvas(trajectory, motions, shape, 1 / half)
     while canvas.height * canvas.width > 4 * _MOST_CELLS:
         half *= 2
-        canvas = _canvas(trajectory, motions, shape, 1 / half)
+        canvas = scene_canvas(trajectory, motions, shape, 1 / half)
     n_rows, n_columns = canvas.height // 2, canvas.width // 2
     covered = _COVERED * _least_weight(source, 2 * half)
 
@@ -148,7 +148,7 @@ def _seen(
     return index, np.asarray(np.maximum(flux, 0) * exposure, np.float64), exposure.astype(np.float64)
 
 
-def _canvas(trajectory: Trajectory, motions: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
+def scene_canvas(trajectory: Trajectory, motions: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
     """Return a canvas that holds all frames: a sphere if the camera turns far."""
     camera = camera_of_motion(trajectory)
     if camera is not None:

@@ -1,0 +1,223 @@
+"""Find what hides the background of a scene for a time: what moves by itself, or stands so near that it shifts against it."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import partial
+
+import cv2
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from photonpano.capture import capture_of
+from photonpano.contracts.protocols import Source, Trajectory
+from photonpano.corrections.lighting.finding import speed_px
+from photonpano.corrections.lighting.gains import scene_canvas
+from photonpano.execution.context import Context
+from photonpano.geometry import PATCHES, Canvas
+from photonpano.merging import Chunk, accumulate, binned_mean
+from photonpano.values import CELL_PX, Background, BoolArray, Decision, FloatArray, FluxImage, FrameSpan, Homography
+
+MOVERS = "movers"  # name of the decision
+_INSTANTS = 400  # at which frames are compared with the background
+# Wanted photons of a square in a sum of frames, most frames of a sum, and most motion within them.
+_PHOTONS, _LONGEST, _MOTION_PX = 400.0, 96, 4.0
+_PROBES = 5  # frames by which the flux is estimated
+_COVERED = 0.9  # share of the frames of a sum that must have seen a square
+# Standard deviation of the Gaussian that weights the pixels of a square, in halves of its side: sums must not depend on the
+# sub-pixel position of a frame.
+_BLUR = 1.0
+_BINS, _TAIL = 64, 1e-3  # of the histograms of brightness, and the share of squares beyond their ends
+_NEAR = 2.5  # standard deviations from the usual brightness within which squares are averaged
+_USUAL = 0.3  # least share of the sums that show a place, in which it has its usual brightness
+# What squares may differ by beyond photon noise: a share of their brightness, and errors of the motion.
+_UNEVEN, _MISPLACED_PX = 0.02, 0.75
+_MEDIAN = 0.455  # the median of the square of a Gaussian number of unit variance
+_AROUND = np.ones((3, 3))  # squares that are tested together
+# Standard deviations by which a patch hides the background, and by which squares beside it belong to it.
+_SURE, _BESIDE = 6.0, 2.5
+_APART = 9.0  # mean square of the residuals of a patch that does not follow the motion, in variances
+_FEWEST = 4  # squares of a patch that are sure
+_LEAST, _MOST = 0.003, 0.75  # shares of what frames see that may be hidden
+_SMOOTH = 5  # sums over which deviations are averaged where the background was never seen
+_LEAST_HIDDEN = 0.25  # share of the sums that are taken for the background there
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """The brightness of squares of the scene, of 8 px a side, in S sums of frames."""
+
+    spans: list[FrameSpan]
+    motions: FloatArray  # (S, 3, 3) of the frames, to the reference plane
+    canvas: Canvas  # whose pixels are quarters of the squares
+    root: FluxImage  # (S, h, w) square root of their flux, whose noise hardly depends on it; 0 where not seen
+    std: FluxImage  # (S, h, w) its standard deviation by photon noise; infinite where not seen
+
+    @property
+    def known(self) -> BoolArray:
+        """(S, h, w) what was seen."""
+        return np.isfinite(self.std)
+
+    def steady(self, usual: FluxImage) -> FluxImage:
+        """Return the roots in the same light, given those that squares usually have."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = np.where(self.known & (usual > 0), self.root / usual, np.nan)
+        return np.asarray(self.root / np.nanmedian(ratios, axis=(1, 2))[:, None, None], np.float32)
+
+
+def find_background(source: Source, trajectory: Trajectory, span: FrameSpan, context: Context) -> Background | None:
+    """Find the parts of the frames of a span that show the background; None if all do.
+
+    The background of a place is the brightness that it has most often: that of things that pass is spread over many values. A
+    patch of squares that differs from it by more than photon noise hides it.
+    """
+    seen = _seen(source, trajectory, span, context)
+    if len(seen.spans) < _SMOOTH:
+        return None
+    known = seen.known
+    usual, _ = _usual(seen, seen.root)
+    steady = seen.steady(usual)
+    usual, sure = _usual(seen, steady)
+    deviation = _deviation(seen, steady, usual)
+    hidden = np.array([_patches(*each) for each in zip(deviation, known, strict=True)])
+    if not _LEAST <= hidden[known].mean() <= _MOST:
+        return None
+    hidden |= known & ~sure
+    instants = np.array([each.centre for each in seen.spans])
+    shown, filled = (~_in_frames(source, seen, each) for each in (hidden, _seen_somewhere(hidden, deviation, known)))
+    return Background(instants, shown, filled, source.info.frame_shape)
+
+
+def without_layers(
+    background: Background | None, instants: FloatArray, layers: FloatArray, frame_shape: tuple[int, int]
+) -> Background | None:
+    """Leave out the patches of frames that do not follow the motion of the camera, too; None if nothing is left out.
+
+    Given are, at N instants, the mean squares of the residuals of patches, (N, P): see `GraphSolution`.
+    """
+    shape = frame_shape
+    apart = (layers > _APART).reshape(len(layers), PATCHES, PATCHES).astype(np.uint8)
+    if apart.mean() < _LEAST:
+        return background
+    near = np.array([cv2.dilate(each, np.ones((3, 3), np.uint8)) for each in np.maximum(apart[:-1], apart[1:])])
+    near = np.concatenate([near[:1], np.maximum(near[:-1], near[1:]), near[-1:]]) > 0
+    rows, columns = (
+        ((np.arange(0, side, CELL_PX) + CELL_PX / 2) * PATCHES / side).astype(int).clip(0, PATCHES - 1) for side in shape
+    )
+    cells = near[:, rows][:, :, columns]
+    if background is None:
+        return Background(instants, ~cells, ~cells, shape)
+    nearest = np.abs(background.instants[:, None] - instants).argmin(axis=1)
+    return replace(background, shown=background.shown & ~cells[nearest], filled=background.filled & ~cells[nearest])
+
+
+def decision_of(background: Background) -> Decision:
+    """Return what was found, for the record."""
+    hidden = 1 - background.shown.mean(axis=(1, 2))
+    most = round(float(background.instants[int(np.argmax(hidden))]))
+    reason = f"do not show the background, which moves as the camera does, most at frame {most} ({hidden.max():.0%})"
+    return Decision(MOVERS, round(float(hidden.mean()), 4), f"{hidden.mean():.1%} of the frames {reason}; they are left out")
+
+
+def _seen(source: Source, trajectory: Trajectory, span: FrameSpan, context: Context) -> _Seen:
+    probes = [binned_mean(source, each) for each in source.info.spread(_PROBES, 1)]
+    photons = float(np.nanmean(probes)) * np.pi * (_BLUR * CELL_PX) ** 2
+    longest = min(_PHOTONS / max(photons, 1e-9), _MOTION_PX / max(speed_px(source, trajectory), 1e-9))
+    length = int(np.clip(longest, 1, min(_LONGEST, len(span))))
+    centres = np.linspace(span.start + length / 2, span.stop - length / 2, min(_INSTANTS, len(span) // length))
+    spans = [FrameSpan(start, start + length) for start in (centres - length / 2).astype(int).tolist()]
+    motions = trajectory.at([each.centre for each in spans])
+    fine = scene_canvas(trajectory, motions, source.info.frame_shape, 2 / CELL_PX)
+    canvas = fine.part(0, 0, fine.height // 2 * 2, fine.width // 2 * 2)
+    summed = partial(_brightness, source, canvas)
+    root, std = (
+        np.array(images) for images in zip(*context.in_order(summed, [*zip(spans, motions, strict=True)]), strict=True)
+    )
+    return _Seen(spans, motions, canvas, root, std)
+
+
+def _brightness(source: Source, canvas: Canvas, place: tuple[FrameSpan, Homography]) -> tuple[FluxImage, FluxImage]:
+    """Return the square root of the flux of squares in a sum of frames, and its standard deviation: (h, w) each."""
+    span, homography = place
+    photons = accumulate(source, [Chunk(span, homography)], canvas, canvas.shape)
+    frames = photons.weight if photons.lit is None else photons.lit.frames.sum(axis=0)
+    counts, weight, frames = (
+        cv2.GaussianBlur(each, (0, 0), _BLUR)[1::2, 1::2] for each in (np.maximum(photons.counts, 0), photons.weight, frames)
+    )
+    seen = frames > _COVERED * len(span)
+    mean = np.where(seen, counts / np.maximum(weight, np.float32(1e-3)), 0).astype(np.float32)
+    exposure = np.maximum(weight * np.float32(np.pi * (_BLUR * CELL_PX) ** 2), np.float32(1))
+    flux = source.response.flux(mean, exposure)
+    root, step = np.sqrt(np.maximum(flux, 0)), np.float32(0.5) / np.sqrt(exposure)
+    lit = np.maximum(flux, 1 / exposure)
+    return root, np.where(seen, step * np.sqrt(np.expm1(np.minimum(lit, 20)) / lit), np.float32(np.inf)).astype(np.float32)
+
+
+def _usual(seen: _Seen, root: FluxImage) -> tuple[FluxImage, BoolArray]:
+    """Return the root of the flux that squares have most often, and for which ones that is often enough: (h, w) each."""
+    known, shape = seen.known, root[0].shape
+    low, high = np.quantile(root[known], [_TAIL, 1 - _TAIL])
+    width = max(float(high - low), 1e-9) / _BINS
+    bins = np.clip((root - low) / width, 0, _BINS - 1).astype(np.intp)
+    squares = np.arange(root[0].size).reshape(shape)
+    votes = np.bincount((squares * _BINS + bins)[known], minlength=root[0].size * _BINS).reshape(-1, _BINS)
+    blur = max(float(np.median(seen.std[known])) / width, 0.5)
+    smooth = cv2.GaussianBlur(votes.astype(np.float32), (0, 0), sigmaX=blur, sigmaY=1e-6, borderType=cv2.BORDER_CONSTANT)
+    usual = ((smooth.argmax(axis=1) + 0.5) * width + low).reshape(shape)
+    for _ in range(2):
+        near = known & (np.abs(root - usual) < _NEAR * np.hypot(seen.std, _UNEVEN * usual))
+        weight = np.where(near, 1 / np.where(known, seen.std, 1) ** 2, 0)
+        total = weight.sum(axis=0)
+        usual = np.where(total > 0, (weight * root).sum(axis=0) / np.maximum(total, 1e-9), usual)
+    return np.asarray(usual, np.float32), near.sum(axis=0) >= _USUAL * known.sum(axis=0)
+
+
+def _deviation(seen: _Seen, root: FluxImage, usual: FluxImage) -> FluxImage:
+    """Return by how much squares and those around them differ from the usual, in standard deviations of noise: (S, h, w)."""
+    known, slopes = seen.known, np.square(np.gradient(usual)).sum(axis=0)
+    tolerated = (_UNEVEN * usual) ** 2 + (_MISPLACED_PX / CELL_PX) ** 2 * slopes
+    squares = np.where(known, (root - usual) ** 2 / (np.where(known, seen.std, 1) ** 2 + tolerated), np.nan)
+    # What frames sample of a thin line differs more, always.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # squares that are never seen
+        squares /= np.maximum(np.nanmedian(squares, axis=0) / _MEDIAN, 1)
+    found = np.zeros_like(root)
+    for index, (of_sum, there) in enumerate(zip(np.nan_to_num(squares), known, strict=True)):
+        total, number = (cv2.filter2D(each, -1, _AROUND, borderType=cv2.BORDER_CONSTANT) for each in (of_sum, there * 1.0))
+        found[index] = (total - number) / np.sqrt(2 * np.maximum(number, 1))
+    return found
+
+
+def _patches(deviation: FluxImage, known: BoolArray) -> BoolArray:
+    """Return the patches of squares that hide the background: (h, w)."""
+    _, labels = cv2.connectedComponents((known & (deviation > _BESIDE)).astype(np.uint8))
+    sure = np.bincount(labels[known & (deviation > _SURE)], minlength=labels.max() + 1) >= _FEWEST
+    sure[0] = False
+    return np.asarray(sure[labels])
+
+
+def _seen_somewhere(hidden: BoolArray, deviation: FluxImage, known: BoolArray) -> BoolArray:
+    """Return what is hidden, but not where a square always is: the sums that differ least are taken for the background."""
+    least, never = hidden.copy(), known.any(axis=0) & (hidden | ~known).all(axis=0)
+    for row, column in np.argwhere(never):
+        times = np.flatnonzero(known[:, row, column])
+        series = uniform_filter1d(deviation[times, row, column], _SMOOTH, mode="nearest")
+        least[times[series <= np.quantile(series, _LEAST_HIDDEN)], row, column] = False
+    return least
+
+
+def _in_frames(source: Source, seen: _Seen, hidden: BoolArray) -> BoolArray:
+    """Return the cells of the frames that hidden squares cover: (S, h', w')."""
+    height, width = source.info.frame_shape
+    rows, columns = (np.arange(0, side, CELL_PX) + (CELL_PX - 1) / 2 for side in (height, width))
+    middles = np.stack(np.meshgrid(np.minimum(columns, width - 1), np.minimum(rows, height - 1)), axis=-1)
+    camera = capture_of(source).camera
+    ideal = middles if camera is None else camera.ideal(middles)
+    ideal = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=-1)
+    cells = np.zeros((len(hidden), *ideal.shape[:2]), bool)
+    for index, (image, motion) in enumerate(zip(hidden, seen.motions, strict=True)):
+        places = seen.canvas.pixels(ideal @ (seen.canvas.plane_to_rays @ motion).T)
+        x, y = np.moveaxis(np.nan_to_num(places, nan=-1e6).astype(np.float32) / 2 - np.float32(0.5), -1, 0)
+        cells[index] = cv2.remap(image.view(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
+    return cells

@@ -1,0 +1,91 @@
+"""Pairs as the patches show them that agree with one motion of the camera: what moves by itself, or is near, has no weight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.geometry import generators, parameters, patch_centres, slopes, transform_points
+from photonpano.values import BoolArray, FloatArray, Located, Patches
+
+# Residuals of patches, in px, within which they agree: all of them at first, and then those of the background alone
+# (graduated non-convexity, Black and Rangarajan 1996).
+TOLERANCES_PX = (2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+_CERTAIN = 0.5  # least error of a patch beside photon noise, as a share of the tolerance
+_FEWEST = 8.0  # patches, by their weights, that determine the motion of a pair
+_UNCERTAIN = 1e-4  # factor of the information of a pair that has fewer
+_FAR, _FAR_PX = 4.0, 0.5  # standard deviations, and px, beyond which a patch contradicts a motion
+_ALIKE_PX = 0.1  # error of patches beside photon noise
+_DAMPING = 1e-6
+
+
+def agreeing(motions: Sequence[Located], residuals: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> list[Located]:
+    """Return the motions of pairs by the patches that agree with a motion of the camera.
+
+    `residuals` (E, P, 2) are what that leaves of where patches lie, in px of frames of (height, width).
+    """
+    squares = (residuals**2).sum(axis=-1)
+    weights = 1 / (1 + squares / (2 * tolerance_px**2)) ** 2  # of Geman and McClure
+    return [_by_patches(*each, tolerance_px, shape) for each in zip(motions, weights, strict=True)]
+
+
+def contradicting(motions: Sequence[Located], residuals: FloatArray) -> float:
+    """Return the share of the patches that lie elsewhere than a motion lets expect, of those that show something."""
+    shown = [(motion.patches, left) for motion, left in zip(motions, residuals, strict=True) if motion.patches is not None]
+    found = np.concatenate([_far(*each) for each in shown]) if shown else np.zeros(1, bool)
+    return float(found.mean()) if found.size else 0.0
+
+
+def _far(patches: Patches, residuals: FloatArray) -> BoolArray:
+    """Return which of the patches that show something are far from where they are expected."""
+    seen = patches.information[:, 0, 0] > 0
+    variances = np.trace(np.linalg.inv(patches.information[seen]), axis1=1, axis2=2)
+    return np.asarray((residuals[seen] ** 2).sum(axis=-1) > _FAR**2 * variances + _FAR_PX**2)
+
+
+def layers(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: FloatArray, n_nodes: int) -> FloatArray:
+    """Return the mean squares of the residuals of the patches of each node, in variances: (n_nodes, P); 0 if not known.
+
+    `pairs` (E, 2) are the moving and the fixed node of each pair; patches are those of the moving one.
+    """
+    squares, numbers = np.zeros((2, n_nodes, residuals.shape[1]))
+    for (moving, _), motion, left in zip(pairs, motions, residuals, strict=True):
+        if motion.patches is not None:
+            seen = motion.patches.information[:, 0, 0] > 0
+            limited = np.linalg.inv(motion.patches.information[seen]) + _ALIKE_PX**2 * np.eye(2)
+            squares[moving, seen] += (
+                np.einsum("pi,pi->p", left[seen], np.linalg.solve(limited, left[seen, :, None])[..., 0]) / 2
+            )
+            numbers[moving, seen] += 1
+    return np.asarray(squares / np.maximum(numbers, 1))
+
+
+def _by_patches(motion: Located, weights: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> Located:
+    """Return the homography that patches with these weights, (P,), show, with its information."""
+    patches = motion.patches
+    if patches is None or motion.information is None:
+        return motion
+    middles = patch_centres(shape)
+    there = motion.homography @ np.concatenate([middles, np.ones((len(middles), 1))], axis=1).T
+    moves = generators(shape)
+    by_points = slopes(there, moves @ there).reshape(len(middles), 2, 8)
+    shown = patches.information[:, 0, 0] > 0
+    limited = np.linalg.pinv(patches.information, hermitian=True) + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
+    information = np.where(shown[:, None, None], weights[:, None, None] * np.linalg.inv(limited), 0)
+    if (weights * shown).sum() < _FEWEST:
+        return replace(motion, information=motion.information * _UNCERTAIN, patches=Patches(patches.shifts, information))
+    normal = np.einsum("pki,pkl,plj->ij", by_points, information, by_points)
+    right = np.einsum("pki,pkl,pl->i", by_points, information, patches.shifts)
+    normal += _DAMPING * np.trace(normal) * np.eye(8)
+    step = np.linalg.solve(normal, right)
+    homography = motion.homography + np.einsum("i,ijk->jk", step, moves) @ motion.homography
+    homography /= homography[2, 2]
+    changed = moves @ homography
+    by_step = parameters(np.eye(3) + changed - homography * changed[:, 2:, 2:])
+    to_step = np.linalg.inv(by_step.T)
+    shifts = transform_points(motion.homography, middles) + patches.shifts - transform_points(homography, middles)
+    kept = Patches(np.where(shown[:, None], shifts, 0), information)
+    return replace(motion, homography=homography, information=to_step.T @ normal @ to_step, patches=kept)
