@@ -17,6 +17,7 @@ from photonpano.corrections.lighting.gains import scene_canvas
 from photonpano.execution.context import Context
 from photonpano.geometry import PATCHES, Canvas
 from photonpano.merging import Chunk, accumulate, binned_mean
+from photonpano.robust import cauchy_weights, robust_std
 from photonpano.values import CELL_PX, Background, BoolArray, Decision, FloatArray, FluxImage, FrameSpan, Homography
 
 MOVERS = "movers"  # name of the decision
@@ -24,7 +25,7 @@ _INSTANTS = 400  # at which frames are compared with the background
 # Wanted photons of a square in a sum of frames, most frames of a sum, and most motion within them.
 _PHOTONS, _LONGEST, _MOTION_PX = 400.0, 96, 4.0
 _PROBES = 5  # frames by which the flux is estimated
-_COVERED = 0.9  # share of the frames of a sum that must have seen a square
+_COVERED = 0.5  # share of the frames of a sum that must have seen a square
 # Standard deviation of the Gaussian that weights the pixels of a square, in halves of its side: sums must not depend on the
 # sub-pixel position of a frame.
 _BLUR = 1.0
@@ -38,8 +39,10 @@ _AROUND = np.ones((3, 3))  # squares that are tested together
 # Standard deviations by which a patch hides the background, and by which squares beside it belong to it.
 _SURE, _BESIDE = 6.0, 2.5
 _APART = 9.0  # mean square of the residuals of a patch that does not follow the motion, in variances
+_THICK = 5  # least height and width of a patch, in squares, with those beside it
 _FEWEST = 4  # squares of a patch that are sure
-_LEAST, _MOST = 0.003, 0.75  # shares of what frames see that may be hidden
+_ROUNDS, _TINY = 4, 1e-6  # of the fit of light and shift
+_LEAST, _MOST = 0.02, 0.6  # least share of what frames see that is hidden, and largest share of a frame
 _SMOOTH = 5  # sums over which deviations are averaged where the background was never seen
 _LEAST_HIDDEN = 0.25  # share of the sums that are taken for the background there
 
@@ -60,10 +63,20 @@ class _Seen:
         return np.isfinite(self.std)
 
     def steady(self, usual: FluxImage) -> FluxImage:
-        """Return the roots in the same light, given those that squares usually have."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratios = np.where(self.known & (usual > 0), self.root / usual, np.nan)
-        return np.asarray(self.root / np.nanmedian(ratios, axis=(1, 2))[:, None, None], np.float32)
+        """Return the roots in the same light, and without a shift of each sum, given those that squares usually have.
+
+        The motion is not exact, and a tremor may be left in it.
+        """
+        slopes, steady = np.gradient(usual), self.root.copy()
+        for index, (root, known) in enumerate(zip(self.root, self.known, strict=True)):
+            terms, weight = np.stack([each[known] for each in (usual, *slopes)], axis=1), np.ones(int(known.sum()))
+            for _ in range(_ROUNDS):
+                scaled = terms * weight[:, None]
+                change = np.linalg.lstsq(scaled, weight * root[known])[0]
+                left = root[known] - terms @ change
+                weight = np.sqrt(cauchy_weights(left, _NEAR * max(robust_std(left), _TINY)))
+            steady[index, known] = (usual[known] + left / max(float(change[0]), _TINY)) if known.any() else 0
+        return steady
 
 
 def find_background(source: Source, trajectory: Trajectory, span: FrameSpan, context: Context) -> Background | None:
@@ -81,11 +94,14 @@ def find_background(source: Source, trajectory: Trajectory, span: FrameSpan, con
     usual, sure = _usual(seen, steady)
     deviation = _deviation(seen, steady, usual)
     hidden = np.array([_patches(*each) for each in zip(deviation, known, strict=True)])
-    if not _LEAST <= hidden[known].mean() <= _MOST:
+    # Where nearly all differs, the motion is wrong.
+    hidden &= (hidden.sum(axis=(1, 2)) < _MOST * known.sum(axis=(1, 2)))[:, None, None]
+    if hidden[known].mean() < _LEAST:
         return None
     hidden |= known & ~sure
     instants = np.array([each.centre for each in seen.spans])
-    shown, filled = (~_in_frames(source, seen, each) for each in (hidden, _seen_somewhere(hidden, deviation, known)))
+    filled = _seen_somewhere(hidden, deviation, known)
+    shown, filled = (~_in_frames(source, seen, _beyond_borders(each, known)) for each in (hidden, filled))
     return Background(instants, shown, filled, source.info.frame_shape)
 
 
@@ -98,7 +114,7 @@ def without_layers(
     """
     shape = frame_shape
     apart = (layers > _APART).reshape(len(layers), PATCHES, PATCHES).astype(np.uint8)
-    if apart.mean() < _LEAST:
+    if not apart.any():
         return background
     near = np.array([cv2.dilate(each, np.ones((3, 3), np.uint8)) for each in np.maximum(apart[:-1], apart[1:])])
     near = np.concatenate([near[:1], np.maximum(near[:-1], near[1:]), near[-1:]]) > 0
@@ -191,7 +207,10 @@ def _deviation(seen: _Seen, root: FluxImage, usual: FluxImage) -> FluxImage:
 
 def _patches(deviation: FluxImage, known: BoolArray) -> BoolArray:
     """Return the patches of squares that hide the background: (h, w)."""
-    _, labels = cv2.connectedComponents((known & (deviation > _BESIDE)).astype(np.uint8))
+    differs = known & (deviation > _BESIDE)
+    # Errors of the motion differ along edges, which are thin.
+    thick = cv2.morphologyEx((differs | ~known).astype(np.uint8), cv2.MORPH_OPEN, np.ones((_THICK, _THICK), np.uint8))
+    _, labels = cv2.connectedComponents((differs & (cv2.dilate(thick, np.ones((3, 3), np.uint8)) > 0)).astype(np.uint8))
     sure = np.bincount(labels[known & (deviation > _SURE)], minlength=labels.max() + 1) >= _FEWEST
     sure[0] = False
     return np.asarray(sure[labels])
@@ -205,6 +224,12 @@ def _seen_somewhere(hidden: BoolArray, deviation: FluxImage, known: BoolArray) -
         series = uniform_filter1d(deviation[times, row, column], _SMOOTH, mode="nearest")
         least[times[series <= np.quantile(series, _LEAST_HIDDEN)], row, column] = False
     return least
+
+
+def _beyond_borders(hidden: BoolArray, known: BoolArray) -> BoolArray:
+    """Return what is hidden, and squares beside it of which too little is seen: (S, h, w)."""
+    beside = np.array([cv2.dilate(each, np.ones((5, 5), np.uint8)) for each in hidden.astype(np.uint8)]) > 0
+    return np.asarray(hidden | (beside & ~known))
 
 
 def _in_frames(source: Source, seen: _Seen, hidden: BoolArray) -> BoolArray:

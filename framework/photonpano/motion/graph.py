@@ -34,7 +34,7 @@ from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, Located
 
 # Share of the patches that contradict a camera that only turns, above which they are told from the background.
-_CONTRADICTED = 0.002
+_CONTRADICTED = 0.005
 
 
 class GraphOptions(Protocol):

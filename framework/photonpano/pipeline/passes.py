@@ -35,6 +35,7 @@ from photonpano.values import Decision, Light
 
 logger = logging.getLogger(__name__)
 
+_FAILED = 0.05  # share of the pairs that are not located beyond which the motion is not trusted to tell what moves by itself
 _EXPLAINED = 0.9  # changing light is accepted if it lowers the reduced chi-square of the photons to this fraction
 
 
@@ -193,7 +194,7 @@ def later_levels(state: State, journal: list[Decision]) -> Proposal:
 
     def make() -> State:
         located = replace(state, levels=levels)
-        if capture_of(state.source).background is None:
+        if located.watched and capture_of(state.source).background is None:
             return located.located(left, state.trajectory)
         for level in left:
             located = tried(located.located([level], located.trajectory), without_movers).state
@@ -204,16 +205,24 @@ def later_levels(state: State, journal: list[Decision]) -> Proposal:
 
 def without_movers(state: State) -> Proposal | None:
     """Leave out what hides the background by the motion known so far: pairs that show both follow something in between."""
+    if _uncertain(state):
+        return None
     found = find_background(before(state.view.source, None), state.trajectory, state.motion.span, state.context)
     located = state.results[-1].located
     if (layers := located.solution.layers) is not None:
         there = located.solution.located
         found = without_layers(found, located.instants, layers[there], state.source.info.frame_shape)
-    if found is None:
-        return None
+    watched = replace(state, watched=True)
+    if found is not None:
+        watched = replace(watched, source=before(state.source, found), context=within(state.context, found), outdated=True)
     # Residuals of what is left out, and not, cannot be compared.
-    hiding = replace(state, source=before(state.source, found), context=within(state.context, found), outdated=True)
-    return Proposal(lambda: hiding, worse=None)
+    return Proposal(lambda: watched, worse=None)
+
+
+def _uncertain(state: State) -> bool:
+    """Return whether the motion may be wrong somewhere, where all of the background would differ from what is expected."""
+    located = state.results[-1].located
+    return len(located.failures) > _FAILED * len(located.edges)
 
 
 def again_without_movers(state: State) -> Proposal | None:

@@ -40,6 +40,7 @@ class State:
         timeline: repeated frames, and where the motion is cut.
         start: the motion known before the first level; None if there is none.
         outdated: whether the source was corrected since these levels were located.
+        watched: whether what hides the background was looked for.
         vignette: by which the source is divided.
         refined: the motion corrected by refiners; None for that of the last level.
         known_fit: how well that explains the photons, if it is known without measuring them.
@@ -55,6 +56,7 @@ class State:
     start: Trajectory | None = None
     results: tuple[LevelResult, ...] = ()
     outdated: bool = False
+    watched: bool = False
     vignette: Vignette | None = None
     decisions: tuple[Decision, ...] = ()
     refined: FrameMotion | None = None
