@@ -147,7 +147,9 @@ def state(folder: Path) -> tuple[int | None, list[str]]:
     record = json.loads((directory / "run.json").read_text())
     missing = [name for name in record["files"] if not (directory / name).exists()]
     other = sorted({path.name for path in directory.iterdir()} - {*record["files"], "run.json"})
-    lacking = sorted(contents.RESULTS - {"report.html", "run.json", "light.npz", "vignette.npz", *record["files"]})
+    lacking = sorted(
+        contents.RESULTS - {"report.html", "run.json", "light.npz", "layers.npz", "vignette.npz", *record["files"]}
+    )
     return record["seed"], [*changed, *missing, *(f"more: {name}" for name in other), *(f"lacks {name}" for name in lacking)]
 
 

@@ -13,6 +13,7 @@ from photonpano.capture import seen_through
 from photonpano.contracts.protocols import Source
 from photonpano.corrections import Vignette, divided_by, read_vignette
 from photonpano.corrections.lighting import in_light_of
+from photonpano.corrections.movers import before_background_of
 from photonpano.errors import InputError, SpecError
 from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.evaluation import load_panorama as read_panorama
@@ -62,7 +63,7 @@ def opened_run(
         InputError: the files are of several runs, or of none, or the capture cannot be opened or is another one now.
         SpecError: a change is wrong.
     """
-    require_one_run(folder, ["trajectory.npz", "light.npz", "vignette.npz"])
+    require_one_run(folder, ["trajectory.npz", "light.npz", "layers.npz", "vignette.npz"])
     run = load_run_trajectory(folder, needs_std_px=False)
     record = read_record(folder)
     with _capture(folder, record, catalog, changes, output) as (plan, capture):
@@ -70,6 +71,7 @@ def opened_run(
         require_same_frames(folder, record, capture)
         vignette = read_vignette(folder, capture)
         lit = in_light_of(capture if vignette is None else divided_by(capture, vignette), folder)
+        lit = before_background_of(lit, folder)
         source = through_lens(lit, model_of(plan)) if run.camera is None else seen_through(lit, run.camera)
         yield OpenedRun(folder, record, plan, capture, source, vignette, _motion(run), not np.isnan(run.std_px).any())
 

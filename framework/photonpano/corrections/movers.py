@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import warnings
+import zipfile
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from photonpano.capture import capture_of
+from photonpano.capture import before, capture_of
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.corrections.lighting.finding import speed_px
 from photonpano.corrections.lighting.gains import scene_canvas
+from photonpano.errors import InputError
 from photonpano.execution.context import Context
 from photonpano.geometry import PATCHES, Canvas
 from photonpano.merging import Chunk, accumulate, binned_mean
@@ -21,6 +25,8 @@ from photonpano.robust import cauchy_weights, robust_std
 from photonpano.values import CELL_PX, Background, BoolArray, Decision, FloatArray, FluxImage, FrameSpan, Homography
 
 MOVERS = "movers"  # name of the decision
+LAYERS_FILE = "layers.npz"
+_ARRAYS = ("instants", "shown", "filled")
 _INSTANTS = 400  # at which frames are compared with the background
 # Wanted photons of a square in a sum of frames, most frames of a sum, and most motion within them.
 _PHOTONS, _LONGEST, _MOTION_PX = 400.0, 96, 4.0
@@ -246,3 +252,29 @@ def _in_frames(source: Source, seen: _Seen, hidden: BoolArray) -> BoolArray:
         x, y = np.moveaxis(np.nan_to_num(places, nan=-1e6).astype(np.float32) / 2 - np.float32(0.5), -1, 0)
         cells[index] = cv2.remap(image.view(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
     return cells
+
+
+def write_background(folder: Path, background: Background) -> None:
+    """Write layers.npz into a folder."""
+    arrays: dict[str, Any] = {name: getattr(background, name) for name in _ARRAYS}
+    np.savez_compressed(folder / LAYERS_FILE, **arrays)
+
+
+def before_background_of(source: Source, folder: Path) -> Source:
+    """Return a capture without what hides the background by a run folder; as it is, if the run found nothing.
+
+    Raises:
+        InputError: layers.npz is damaged, or of frames of another size.
+    """
+    path, shape = folder / LAYERS_FILE, source.info.frame_shape
+    if not path.exists():
+        return source
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            background = Background(*(archive[name] for name in _ARRAYS), shape)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: cannot be read as the layers of a run ({error}); run again") from error
+    expected = len(background.instants), *(-(-side // CELL_PX) for side in shape)
+    if not background.shown.shape == background.filled.shape == expected:
+        raise InputError(f"{path} has cells of the shape {background.shown.shape}, not {expected} as the capture; run again")
+    return before(source, background)

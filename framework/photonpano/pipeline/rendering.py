@@ -18,6 +18,7 @@ from photonpano.contracts.results import FILES, require_panorama
 from photonpano.contracts.rules import BrokenContract, attributing
 from photonpano.corrections import Vignette, write_vignette
 from photonpano.corrections.lighting import write_light
+from photonpano.corrections.movers import write_background
 from photonpano.errors import ExtentError, InputError, OutputError, ProjectionError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import InOrder
@@ -49,7 +50,8 @@ def render_into(
     `source` is divided by the vignette and in its light. Returns the panorama, and the decisions of renderer and exporters.
     """
     decisions: list[Decision] = []
-    if (background := capture_of(source).background) is not None:
+    background = capture_of(source).background
+    if background is not None:
         source = before(source, background.complete)
     renderer = build_renderer(plan, source, decisions, context.in_order)
     exporters = build_exporters(plan, source, decisions)
@@ -75,6 +77,8 @@ def render_into(
             write_vignette(folder.staging, vignette)
         if (light := light_of(source)) is not None:
             write_light(folder.staging, light)
+        if background is not None:
+            write_background(folder.staging, background)
     return panorama, decisions
 
 

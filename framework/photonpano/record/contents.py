@@ -24,7 +24,8 @@ RECORD = "run.json"
 # The files of a run. Runs of older versions do not list theirs.
 RESULTS = frozenset(
     {
-        *("panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "light.npz", "vignette.npz", "report.html"),
+        *("panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "report.html"),
+        *("light.npz", "layers.npz", "vignette.npz"),
         RECORD,
     }
 )

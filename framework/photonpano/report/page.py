@@ -118,6 +118,7 @@ _CONTENTS = {
     "coverage.tiff": "the number of frames that saw each pixel of the panorama, float32",
     "trajectory.npz": "the motion of every frame",
     "light.npz": "the gain of the light in each frame",
+    "layers.npz": "which parts of the frames show the background, and which something that hides it",
     "vignette.npz": "the relative sensitivity of each pixel",
     "panorama.exr": "linear flux, for programs that work with a large range",
     "panorama.hdr": "linear flux, for programs that work with a large range",

@@ -148,7 +148,7 @@ def _photons(run: _Run) -> _Found | None:
 @_doubtful_above(
     0.03,
     "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
-    "merge with robust-merge, or mask what moves; the motion may be that of the thing instead of the scene",
+    "mask what moves (corrections: mask); the motion may be that of the thing instead of the scene",
 )
 def _moving(run: _Run) -> _Found | None:
     residuals = run.explained.residuals

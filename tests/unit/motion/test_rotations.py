@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -213,9 +214,34 @@ def test_patches_that_move_by_themselves_do_not_bend_the_lens() -> None:
         assert isinstance(edge.motion, Located)
         assert edge.motion.patches is not None
         edge.motion.patches.shifts[:36, 0] += 3.0
-    rotations = solve(20, edges, 10, SHAPE, model=MotionModel("auto").knowing(assumed)).rotations
-    assert rotations is not None
-    np.testing.assert_allclose(rotations.camera.numbers[:3], camera.numbers[:3], rtol=0.1)
+    solution = solve(20, edges, 10, SHAPE, model=MotionModel("auto").knowing(assumed))
+    assert solution.rotations is not None
+    np.testing.assert_allclose(solution.rotations.camera.numbers[:3], camera.numbers[:3], rtol=0.02)
+    assert solution.layers is not None
+    assert (solution.layers[1:, :36] > 100).all()
+    assert solution.layers[:, 36:].max() < 9
+
+
+def test_pairs_follow_the_background_behind_things_that_are_near() -> None:
+    """A third of the frame shifts by 0.8 px from exposure to exposure, and homographies follow it as far as they can."""
+    camera, rotations = Camera.of(430.0, SHAPE), turn(16, 30.0)
+    points, rng, edges = patch_centres(SHAPE), np.random.default_rng(0), []
+    for moving in range(16):
+        for fixed in range(max(0, moving - 3), moving):
+            there = transform_points(camera.homographies(rotations[fixed].T @ rotations[moving]), points)
+            there[points[:, 0] < SHAPE[1] / 3, 0] += 0.8 * (moving - fixed)
+            there += 0.05 * rng.normal(size=there.shape)
+            fit = fit_homography(points, there, np.ones(len(points)), camera.homographies(np.eye(3)))
+            patches = Patches(there - transform_points(fit.homography, points), np.tile(np.eye(2) / 0.05**2, (144, 1, 1)))
+            edges.append(Edge(moving, fixed, Located(fit.homography, fit.information, 0.05, patches=patches)))
+    solution = solve(16, edges, 8, SHAPE, model=MotionModel("auto"))
+    assert solution.model.name == "rotation"
+    true = camera.homographies(rotations[8].T @ rotations)
+    away = corner_displacements(np.linalg.inv(true) @ solution.homographies, np.eye(3), SHAPE)
+    assert away.mean() < 0.15
+    without = [replace(each, motion=replace(each.motion, patches=None)) for each in edges]
+    pulled = solve(16, without, 8, SHAPE, model=MotionModel("rotation", focal_px=430.0)).homographies
+    assert corner_displacements(np.linalg.inv(true) @ pulled, np.eye(3), SHAPE).mean() > 1
 
 
 def test_unknown_lens_moves_corners_as_the_best_homography_between_distorted_pixels() -> None:

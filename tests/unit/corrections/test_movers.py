@@ -1,0 +1,126 @@
+"""What moves before the background is told from it, and left out of what is merged and compared."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, InputError
+from photonpano.capture import before, capture_of
+from photonpano.corrections.movers import (
+    before_background_of,
+    decision_of,
+    find_background,
+    without_layers,
+    write_background,
+)
+from photonpano.execution.context import Context
+from photonpano.geometry import PATCHES, translation
+from photonpano.merging import accumulate, chunks_of
+from photonpano.testing import KnownMotion, MemorySource, Scene
+
+SHAPE, N = (96, 128), 1600
+MOTION = KnownMotion(lambda frame: translation(0.04 * float(frame), 0.01 * float(frame)))
+ALL = FrameSpan(0, N)
+STEADY = np.ones(N)
+
+
+@cache
+def panned(with_mover: bool, light: float = 0.0, tremor_px: float = 0.0) -> MemorySource:
+    """A pan over a scene; a square of 32 px walks through the frame in 1,600 frames."""
+    scene, rng = Scene(0, (0.1, 0.5)), np.random.default_rng(0)
+    frames = np.empty((N, *SHAPE), np.uint8)
+    for first in range(0, N, 8):
+        at = MOTION.at([first + 3.5])[0] @ translation(tremor_px * np.sin(first / 60), 0)
+        view = scene.view(at, SHAPE).copy()
+        if with_mover:
+            view[walker(first + 4)] = 0.9
+        lit = view * (1 + light * np.cos((first + np.arange(8)) / 40))[:, None, None]
+        frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-lit)
+    return MemorySource(frames)
+
+
+def walker(frame: int) -> tuple[slice, slice]:
+    left = round(0.06 * frame)
+    return slice(30, 62), slice(left, left + 32)
+
+
+def shares(found: object, frames: range) -> tuple[float, float]:
+    """Return which share of the square is hidden, and of all else."""
+    hits, false = [], []
+    for frame in frames:
+        pixels = found.pixels(FrameSpan(frame, frame + 1))
+        hidden = np.zeros(SHAPE, bool) if pixels is None else pixels == 0
+        square = np.zeros(SHAPE, bool)
+        square[walker(frame)] = True
+        hits.append(hidden[square].mean())
+        false.append(hidden[~square].mean())
+    return float(np.mean(hits)), float(np.mean(false))
+
+
+@pytest.mark.parametrize("light", [0.0, 0.4], ids=["steady", "flickering"])
+def test_what_walks_before_the_background_is_hidden_whatever_the_light(light: float) -> None:
+    found = find_background(panned(with_mover=True, light=light), MOTION, ALL, Context(1))
+    assert found is not None
+    hit, false = shares(found, range(100, 1500, 100))
+    assert hit > 0.97
+    assert false < 0.25
+    assert "do not show the background" in decision_of(found).reason
+
+
+@pytest.mark.parametrize(("light", "tremor_px"), [(0.0, 0.0), (0.4, 0.0), (0.0, 2.5)], ids=["still", "flicker", "tremor"])
+def test_nothing_is_hidden_where_nothing_moves(light: float, tremor_px: float) -> None:
+    assert find_background(panned(with_mover=False, light=light, tremor_px=tremor_px), MOTION, ALL, Context(1)) is None
+
+
+def test_the_merged_background_is_that_without_the_walker() -> None:
+    found = find_background(panned(with_mover=True), MOTION, ALL, Context(1))
+    assert found is not None
+    onto, shape = translation(0, 0), (112, 192)
+    chunks = chunks_of(ALL, MOTION, SHAPE, 1.0)
+
+    def flux(source: object) -> np.ndarray:
+        photons = accumulate(source, chunks, onto, shape)
+        return np.where(photons.weight > 100, photons.counts / np.maximum(photons.weight, 1), np.nan)
+
+    true = flux(panned(with_mover=False))
+    ghost, clean = (flux(source) - true for source in (panned(with_mover=True), before(panned(with_mover=True), found)))
+    assert np.nanmax(np.abs(ghost)) > 0.2
+    assert np.sqrt(np.nanmean(clean**2)) < 0.25 * np.sqrt(np.nanmean(ghost**2))
+
+
+def test_every_place_that_was_seen_is_in_the_panorama() -> None:
+    found = find_background(panned(with_mover=True), MOTION, ALL, Context(1))
+    assert found is not None
+    assert (found.filled >= found.shown).all()
+
+
+def test_patches_that_do_not_follow_the_motion_are_hidden() -> None:
+    layers = np.ones((8, PATCHES**2))
+    instants = np.linspace(0, N, 8)
+    assert without_layers(None, instants, layers, SHAPE) is None
+    layers[:, 5 * PATCHES + 6] = 40.0
+    found = without_layers(None, instants, layers, SHAPE)
+    assert found is not None
+    pixels = found.pixels(FrameSpan(800, 801))
+    assert pixels is not None
+    y, x = int(5.5 * SHAPE[0] / PATCHES), int(6.5 * SHAPE[1] / PATCHES)
+    assert pixels[y, x] == 0
+    assert pixels.mean() > 0.8
+
+
+def test_layers_are_read_as_they_were_written(tmp_path: Path) -> None:
+    source, found = panned(with_mover=True), find_background(panned(with_mover=True), MOTION, ALL, Context(1))
+    assert found is not None
+    assert before_background_of(source, tmp_path) is source
+    write_background(tmp_path, found)
+    read = capture_of(before_background_of(source, tmp_path)).background
+    assert read is not None
+    np.testing.assert_array_equal(read.shown, found.shown)
+    np.testing.assert_array_equal(read.filled, found.filled)
+    with pytest.raises(InputError, match="has cells of the shape"):
+        before_background_of(MemorySource(np.zeros((4, 30, 40), np.uint8)), tmp_path)
+    (tmp_path / "layers.npz").write_bytes(b"no archive")
+    with pytest.raises(InputError, match="cannot be read as the layers of a run"):
+        before_background_of(source, tmp_path)

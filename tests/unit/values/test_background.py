@@ -1,0 +1,39 @@
+"""Which parts of frames show the background, between the instants at which it is known."""
+
+import numpy as np
+
+from photonpano.values import Background, FrameSpan
+
+SHAPE = (20, 30)
+
+
+def hidden_at(*places: tuple[int, int, int]) -> Background:
+    """At the instants 10, 20, 30 and 40, cells (instant, row, column) are hidden; the panorama shows all of them."""
+    shown = np.ones((4, 3, 4), bool)
+    for place in places:
+        shown[place] = False
+    return Background(np.array([10.0, 20.0, 30.0, 40.0]), shown, np.ones_like(shown), SHAPE)
+
+
+def test_frames_are_hidden_where_an_instant_next_to_them_is() -> None:
+    background = hidden_at((1, 0, 2))
+    hidden = [bool(not background.cells(FrameSpan(frame, frame + 1))[0, 2]) for frame in (5, 12, 20, 25, 31)]
+    assert hidden == [False, True, True, True, False]
+
+
+def test_spans_are_hidden_where_any_instant_in_them_is() -> None:
+    assert not hidden_at((1, 0, 2), (2, 1, 1)).cells(FrameSpan(0, 50))[[0, 1], [2, 1]].any()
+
+
+def test_pixels_are_those_of_cells_of_8_px_and_the_last_ones_are_cut_off() -> None:
+    background = hidden_at((0, 2, 3))
+    pixels = background.pixels(FrameSpan(0, 1))
+    assert pixels is not None
+    np.testing.assert_array_equal(np.argwhere(pixels == 0), [(y, x) for y in range(16, 20) for x in range(24, 30)])
+    assert background.pixels(FrameSpan(40, 50)) is None
+
+
+def test_parts_keep_their_instants_and_the_panorama_shows_what_is_filled() -> None:
+    background = hidden_at((1, 0, 2))
+    assert not background.part(FrameSpan(15, 50)).cells(FrameSpan(5, 6))[0, 2]
+    assert background.complete.pixels(FrameSpan(20, 21)) is None
