@@ -271,10 +271,10 @@ def before_background_of(source: Source, folder: Path) -> Source:
         return source
     try:
         with np.load(path, allow_pickle=False) as archive:
-            background = Background(*(archive[name] for name in _ARRAYS), shape)
+            instants, shown, filled = (archive[name] for name in _ARRAYS)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: cannot be read as the layers of a run ({error}); run again") from error
-    expected = len(background.instants), *(-(-side // CELL_PX) for side in shape)
-    if not background.shown.shape == background.filled.shape == expected:
-        raise InputError(f"{path} has cells of the shape {background.shown.shape}, not {expected} as the capture; run again")
-    return before(source, background)
+    expected = len(instants), *(-(-side // CELL_PX) for side in shape)
+    if not shown.shape == filled.shape == expected:
+        raise InputError(f"{path} has cells of the shape {shown.shape}, not {expected} as the capture; run again")
+    return before(source, Background(instants, shown, filled, shape))

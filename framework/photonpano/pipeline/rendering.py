@@ -52,7 +52,7 @@ def render_into(
     decisions: list[Decision] = []
     background = capture_of(source).background
     if background is not None:
-        source = before(source, background.complete)
+        source = before(source, background.complete if plan.render.movers == "hide" else None)
     renderer = build_renderer(plan, source, decisions, context.in_order)
     exporters = build_exporters(plan, source, decisions)
     with naming_key_of_canvas(plan):

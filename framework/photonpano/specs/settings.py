@@ -116,6 +116,11 @@ class RenderSettings(Config):
         description="where the horizon of a cylinder or a sphere lies: in the middle of the reference camera's view, as it was "
         "held, or level along the whole motion",
     )
+    movers: Literal["hide", "show"] = Field(
+        "hide",
+        description="what hides the background for a time, since it moves by itself or is near: hide leaves it out of the "
+        "panorama, as far as the background was ever seen, and show merges all photons",
+    )
     tolerance_px: float = Field(
         0.125,
         gt=0,

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from photonpano.photometry import BinaryResponse, BinarySumResponse
 _BATCH = 16  # chunks that are summed before they are added to the grid
 _PART_ROWS = 64  # approximate number of rows of the grid that a thread adds to at a time
 _MANY_PIECES = 64  # a span is divided into at least this many chunks, if it has the frames: some of them are held out
+_Summed: TypeAlias = tuple[FluxImage, FluxImage, BoolArray]  # see `_summed`
+
 _UP = 0.5 + 1e-6  # a centre on the border of two cells belongs to the second one, whatever the rounding of its coordinates
 
 
@@ -71,7 +74,6 @@ def sums_on(
     terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
     lit = np.zeros(canvas.shape, np.float32)
     seen = np.zeros((1 if terms is None else terms.number, *canvas.shape), np.float32)
-    usable = np.ascontiguousarray(source.valid)
     parts = divided(canvas.height, max(1, canvas.height // _PART_ROWS))
     adding: Iterable[None] = ()
     for first in range(0, len(chunks), _BATCH):
@@ -79,7 +81,7 @@ def sums_on(
         summed = list(pool.map(partial(_summed, capture, terms), batch))
         deque(adding, maxlen=0)
         to_grid = [np.ascontiguousarray(canvas.transform @ chunk.homography) for chunk in batch]
-        adding = pool.map(partial(_add, summed, to_grid, usable, lit, seen), parts)
+        adding = pool.map(partial(_add, summed, to_grid, lit, seen), parts)
         for chunk in batch:
             advance(len(chunk.span))
     deque(adding, maxlen=0)
@@ -87,22 +89,23 @@ def sums_on(
     return _photons(source, lit, seen[0], lit_frames)
 
 
-def _summed(capture: Capture, terms: LightTerms | None, chunk: Chunk) -> tuple[FluxImage, FluxImage]:
-    """Return the counts of a chunk, (h, w), and what a pixel adds to each image of frames and gains, (P,)."""
+def _summed(capture: Capture, terms: LightTerms | None, chunk: Chunk) -> _Summed:
+    """Return the counts of a chunk, (h, w), what a pixel adds to each image of frames and gains, (P,), and which pixels do."""
     amounts = np.array([len(chunk.span)], np.float32) if terms is None else terms.amounts(chunk.span).astype(np.float32)
-    return np.ascontiguousarray(capture.corrected_counts(chunk.span), np.float32), amounts
+    shown = None if capture.background is None else capture.background.pixels(chunk.span)
+    usable = capture.valid if shown is None else capture.valid & (shown > 0)
+    return np.ascontiguousarray(capture.corrected_counts(chunk.span), np.float32), amounts, np.ascontiguousarray(usable)
 
 
 def _add(
-    summed: Sequence[tuple[FluxImage, FluxImage]],
+    summed: Sequence[_Summed],
     to_grid: Sequence[Homography],
-    usable: BoolArray,
     lit: FluxImage,
     seen: FluxImage,
     rows: range,
 ) -> None:
     part = slice(rows.start, rows.stop)
-    for (counts, amounts), homography in zip(summed, to_grid, strict=True):
+    for (counts, amounts, usable), homography in zip(summed, to_grid, strict=True):
         add_observations(counts, usable, amounts, homography, rows.start, lit[part], seen[:, part])
 
 
