@@ -116,6 +116,8 @@ def without_layers(
 ) -> Background | None:
     """Leave out the patches of frames that do not follow the motion of the camera, too; None if nothing is left out.
 
+    The panorama shows them: most places behind what is near are never seen.
+
     Given are, at N instants, the mean squares of the residuals of patches, (N, P): see `GraphSolution`.
     """
     shape = frame_shape
@@ -129,9 +131,9 @@ def without_layers(
     )
     cells = near[:, rows][:, :, columns]
     if background is None:
-        return Background(instants, ~cells, ~cells, shape)
+        return Background(instants, ~cells, np.ones_like(cells), shape)
     nearest = np.abs(background.instants[:, None] - instants).argmin(axis=1)
-    return replace(background, shown=background.shown & ~cells[nearest], filled=background.filled & ~cells[nearest])
+    return replace(background, shown=background.shown & ~cells[nearest])
 
 
 def decision_of(background: Background) -> Decision:
