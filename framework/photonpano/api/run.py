@@ -20,7 +20,7 @@ from photonpano.api.command import (
     warn,
 )
 from photonpano.execution.context import Progress
-from photonpano.motion.timeline import CUT, DARK_JUMP, REPEATED
+from photonpano.motion.timeline import CUT, DARK_FRAMES, DARK_JUMP, REPEATED, SHOTS
 from photonpano.pipeline.estimate import START
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
 from photonpano.record.schema import PanoramaRecord, RunRecord
@@ -42,7 +42,7 @@ def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
     for warning in record["warnings"]:
         warn(warning)
     for decision in record["decisions"]:
-        if decision["what"] in (START, CUT, DARK_JUMP, REPEATED):
+        if decision["what"] in (START, SHOTS, DARK_FRAMES, CUT, DARK_JUMP, REPEATED):
             yield f"{decision['what']:<9} {decision['value']}: {decision['reason']}"
     for refinement in record["refinements"]:
         if refinement["rounds"]:  # the first of them is the largest

@@ -1,6 +1,6 @@
 """One record of a capture as a run sees it: what its source gives, and what was found about it."""
 
-from photonpano.capture.capture import Capture, Colours, before, capture_of, in_light, part_of, seen_through
+from photonpano.capture.capture import Capture, Colours, before, capture_of, in_light, leaving_out, part_of, seen_through
 from photonpano.capture.pixels import MISSING, Gather, Index, LinearCorrection, numbered
 from photonpano.capture.plugin_source import PluginSource
 
@@ -15,6 +15,7 @@ __all__ = [
     "before",
     "capture_of",
     "in_light",
+    "leaving_out",
     "numbered",
     "part_of",
     "seen_through",

@@ -139,6 +139,10 @@ class Capture(Closing):
         """Return the corrected sum of the frames of a span: see `corrected`."""
         return self.corrected(self.counts(span), len(span))
 
+    def shown(self, spans: Iterable[FrameSpan]) -> list[FrameSpan]:
+        """Return the spans that hold no frame that is left out, such as one without light: its gain is 0."""
+        return [span for span in spans if self.light is None or self.light.shown[span.start : span.stop].all()]
+
     def weights(self) -> FluxImage:
         """Return the statistical weight of a frame of each pixel: (H, W) float32, 1 for an ordinary pixel."""
         return np.ones(self.info.frame_shape, np.float32) if self.weight is None else self.weight
@@ -226,6 +230,14 @@ def capture_of(source: Source, origin: str | None = None) -> Capture:
 def in_light(source: Source, light: Light) -> Capture:
     """Return a capture with the gain of each of its frames. Counts stay as they are; what sums them divides by the gains."""
     return replace(capture_of(source), light=light)
+
+
+def leaving_out(source: Source, shown: BoolArray) -> Capture:
+    """Return a capture without the frames that are not `shown`, (T,): their gain is 0, so that they count in no sum."""
+    capture = capture_of(source)
+    if shown.all():
+        return capture
+    return replace(capture, light=(capture.light or Light.of_frames(np.ones(len(shown)))).leaving_out(shown))
 
 
 def seen_through(source: Source, camera: Camera) -> Capture:

@@ -197,7 +197,7 @@ def _spans(capture: Capture, trajectory: Trajectory) -> list[FrameSpan]:
     moved = float(np.median(corner_displacements(steps, np.eye(3), info.frame_shape).max(axis=-1)))
     per_frame = moved * _SPANS / max(info.n_frames - 1, 1)
     n_frames = int(np.clip(_SPAN_PX / max(per_frame, 1e-9), 1, min(_SPAN_FRAMES, max(1, (info.n_frames - 1) // _SPANS))))
-    return info.spread(_SPANS, n_frames)
+    return capture.shown(info.spread(_SPANS, n_frames))
 
 
 def _solved(

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import LocationError
+from photonpano.errors import InputError, LocationError
 from photonpano.geometry import corners
 from photonpano.motion.graph import GraphSolution
 from photonpano.photometry import signal_to_noise
@@ -23,9 +23,6 @@ _NOISY, _CLEAR = 0.25, 2.0
 _NOTHING = 0.01  # signal-to-noise ratio below which there is hardly any signal
 _FAR = 1e9  # numbers of a homography from this on map a frame to infinity
 _SHOWN = 6  # most pairs, spans or parts that a message lists
-
-
-_START = "If the image turns or shifts at a constant velocity, write motion: {start: constant-velocity}."
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +78,6 @@ def require_tied(
     contrasts: Mapping[int, Contrast],
     disconnected: Literal["error", "largest"],
     merged: Callable[[int], VirtualExposure] | None = None,
-    started: bool = True,
 ) -> None:
     """Raise an `UntiedError` for a level where too many exposures are not tied to the others.
 
@@ -104,8 +100,7 @@ def require_tied(
     more = [f"  ... and {len(reasons) - _SHOWN} more"] if len(reasons) > _SHOWN else []
     lines = [*reasons[:_SHOWN], *more, *_advice(groups, tied, contrasts)]
     if tied.sum() < 2:
-        none = f"level {level}: none of the {len(edges)} pairs of exposures could be located"
-        lines = [none, *lines, *([] if started else [_START])]
+        lines = [f"level {level}: none of the {len(edges)} pairs of exposures could be located", *lines]
     else:
         lost = [_frames(run) for run in runs[:_SHOWN]] + ([f"{len(runs) - _SHOWN} more spans"] if len(runs) > _SHOWN else [])
         lines = [
@@ -116,6 +111,16 @@ def require_tied(
             "To go on with the largest part alone, set graph.disconnected to largest.",
         ]
     raise UntiedError("\n".join(lines), level, groups, edges, parts, merged)
+
+
+@contextmanager
+def also_tried(error: LocationError, what: str) -> Iterator[None]:
+    """Raise an error, with a sentence on what was tried in vain, if the block cannot locate exposures either."""
+    try:
+        yield
+    except (LocationError, InputError) as failure:
+        error.args = (f"{error}\n{what}: {str(failure).splitlines()[0]}",)
+        raise error from failure
 
 
 @contextmanager

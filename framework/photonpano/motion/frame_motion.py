@@ -40,8 +40,8 @@ class FrameMotion:
     trajectory: Trajectory
     span: FrameSpan  # the frames from the first to the last that a located exposure holds
     homographies: FloatArray  # (T, 3, 3), one for each frame
-    located: BoolArray  # (T,), False outside `span`
-    std_px: FloatArray  # (T,) expected corner error, infinite outside `span`
+    located: BoolArray  # (T,), False outside `span`, and for frames without light
+    std_px: FloatArray  # (T,) expected corner error, infinite where not located
     reference: int  # the frame whose homography is the identity
     frame_shape: tuple[int, int]  # (height, width) of a frame
     camera: Camera | None = None  # that turns; None where homographies are any. Theirs are K R K^-1 of determinant 1 otherwise.
@@ -63,6 +63,8 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     last = levels[-1]
     frames, span = np.arange(stream.n_frames), last.located.covered
     located = (span.start <= frames) & (frames < span.stop)
+    if (timeline := last.exposures.timeline) is not None:
+        located &= timeline.shown
     std_px = np.where(located, last.uncertainty.at(frames), np.inf)
     homographies = np.concatenate([last.trajectory.at(block) for block in np.split(frames, frames[BLOCK_FRAMES::BLOCK_FRAMES])])
     trajectory = FrameTrajectory(homographies)

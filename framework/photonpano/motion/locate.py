@@ -14,11 +14,11 @@ from photonpano.errors import PluginError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import thread_pool
 from photonpano.geometry import corner_displacements, inverse
-from photonpano.motion.closures import closure_candidates
+from photonpano.motion.closures import MIN_SIMILARITY, closure_candidates, exposure_similarity
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.evidence import Evidence
 from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
-from photonpano.motion.level import Level, VirtualExposures
+from photonpano.motion.level import FrameHomography, Level, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import instants_of, pairs_of
 from photonpano.motion.registration import Registrar
@@ -102,14 +102,12 @@ def locate(
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
+        edges = tuple(_alike_across_cuts(exposures, each) for each in edges)
         _require_motion(level, edges, shape, partial(_seen_px, exposures.groups, edges, start))
         with exposures.clock("locate"), solving(level.number):
             edges = _checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
-            started = registrar.to_plane is not None
-            require_tied(
-                level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged, started
-            )
+            require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged)
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
             to_plane = registrar.to_plane
@@ -139,6 +137,20 @@ def locate(
         evidence,
         _ambiguity(level.number, registrar.alternatives_px, edges),
     )
+
+
+def _alike_across_cuts(exposures: VirtualExposures, edge: Edge) -> Edge:
+    """Reject a pair across a cut whose exposures are not similar: where the view is another one, features agree by chance."""
+    moving, fixed = exposures.groups[edge.moving], exposures.groups[edge.fixed]
+    cuts = () if exposures.timeline is None else exposures.timeline.cuts
+    if not isinstance(edge.motion, Located) or not any(fixed.reference < cut.frame <= moving.reference for cut in cuts):
+        return edge
+    one, other = exposures.merged(edge.moving), exposures.merged(edge.fixed)
+    similarity = exposure_similarity(one, other, FrameHomography(edge.motion.homography))
+    if similarity == 0 or similarity >= MIN_SIMILARITY:  # 0 where noise hides it
+        return edge
+    reason = f"across a cut, the similarity of the exposures is {similarity:.2f}, less than {MIN_SIMILARITY:g}"
+    return replace(edge, motion=NotLocated(reason, edge.motion.evidence), locator="")
 
 
 def _checked_fallbacks(

@@ -1,4 +1,4 @@
-"""Time of each frame, and frames where the image jumps: frames may be repeated, or missing."""
+"""Time of each frame, frames without light, and frames where the image jumps: frames may be repeated, or missing."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from photonpano.contracts.protocols import Trajectory
 from photonpano.geometry import corners, inverse, transform_points
+from photonpano.text import listed
 from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, Group
 
 # Names of decisions in a record.
-CUT, DARK_JUMP, REPEATED = "cut", "jump_in_the_dark", "repeated_frames"
+CUT, DARK_FRAMES, DARK_JUMP, REPEATED = "cut", "dark_frames", "jump_in_the_dark", "repeated_frames"
+SHOTS = "shots"
 # Frames of the shortest part of a group that is kept beside a cut.
 _SHORTEST_PART = 4
 
@@ -63,6 +65,8 @@ class Timeline:
 
     taken: FloatArray  # (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated
     cuts: tuple[Cut, ...] = ()  # where the image jumps, in order
+    dark: tuple[FrameSpan, ...] = ()  # frames without light, in order: no group holds them, and they are not located
+    shots: tuple[FrameSpan, ...] = ()  # parts that show nothing in common, in order; groups are of the longest
 
     @classmethod
     def regular(cls, n_frames: int) -> Timeline:
@@ -70,20 +74,43 @@ class Timeline:
         return cls(np.arange(n_frames, dtype=np.float64))
 
     @classmethod
-    def with_repeats(cls, repeated: BoolArray) -> Timeline:
+    def with_repeats(cls, repeated: BoolArray, dark: tuple[FrameSpan, ...] = ()) -> Timeline:
         """Return that of a capture without missing frames; (T,) True for frames that are copies of the frame before."""
-        return cls(np.cumsum(~repeated).astype(np.float64) - 1.0)
+        return cls(np.cumsum(~repeated).astype(np.float64) - 1.0, dark=dark)
+
+    @property
+    def shown(self) -> BoolArray:
+        """(T,) whether each frame shows the scene of the panorama, neither darkness nor another shot."""
+        frames = np.arange(len(self.taken))
+        shown = (self.shot.start <= frames) & (frames < self.shot.stop)
+        for span in self.dark:
+            shown[span.start : span.stop] = False
+        return shown
+
+    @property
+    def shot(self) -> FrameSpan:
+        """The frames of the longest shot, the first of several; all if there is a single one."""
+        return max(self.shots, key=len, default=FrameSpan(0, len(self.taken)))
 
     @property
     def decisions(self) -> list[Decision]:
-        """What is known of missing and repeated frames, for the record."""
+        """What is known of missing, repeated and dark frames, for the record."""
         repeated = int(len(self.taken) - 1 - self.taken[-1])
         found = [Decision(REPEATED, repeated, "copies of the frame before; the motion stands still there")]
-        return (found if repeated else []) + [cut.decision for cut in self.cuts]
+        dark = [
+            Decision(DARK_FRAMES, str(span), "no light reaches the sensor; these frames are left out") for span in self.dark
+        ]
+        apart = f"no motion explains what they show as one scene; {self.shot} are located, since they are the most"
+        shots = [Decision(SHOTS, listed(map(str, self.shots)), apart)] if self.shots else []
+        return (found if repeated else []) + shots + dark + [cut.decision for cut in self.cuts]
 
     def cut_at(self, cuts: Sequence[Cut]) -> Timeline:
         """Return this timeline with other cuts."""
         return replace(self, cuts=tuple(cuts))
+
+    def in_shots(self, shots: Sequence[FrameSpan]) -> Timeline:
+        """Return this timeline without cuts, in shots of which the longest is located."""
+        return replace(self, cuts=(), shots=tuple(shots))
 
     def parts(self, groups: Sequence[Group]) -> tuple[Group, ...]:
         """Divide groups at the cuts and the frames without light; leave out those that consist mostly of repeated frames.
@@ -95,7 +122,7 @@ class Timeline:
         for group in groups:
             for span in self._divided(group.span):
                 whole = span == group.span
-                if not whole and (len(span) < _SHORTEST_PART or self._is_dark(span)):
+                if self._is_left_out(span) or (not whole and len(span) < _SHORTEST_PART):
                     continue
                 if 2 * (self.taken[span.stop - 1] - self.taken[span.start] + 1) < len(span):
                     continue
@@ -145,11 +172,17 @@ class Timeline:
         return np.asarray((stop - start) * (inside - before) + start + np.minimum(at, 0) + np.maximum(at - last, 0))
 
     def _divided(self, span: FrameSpan) -> list[FrameSpan]:
-        bounds = {bound for cut in self.cuts for bound in cut.bounds if span.start < bound < span.stop}
+        ends = [end for each in (*self.dark, *self.shots) for end in (each.start, each.stop)]
+        bounds = {
+            bound for bound in (*ends, *(each for cut in self.cuts for each in cut.bounds)) if span.start < bound < span.stop
+        }
         return [FrameSpan(start, stop) for start, stop in pairwise([span.start, *sorted(bounds), span.stop])]
 
-    def _is_dark(self, span: FrameSpan) -> bool:
-        return any(cut.dark is not None and cut.dark.start <= span.start and span.stop <= cut.dark.stop for cut in self.cuts)
+    def _is_left_out(self, span: FrameSpan) -> bool:
+        if span.start < self.shot.start or span.stop > self.shot.stop:
+            return True
+        dark = [*self.dark, *(cut.dark for cut in self.cuts if cut.dark is not None)]
+        return any(each.start <= span.start and span.stop <= each.stop for each in dark)
 
 
 class PiecewiseTrajectory:

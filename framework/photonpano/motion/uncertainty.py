@@ -35,7 +35,8 @@ class Uncertainty:
         self._instants = located.instants
         self._std_px = located.std_px
         self._timeline = timeline
-        self._frames = np.unique(np.linspace(0, len(timeline.taken) - 1, _COMPARED).round())
+        shown = np.flatnonzero(timeline.shown)
+        self._frames = shown[np.unique(np.linspace(0, len(shown) - 1, _COMPARED).round().astype(int))].astype(np.float64)
         shape, current = located.frame_shape, trajectory.at(self._frames)
         if previous is None:
             half = np.median([len(group.span) for group in located.groups]) / 2

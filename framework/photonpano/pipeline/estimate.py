@@ -7,18 +7,25 @@ from functools import partial
 
 import numpy as np
 
+<<<<<<< HEAD
 from photonpano.capture import capture_of
+=======
+from photonpano.capture import leaving_out
+>>>>>>> 681995fb (Leave out frames without light and shots that show nothing in common, since both were glued into a wrong motion)
 from photonpano.contracts.protocols import Source
 from photonpano.corrections.movers import decision_of as background_decision
 from photonpano.execution.context import Context
+from photonpano.motion.diagnosis import UntiedError, also_tried
 from photonpano.motion.loop import LevelResult
+from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.obstacles import timeline_of
+from photonpano.pipeline.shots import ApartError, shots_of
 from photonpano.pipeline.state import State, model_of
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision
+from photonpano.values import Decision, FrameSpan
 
 _MOST_LENSES = 4  # times that the last level is run again, through the lens that it has found
 START = "start"  # name of the decision on the initial motion
@@ -30,9 +37,28 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
     `journal` receives the decisions, in the order in which components and passes take them. For errors, see `run`.
     """
     require_centre(plan, source)
-    reference, levels = _reference_frame(plan, source), build_levels(plan, source, journal)
-    timeline = timeline_of(source, context)
-    start = None if plan.motion.start == "none" else _start(source, reference, journal, context)
+    timeline, found = timeline_of(source, context), len(journal)
+    try:
+        return _along(timeline, plan, source, journal, context, plan.motion.start != "none")
+    except ApartError as apart:
+        shots, error = apart.shots, None
+    except UntiedError as untied:
+        shots, error = shots_of(source, untied), untied
+    del journal[found:]
+    if shots:
+        return _along(timeline.in_shots(shots), plan, source, journal, context, plan.motion.start != "none")
+    assert error is not None
+    if plan.motion.start == "none":
+        with also_tried(error, "motion: {start: constant-velocity} was tried, too"):
+            return _along(timeline, plan, source, journal, context, True)
+    raise error
+
+
+def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decision], context: Context, started: bool) -> State:
+    """Estimate the motion of the frames that a timeline shows, from a constant velocity if it is `started`."""
+    source = leaving_out(source, timeline.shown)
+    reference, levels = _reference_frame(plan, timeline.shot), build_levels(plan, source, journal)
+    start = _start(source, reference, journal, context) if started else None
     state = State(plan, source, context, reference, levels, timeline, model_of(plan), start).located(levels[:1], start)
     tried: tuple[passes.Pass, ...] = (
         passes.through_found_lens,
@@ -66,10 +92,12 @@ def require_centre(plan: Plan, source: Source) -> None:
         )
 
 
-def _reference_frame(plan: Plan, source: Source) -> int:
-    n_frames, reference = source.info.n_frames, plan.render.reference
-    named = {"first": 0, "middle": n_frames // 2, "last": n_frames - 1}
-    return named[reference] if isinstance(reference, str) else reference
+def _reference_frame(plan: Plan, shot: FrameSpan) -> int:
+    """Return the reference frame; where it does not lie in the shot that is located, the middle of that."""
+    reference, middle = plan.render.reference, (shot.start + shot.stop) // 2
+    named = {"first": shot.start, "middle": middle, "last": shot.stop - 1}
+    frame = named[reference] if isinstance(reference, str) else reference
+    return frame if shot.start <= frame < shot.stop else middle
 
 
 def _start(source: Source, reference: int, journal: list[Decision], context: Context) -> ConstantVelocity:

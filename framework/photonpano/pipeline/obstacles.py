@@ -16,10 +16,13 @@ from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, LocationError
 from photonpano.execution.context import Context
 from photonpano.locating.phase import correlation_peaks
+from photonpano.merging import binned_mean, binning_of
 from photonpano.merging.accumulate import weights_of
 from photonpano.motion.timeline import Timeline
+from photonpano.motion.tracking.spans import DARK
 from photonpano.reading import other_order, sampled_spans
-from photonpano.values import BoolArray, Decision, FrameSpan, true_spans
+from photonpano.robust import robust_std
+from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, true_spans
 
 _PLACES, _FRAMES = 5, 256  # spans all over the capture, and most frames of each
 _ALIKE = 0.7  # an image repeats if another shift fits at least this well, as a share of the best one
@@ -35,6 +38,10 @@ _ROW_STRIDE = 16  # frames are compared on every 16th row first
 # Frames that are repeated differ from the frame before by this many newly lit pixels, and as many that went dark: dark frames
 # are alike by chance, and so are saturated ones.
 _FEWEST_NEW = 20
+# Frames without light: at least so many in a row, in at most so many places, since light that goes off more often flickers.
+_SHORTEST_DARK, _MOST_DARK = 32, 8
+_FEW_PHOTONS = 100.0  # frames of fewer photons, on the rows that are compared, are averaged
+_SHAPELESS = 2.0  # most variance of binned pixels in the dark, relative to that of their counts: a scene, however dim, has more
 
 
 def order_warning(source: Source) -> str | None:
@@ -132,34 +139,54 @@ def repetition_px(first: NDArray[Any], second: NDArray[Any]) -> float | None:
 
 
 def timeline_of(source: Source, context: Context) -> Timeline:
-    """Return the timeline of a capture, in which repeated frames take no time; raise an `InputError` if all are copies.
+    """Return the timeline of a capture, in which repeated frames take no time, and frames without light are left out.
 
-    Only packed frames are compared: others would have to be read twice.
+    Raise an `InputError` if all frames are copies. Only packed frames are compared: others would have to be read twice.
     """
     capture, n_frames = capture_of(source), source.info.n_frames
     if not capture.is_packed:
         return Timeline.regular(n_frames)
     spans = [FrameSpan(max(0, span.start - 1), span.stop) for span in source.info.span.blocks(_BLOCK_FRAMES)]
-    same = np.zeros(n_frames, dtype=bool)
-    for span, found in zip(spans, context.in_order(partial(_same_as_before, capture), spans), strict=True):
-        same[span.start + 1 : span.stop] = found
+    same, photons = np.zeros(n_frames, dtype=bool), np.zeros(n_frames)
+    for span, (found, lit) in zip(spans, context.in_order(partial(_compared, capture), spans), strict=True):
+        same[span.start + 1 : span.stop], photons[span.start : span.stop] = found, lit
     if n_frames > 1 and same[1:].all():
         raise InputError(f"all {n_frames} frames are copies of the first one; check that the camera went on recording")
     for run in true_spans(same):
         original = run.start - 1
         if original and not _differ(*capture.packed(FrameSpan(original - 1, original + 1))):
             same[run.start : run.stop] = False
-    return Timeline.with_repeats(same)
+    return Timeline.with_repeats(same, _dark_spans(capture, photons))
 
 
-def _same_as_before(capture: Capture, span: FrameSpan) -> BoolArray:
-    """Return whether each frame of a span but the first equals the one before it."""
+def _dark_spans(capture: Capture, photons: FloatArray) -> tuple[FrameSpan, ...]:
+    """Return the frames without light, as of a closed shutter, from the (T,) photons of some rows of each frame."""
+    usual = float(np.quantile(photons, 0.9))
+    size = int(np.clip(_FEW_PHOTONS / max(usual, 1e-9), 1, len(photons)))
+    smooth = ndimage.uniform_filter1d(photons, size, mode="nearest")
+    runs = [run for run in true_spans(smooth < DARK * usual) if len(run) >= _SHORTEST_DARK]
+    return tuple(run for run in runs if _is_shapeless(capture, run)) if len(runs) <= _MOST_DARK else ()
+
+
+def _is_shapeless(capture: Capture, span: FrameSpan) -> bool:
+    """Return whether frames show nothing but noise. A dim part of the scene has a contrast."""
+    middle = int(span.centre)
+    part = FrameSpan(max(span.start, middle - _FRAMES // 4), min(span.stop, middle + _FRAMES // 4))
+    counts = binned_mean(capture, part) * len(part) * binning_of(capture) ** 2
+    counts = counts[np.isfinite(counts)]
+    mean = float(np.median(counts))
+    return robust_std(counts - mean) ** 2 < _SHAPELESS * max(mean, 1.0)
+
+
+def _compared(capture: Capture, span: FrameSpan) -> tuple[BoolArray, NDArray[np.integer]]:
+    """Return whether each frame of a span but the first equals the one before it, and the photons of some rows of each."""
     packed = capture.packed(span)
     some = packed[:, ::_ROW_STRIDE]
+    usable = np.packbits(capture.valid[::_ROW_STRIDE], axis=-1)
     same = (some[1:] == some[:-1]).all(axis=(1, 2))
     for index in np.flatnonzero(same):
         same[index] = np.array_equal(packed[index], packed[index + 1])
-    return np.asarray(same)
+    return np.asarray(same), np.bitwise_count(some & usable).sum(axis=(1, 2), dtype=np.int64)
 
 
 def _differ(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> bool:

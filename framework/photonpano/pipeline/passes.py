@@ -23,10 +23,16 @@ from photonpano.corrections.lighting import (
 from photonpano.corrections.movers import find_background, without_layers
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import Camera, lenses_apart_px
+from photonpano.motion.diagnosis import UntiedError
 from photonpano.motion.model import SAME_LENS_PX
 from photonpano.motion.timeline import Cut
 from photonpano.pipeline.components import build_levels
+<<<<<<< HEAD
 from photonpano.pipeline.state import State, within
+=======
+from photonpano.pipeline.shots import ApartError, shots_of
+from photonpano.pipeline.state import State
+>>>>>>> 681995fb (Leave out frames without light and shots that show nothing in common, since both were glued into a wrong motion)
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.residuals.cuts import SMALLEST_PX, find_cuts
 from photonpano.residuals.refinement import MotionFit
@@ -235,7 +241,7 @@ def again_without_movers(state: State) -> Proposal | None:
 def cut_at_jumps(state: State) -> Proposal | None:
     """Cut the motion where the image jumps, and locate all levels again: exposures across a jump bias the first level, too.
 
-    Where the pieces then meet to less than 1 px, there was no jump.
+    Where the pieces then meet to less than 1 px, there was no jump. Raise `ApartError` where they show nothing in common.
     """
     cuts = find_cuts(state.source, state.fit, state.context)
     if not cuts:
@@ -243,7 +249,12 @@ def cut_at_jumps(state: State) -> Proposal | None:
 
     def make(cuts: Sequence[Cut] = cuts) -> State | None:
         levels = build_levels(state.plan, state.source, [])
-        cut = replace(state, timeline=state.timeline.cut_at(cuts), levels=levels).located(levels, state.start)
+        try:
+            cut = replace(state, timeline=state.timeline.cut_at(cuts), levels=levels).located(levels, state.start)
+        except UntiedError as error:
+            if shots := shots_of(state.source, error):
+                raise ApartError(shots) from error
+            raise
         measured = [each.along(cut.motion.trajectory, cut.motion.frame_shape) for each in cuts]
         jumps = [each for each in measured if each.dark is not None or each.size_px >= SMALLEST_PX]
         if len(jumps) < len(cuts):

@@ -18,7 +18,7 @@ from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.loop import LevelResult
 from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
 from photonpano.record.fingerprint import CaptureRecord
-from photonpano.record.run_warnings import level_warnings, motion_warnings, refinement_warnings
+from photonpano.record.run_warnings import left_out_warnings, level_warnings, motion_warnings, refinement_warnings
 from photonpano.record.schema import (
     CameraRecord,
     DecisionRecord,
@@ -49,7 +49,7 @@ def record_of(
     rendered: Sequence[Decision],
 ) -> RunRecord:
     """Return the record of a finished run; `rendered` are the decisions of renderer and exporters."""
-    motion = explained.motion
+    motion, timeline = explained.motion, levels[-1].exposures.timeline
     decisions = [levels_decision(levels), *rendered] if plan.until_converged else rendered
     return {
         **started,
@@ -59,7 +59,12 @@ def record_of(
         "motion": motion_record(motion.std_px),
         "refinements": [refinement_record(each) for each in explained.refinements],
         "verdict": verdict_record(verdict),
-        "warnings": [*level_warnings(levels), *motion_warnings(motion), *refinement_warnings(explained.refinements)],
+        "warnings": [
+            *left_out_warnings(timeline),
+            *level_warnings(levels),
+            *motion_warnings(motion, timeline),
+            *refinement_warnings(explained.refinements),
+        ],
     }
 
 

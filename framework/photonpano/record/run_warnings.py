@@ -8,7 +8,9 @@ import numpy as np
 
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
+from photonpano.motion.timeline import Timeline
 from photonpano.residuals.refinement import Refinement
+from photonpano.text import listed
 from photonpano.values import FloatArray, PoseEstimate, true_spans
 
 # Expected corner error above which a warning names the frames: it is likely to be visible.
@@ -50,11 +52,30 @@ def level_warnings(results: Sequence[LevelResult]) -> list[str]:
     return warnings
 
 
-def motion_warnings(motion: FrameMotion) -> list[str]:
-    """Warn of frames whose motion is uncertain, and of frames that are left out."""
+def left_out_warnings(timeline: Timeline | None) -> list[str]:
+    """Warn of shots and of dark frames, which are left out of the panorama."""
+    warnings: list[str] = []
+    if timeline is not None and timeline.shots:
+        shots, shown = timeline.shots, timeline.shot
+        other = next(each for each in shots if each != shown)
+        warnings.append(
+            f"the capture holds {len(shots)} shots that show nothing in common: {listed(map(str, shots))}. The panorama is of "
+            f"{shown} alone; for one of {other}, write source: {{with: {{frames: [{other.start}, {other.stop}]}}}}"
+        )
+    if timeline is not None and timeline.dark:
+        warnings.append(
+            f"{listed(map(str, timeline.dark))} show no light, as behind a closed shutter: they are not located, and left out "
+            "of the panorama. If the shutter was meant to be open, check it, and the gate of the sensor"
+        )
+    return warnings
+
+
+def motion_warnings(motion: FrameMotion, timeline: Timeline | None = None) -> list[str]:
+    """Warn of frames whose motion is uncertain, and of frames that show the scene and are left out nevertheless."""
     warnings = uncertain_frames(motion.std_px)
-    if not motion.located.all():
-        n_left_out, n_frames = int(np.sum(~motion.located)), len(motion.located)
+    lost = ~motion.located if timeline is None else ~motion.located & timeline.shown
+    if lost.any():
+        n_left_out, n_frames = int(np.sum(lost)), len(lost)
         warnings.append(f"{n_left_out} of {n_frames} frames lie outside the located exposures and are left out")
     return warnings
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from photonpano.geometry import corners, jacobian
 from photonpano.motion.loop import LevelResult
-from photonpano.motion.timeline import DARK_JUMP
+from photonpano.motion.timeline import DARK_JUMP, SHOTS
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.refinement import Explained
@@ -118,6 +118,16 @@ def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequen
 def contradictions(dropped: int, pairs: int) -> Reason | None:
     """Judge the pairs of the last level, of which some, `dropped`, contradict the others."""
     return _contradictions.reason(_contradicting(dropped, pairs))
+
+
+@_doubtful_above(
+    1,
+    "the capture holds shots that show nothing in common, and the panorama is made of the longest alone",
+    "make a panorama of each: write source.with.frames: [first, last + 1]",
+)
+def _shots(run: _Run) -> _Found | None:
+    shots = next((str(each.value) for each in run.decisions if each.what == SHOTS), "")
+    return _Found(shots.count("frame"), shots) if shots else None
 
 
 @_doubtful_above(

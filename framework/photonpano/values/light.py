@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.values.arrays import FloatArray, FluxImage, Homography
+from photonpano.values.arrays import BoolArray, FloatArray, FluxImage, Homography
 from photonpano.values.frames import FrameSpan
 
 _CLASSES = 8  # most classes into which frames are divided by their gain, or by the phase of the lamps
@@ -27,7 +27,7 @@ class Light:
         maps: (K, h, w) float32, their amplitude at places of the reference plane.
         to_map: (3, 3), pixels of the reference plane to pixels of `maps`.
         frequency: flickers in a frame period; 0 for light that does not flicker.
-        std: (T,) standard deviation of `gain` by photon noise.
+        std: (T,) standard deviation of `gain` by photon noise; infinite for frames that are left out, whose gain is 0.
     """
 
     gain: FloatArray
@@ -47,6 +47,16 @@ class Light:
     def has_lamps(self) -> bool:
         """Whether the gain depends on the place."""
         return len(self.waves) > 0
+
+    @property
+    def shown(self) -> BoolArray:
+        """(T,) False for frames that are left out, such as those behind a closed shutter."""
+        return np.isfinite(self.std)
+
+    def leaving_out(self, shown: BoolArray) -> Light:
+        """Return this light without the frames that are not `shown`, (T,), relative to the mean of the others."""
+        mean = float(self.gain[shown].mean())
+        return replace(self, gain=np.where(shown, self.gain / mean, 0), std=np.where(shown, self.std / mean, np.inf))
 
     def terms(self, span: FrameSpan) -> FloatArray:
         """Return the terms of the gain in each frame of a span: (1 + K, n), the first for all of the scene."""

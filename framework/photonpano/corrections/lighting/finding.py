@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import UnivariateSpline
 
 from photonpano.capture import in_light
-from photonpano.contracts.protocols import Source, Trajectory
+from photonpano.contracts.protocols import Source, Trajectory, light_of
 from photonpano.corrections.lighting.flicker import LocalFlicker, local_frequency, measure_local_flicker
 from photonpano.corrections.lighting.gains import Gains, seen_cells, solve_gains
 from photonpano.errors import InputError
@@ -52,7 +52,12 @@ def changes(gains: Gains) -> bool:
 
 
 def measure_light(source: Source, trajectory: Trajectory, context: Context) -> Light:
-    """Measure the gain of each frame of a capture along its motion, known to a few pixels."""
+    """Measure the gain of each frame of a capture along its motion, known to a few pixels; frames left out stay so."""
+    light, before = _measured(source, trajectory, context), light_of(source)
+    return light if before is None else light.leaving_out(before.shown)
+
+
+def _measured(source: Source, trajectory: Trajectory, context: Context) -> Light:
     n_frames = source.info.n_frames
     length = min(n_frames, max(_FEWEST_FRAMES, -(-n_frames // _MOST_SPANS)))
     bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
@@ -75,6 +80,8 @@ def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray
     """
     if light.has_lamps:
         return light
+    kept = [bool(light.shown[span.start : span.stop].all()) for span in spans]
+    spans, change, std = [span for span, each in zip(spans, kept, strict=True) if each], change[kept], std[kept]
     instants = np.array([span.centre for span in spans])
     lengths = np.array([len(span) for span in spans], float)
     gain = np.array([light.mean(span) for span in spans]) * np.maximum(1 + change, 0)
@@ -82,7 +89,7 @@ def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray
     if bool(frequency) != bool(light.frequency):
         return light
     mean = float(found.mean())
-    return Light.of_frames(found / mean, frequency, noise / mean)
+    return Light.of_frames(found / mean, frequency, noise / mean).leaving_out(light.shown)
 
 
 def _light_of(flicker: LocalFlicker, to_map: Homography, gains: Gains, n_frames: int) -> Light:
@@ -96,7 +103,7 @@ def _light_of(flicker: LocalFlicker, to_map: Homography, gains: Gains, n_frames:
 
 def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:
     """Return what was found, for the record: the depth of the changes, and the frequency of a flicker."""
-    low, high = (float(np.quantile(light.gain, each)) for each in (0.01, 0.99))
+    low, high = (float(np.quantile(light.gain[light.shown], each)) for each in (0.01, 0.99))
     depth = (high - low) / (high + low)
     where = f"the light of the scene changes between {low:.2f} and {high:.2f} of its mean"
     if light.has_lamps:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas, canvas_around, canvas_of, covered_by, depths
@@ -85,9 +86,10 @@ class Gains:
 def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan], context: Context) -> SeenCells:
     """Sum the photons of squares of the scene in spans of frames, along a motion known to a few pixels.
 
-    The image must hardly move in a span; spans that a plane can hardly show are left out.
+    The image must hardly move in a span; spans that a plane can hardly show are left out, and those that show nothing.
     """
     shape = source.info.frame_shape
+    spans = capture_of(source).shown(spans)
     motions = trajectory.at([span.centre for span in spans])
     if camera_of_motion(trajectory) is None:
         # A first motion may be wrong somewhere. Frames far to the side of the plane would need a canvas without end.

@@ -1,0 +1,67 @@
+"""Find the shots of a capture: parts whose frames show nothing in common, as where the camera was stopped and moved."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from photonpano.contracts.protocols import Source
+from photonpano.merging import binned_mean
+from photonpano.motion.diagnosis import UntiedError
+from photonpano.values import FloatArray, FrameSpan
+
+_BLOCKS, _SHORTEST, _LONGEST = 64, 4, 32  # blocks of frames that are compared; fewest and most frames of one
+_SIDE = 4  # blocks before and after an instant whose means are compared
+_ABRUPT = 3.0  # least change of the image where a shot ends, relative to the median around it
+_FEWEST = 3  # exposures of a shot
+
+
+class ApartError(Exception):
+    """Raised where the motion was known as one, and turns out to be that of several `shots`."""
+
+    def __init__(self, shots: tuple[FrameSpan, ...]) -> None:
+        super().__init__(shots)
+        self.shots = shots
+
+
+def shots_of(source: Source, error: UntiedError) -> tuple[FrameSpan, ...]:
+    """Return the shots of a capture whose exposures fall into parts; none unless the image changes at once between them.
+
+    Motion that is too fast, and darkness, also tear the exposures apart; there, the image changes all the time, or not at all.
+    """
+    groups, labels = error.groups, error.parts
+    members = [np.flatnonzero(labels == part) for part in np.flatnonzero(np.bincount(labels) >= _FEWEST)]
+    members.sort(key=lambda each: int(each[0]))
+    if len(members) < 2 or any(one[-1] > other[0] for one, other in pairwise(members)):
+        return ()
+    starts = [0]
+    for one, other in pairwise(members):
+        # A group that holds the change may be tied to either part.
+        first, last = groups[one[-1]].span, groups[other[0]].span
+        start = _first_after_change(source, FrameSpan(min(first.start, last.start), max(first.stop, last.stop)))
+        if start is None:
+            return ()
+        starts.append(start)
+    return tuple(map(FrameSpan, starts, [*starts[1:], source.info.n_frames]))
+
+
+def _first_after_change(source: Source, span: FrameSpan) -> int | None:
+    """Return the first frame after the image changes from one frame to the next; None if it changes gradually."""
+    length = int(np.clip(len(span) // _BLOCKS, _SHORTEST, _LONGEST))
+    blocks = [each for each in span.blocks(length) if len(each) == length]
+    if len(blocks) < 4 * _SIDE:
+        return None
+    images = np.stack([np.nan_to_num(binned_mean(source, block)) for block in blocks])
+    sums = np.concatenate([np.zeros((1, *images.shape[1:])), images.cumsum(axis=0)])
+    means = (sums[_SIDE:] - sums[:-_SIDE]) / _SIDE
+    changes = ((means[_SIDE:] - means[:-_SIDE]) ** 2).mean(axis=(1, 2))
+    index = int(changes.argmax())
+    if changes[index] < _ABRUPT * np.median(changes):
+        return None
+    # The change lies within a block of the boundary between both means.
+    first = blocks[index + _SIDE].start - length
+    frames = [np.nan_to_num(binned_mean(source, FrameSpan(frame, frame + 1))) for frame in range(first, first + 2 * length)]
+    before, after = means[max(index - 1, 0)], means[min(index + _SIDE + 1, len(means) - 1)]
+    misfit: FloatArray = np.array([((frame - before) ** 2 - (frame - after) ** 2).sum() for frame in frames])
+    return first + int(np.concatenate([[0.0], misfit.cumsum()]).argmin())
