@@ -142,8 +142,9 @@ def locate(
 def _alike_across_cuts(exposures: VirtualExposures, edge: Edge) -> Edge:
     """Reject a pair across a cut whose exposures are not similar: where the view is another one, features agree by chance."""
     moving, fixed = exposures.groups[edge.moving], exposures.groups[edge.fixed]
-    cuts = () if exposures.timeline is None else exposures.timeline.cuts
-    if not isinstance(edge.motion, Located) or not any(fixed.reference < cut.frame <= moving.reference for cut in cuts):
+    if not isinstance(edge.motion, Located) or exposures.timeline is None:
+        return edge
+    if np.ptp(exposures.timeline.piece_of([fixed.reference, moving.reference])) == 0:
         return edge
     one, other = exposures.merged(edge.moving), exposures.merged(edge.fixed)
     similarity = exposure_similarity(one, other, FrameHomography(edge.motion.homography))

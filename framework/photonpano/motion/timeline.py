@@ -154,12 +154,15 @@ class Timeline:
         return unknown
 
     def piece_of(self, instants: ArrayLike) -> NDArray[np.integer]:
-        """Return the number of the piece that each of N instants, in frames, lies in: (N,), 0 before the first cut."""
-        return np.searchsorted([cut.frame - 0.5 for cut in self.cuts], instants, side="right")
+        """Return the number of the piece that each of N instants, in frames, lies in: (N,), 0 before the first cut.
+
+        Where frames are dark for long, the camera may move as it likes: the motion before and after them is of two pieces.
+        """
+        return np.searchsorted(self._bounds, instants, side="right")
 
     def knot_pieces(self, instants: FloatArray) -> list[slice]:
         """Return which of N knots lie in each piece; their instants are in order."""
-        bounds = np.searchsorted(self.piece_of(instants), np.arange(len(self.cuts) + 2))
+        bounds = np.searchsorted(self.piece_of(instants), np.arange(len(self._bounds) + 2))
         return [slice(start, stop) for start, stop in pairwise(bounds.tolist())]
 
     def times(self, instants: ArrayLike) -> FloatArray:
@@ -170,6 +173,15 @@ class Timeline:
         before = np.minimum(inside.astype(np.intp), max(last - 1, 0))
         start, stop = self.taken[before], self.taken[np.minimum(before + 1, last)]
         return np.asarray((stop - start) * (inside - before) + start + np.minimum(at, 0) + np.maximum(at - last, 0))
+
+    @property
+    def _bounds(self) -> list[float]:
+        dark = [each.centre for each in self.dark if each.start > 0 and each.stop < len(self.taken)]
+        return sorted({*dark, *(cut.frame - 0.5 for cut in self.cuts)})
+
+    def is_dark_between(self, earlier: float, later: float) -> bool:
+        """Return whether frames without light lie between two instants, after which the image may be anywhere."""
+        return any(earlier < each.start and each.stop <= later + 1 for each in self.dark)
 
     def _divided(self, span: FrameSpan) -> list[FrameSpan]:
         ends = [end for each in (*self.dark, *self.shots) for end in (each.start, each.stop)]

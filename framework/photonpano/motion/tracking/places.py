@@ -56,6 +56,9 @@ class Track:
         if place is not None and place.segment == there.segment:
             return FrameHomography(normalised(inverse(there.homography) @ place.homography))
         instants = self._groups[moving].reference, self._groups[fixed].reference
+        timeline = None if self._start is None else self._start.timeline
+        if timeline is not None and timeline.is_dark_between(instants[1], instants[0]):
+            return self._steadiest(hypotheses(), None, moving, fixed)
         if self._start is not None and (motion := self._start.between(*instants)) is not None:
             if alternative_px := self._start.alternative_px(*instants):
                 self.alternatives_px[moving, fixed] = alternative_px
