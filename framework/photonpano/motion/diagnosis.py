@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import InputError, LocationError
+from photonpano.errors import InputError, LocationError, PhotonpanoError
 from photonpano.geometry import corners
 from photonpano.motion.graph import GraphSolution
 from photonpano.photometry import signal_to_noise
@@ -119,8 +119,12 @@ def also_tried(error: LocationError, what: str) -> Iterator[None]:
     try:
         yield
     except (LocationError, InputError) as failure:
-        error.args = (f"{error}\n{what}: {str(failure).splitlines()[0]}",)
+        error.args = (f"{error}\n{what}: {_first_clause(failure)}",)
         raise error from failure
+
+
+def _first_clause(error: PhotonpanoError) -> str:
+    return str(error).splitlines()[0].split("; ")[0].removeprefix("motion.start: ")
 
 
 @contextmanager

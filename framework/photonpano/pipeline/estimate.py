@@ -58,7 +58,7 @@ def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decisio
     """Estimate the motion of the frames that a timeline shows, from a constant velocity if it is `started`."""
     source = leaving_out(source, timeline.shown)
     reference, levels = _reference_frame(plan, timeline.shot), build_levels(plan, source, journal)
-    start = _start(source, reference, journal, context) if started else None
+    start = _start(plan, source, reference, journal, context) if started else None
     state = State(plan, source, context, reference, levels, timeline, model_of(plan), start).located(levels[:1], start)
     tried: tuple[passes.Pass, ...] = (
         passes.through_found_lens,
@@ -100,7 +100,7 @@ def _reference_frame(plan: Plan, shot: FrameSpan) -> int:
     return frame if shot.start <= frame < shot.stop else middle
 
 
-def _start(source: Source, reference: int, journal: list[Decision], context: Context) -> ConstantVelocity:
+def _start(plan: Plan, source: Source, reference: int, journal: list[Decision], context: Context) -> ConstantVelocity:
     """Find the constant velocity with which the first level starts; `InputError` or `LocationError` if there is none."""
     found = find_velocity(source, context)
     halves = " and ".join(f"{np.degrees(each.turn):.4g}" for each in found.halves)
@@ -108,6 +108,8 @@ def _start(source: Source, reference: int, journal: list[Decision], context: Con
         f"photons merged along it stand out by {found.significance:.2g} standard deviations; the halves of the capture alone "
         f"turn by {halves} degrees a frame"
     )
+    if plan.motion.start == "none":
+        reason += "; without it, pairs of exposures could not be located"
     journal.append(Decision(START, found.text, reason))
     return ConstantVelocity(found.velocity, reference)
 

@@ -241,7 +241,7 @@ def again_without_movers(state: State) -> Proposal | None:
 def cut_at_jumps(state: State) -> Proposal | None:
     """Cut the motion where the image jumps, and locate all levels again: exposures across a jump bias the first level, too.
 
-    Where the pieces then meet to less than 1 px, there was no jump. Raise `ApartError` where they show nothing in common.
+    Where the pieces then meet to less than 1 px, there was no jump. Raise `ApartError` where no pair ties them together.
     """
     cuts = find_cuts(state.source, state.fit, state.context)
     if not cuts:

@@ -1,4 +1,4 @@
-"""Find the shots of a capture: parts whose frames show nothing in common, as where the camera was stopped and moved."""
+"""Find the shots of a capture: parts that no pair of exposures ties together, as where the camera was stopped and moved."""
 
 from __future__ import annotations
 
@@ -47,20 +47,25 @@ def shots_of(source: Source, error: UntiedError) -> tuple[FrameSpan, ...]:
 
 
 def _first_after_change(source: Source, span: FrameSpan) -> int | None:
-    """Return the first frame after the image changes from one frame to the next; None if it changes gradually."""
-    length = int(np.clip(len(span) // _BLOCKS, _SHORTEST, _LONGEST))
-    blocks = [each for each in span.blocks(length) if len(each) == length]
+    """Return the first frame of a span after the image changes from one frame to the next; None if it changes gradually.
+
+    How much the image changes otherwise is seen in the span, and in as many frames before and after it.
+    """
+    length = int(np.clip(3 * len(span) // _BLOCKS, _SHORTEST, _LONGEST))
+    around = FrameSpan(max(0, span.start - len(span)), min(source.info.n_frames, span.stop + len(span)))
+    blocks = [each for each in around.blocks(length) if len(each) == length]
     if len(blocks) < 4 * _SIDE:
         return None
     images = np.stack([np.nan_to_num(binned_mean(source, block)) for block in blocks])
     sums = np.concatenate([np.zeros((1, *images.shape[1:])), images.cumsum(axis=0)])
     means = (sums[_SIDE:] - sums[:-_SIDE]) / _SIDE
     changes = ((means[_SIDE:] - means[:-_SIDE]) ** 2).mean(axis=(1, 2))
-    index = int(changes.argmax())
+    starts = around.start + length * (np.arange(len(changes)) + _SIDE)
+    index = int(np.where((span.start <= starts) & (starts < span.stop), changes, -1).argmax())
     if changes[index] < _ABRUPT * np.median(changes):
         return None
     # The change lies within a block of the boundary between both means.
-    first = blocks[index + _SIDE].start - length
+    first = int(starts[index]) - length
     frames = [np.nan_to_num(binned_mean(source, FrameSpan(frame, frame + 1))) for frame in range(first, first + 2 * length)]
     before, after = means[max(index - 1, 0)], means[min(index + _SIDE + 1, len(means) - 1)]
     misfit: FloatArray = np.array([((frame - before) ** 2 - (frame - after) ** 2).sum() for frame in frames])

@@ -122,7 +122,7 @@ def contradictions(dropped: int, pairs: int) -> Reason | None:
 
 @_doubtful_above(
     1,
-    "the capture holds shots that show nothing in common, and the panorama is made of the longest alone",
+    "the capture holds shots that no pair of exposures ties together, and the panorama is of the longest alone",
     "make a panorama of each: write source.with.frames: [first, last + 1]",
 )
 def _shots(run: _Run) -> _Found | None:
