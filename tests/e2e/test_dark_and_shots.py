@@ -1,4 +1,4 @@
-"""Frames without light, shots that nothing ties together, and motion that exposures do not show: with what a spec says by default."""
+"""Frames without light, shots that nothing ties together, and motion that exposures do not show."""
 
 from __future__ import annotations
 
@@ -99,13 +99,14 @@ def test_shots_that_nothing_ties_together_are_kept_apart(simulated: Callable[...
     np.testing.assert_array_equal(np.flatnonzero(motion["located"]), np.arange(120, 300))
     assert motion["reference"] == 210
     assert result.record["warnings"][0] == (
-        "the capture holds 2 shots that no pair of exposures ties together: frames 0 to 119 and frames 120 to 299. The panorama "
-        "is of frames 120 to 299 alone; for one of frames 0 to 119, write source: {with: {frames: [0, 120]}}"
+        "the capture holds 2 shots that no pair of exposures ties together: frames 0 to 119 and frames 120 to 299. The "
+        "panorama is of frames 120 to 299 alone; for one of frames 0 to 119, write source: {with: {frames: [0, 120]}}"
     )
     assert result.verdict is not None
     assert str(result.verdict.reasons[0]) == (
         "the capture holds shots that no pair of exposures ties together, and the panorama is of the longest alone (frames 0 "
-        "to 119 and frames 120 to 299): 2, trusted up to 1; make a panorama of each: write source.with.frames: [first, last + 1]"
+        "to 119 and frames 120 to 299): 2, trusted up to 1; make a panorama of each: write "
+        "source.with.frames: [first, last + 1]"
     )
 
 

@@ -59,8 +59,8 @@ def left_out_warnings(timeline: Timeline | None) -> list[str]:
         shots, shown = timeline.shots, timeline.shot
         other = next(each for each in shots if each != shown)
         warnings.append(
-            f"the capture holds {len(shots)} shots that no pair of exposures ties together: {listed(map(str, shots))}. The panorama is of "
-            f"{shown} alone; for one of {other}, write source: {{with: {{frames: [{other.start}, {other.stop}]}}}}"
+            f"the capture holds {len(shots)} shots that no pair of exposures ties together: "
+            f"{listed(map(str, shots))}. The panorama is of {shown} alone; for one of {other}, write source: {{with: {{frames: [{other.start}, {other.stop}]}}}}"
         )
     if timeline is not None and timeline.dark:
         warnings.append(

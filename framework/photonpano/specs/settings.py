@@ -55,8 +55,8 @@ class MotionSettings(Config):
     start: Literal["none", "constant-velocity"] = Field(
         "none",
         description="what is known of the motion before the first level: none, or the constant-velocity of the image, a turn "
-        "about any point or a shift, that is found from all frames together, where groups of them are too dark or too blurred; with "
-        "none, this is tried if pairs of exposures cannot be located",
+        "about any point or a shift, that is found from all frames together, where groups of them are too dark or too blurred; "
+        "with none, this is tried if pairs of exposures cannot be located",
     )
 
 
