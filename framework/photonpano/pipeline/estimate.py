@@ -7,11 +7,7 @@ from functools import partial
 
 import numpy as np
 
-<<<<<<< HEAD
-from photonpano.capture import capture_of
-=======
-from photonpano.capture import leaving_out
->>>>>>> 681995fb (Leave out frames without light and shots that show nothing in common, since both were glued into a wrong motion)
+from photonpano.capture import capture_of, leaving_out
 from photonpano.contracts.protocols import Source
 from photonpano.corrections.movers import decision_of as background_decision
 from photonpano.execution.context import Context

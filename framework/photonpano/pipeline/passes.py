@@ -27,12 +27,8 @@ from photonpano.motion.diagnosis import UntiedError
 from photonpano.motion.model import SAME_LENS_PX
 from photonpano.motion.timeline import Cut
 from photonpano.pipeline.components import build_levels
-<<<<<<< HEAD
-from photonpano.pipeline.state import State, within
-=======
 from photonpano.pipeline.shots import ApartError, shots_of
-from photonpano.pipeline.state import State
->>>>>>> 681995fb (Leave out frames without light and shots that show nothing in common, since both were glued into a wrong motion)
+from photonpano.pipeline.state import State, within
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.residuals.cuts import SMALLEST_PX, find_cuts
 from photonpano.residuals.refinement import MotionFit
