@@ -60,8 +60,8 @@ def left_out_warnings(timeline: Timeline | None) -> list[str]:
         other = next(each for each in shots if each != shown)
         warnings.append(
             f"the capture holds {len(shots)} shots that no pair of exposures ties together: "
-            f"{listed(map(str, shots))}. The panorama is of {shown} alone; for one of {other}, write source: "
-            f"{{with: {{frames: [{other.start}, {other.stop}]}}}}"
+            f"{listed(map(str, shots))}. The panorama is of {shown} alone; for one of {other}, write "
+            f"source: {{with: {{frames: [{other.start}, {other.stop}]}}}}"
         )
     if timeline is not None and timeline.dark:
         warnings.append(

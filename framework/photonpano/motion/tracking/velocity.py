@@ -24,6 +24,7 @@ from photonpano.values import FloatArray, FrameSpan
 
 _SPANS = 128  # a capture is divided into at most this many spans
 _FEWEST_SPANS = 8
+_FEWEST_PIXELS = 2  # binned pixels of the shorter side of a frame
 _LAGS = 4  # spans that are up to this many apart are compared in the search over all velocities
 _FASTEST = np.radians(20)  # fastest turn that is considered, in radians from span to span
 _FASTEST_SHIFT = 8.0  # fastest shift that is considered, in binned pixels from span to span
@@ -124,7 +125,7 @@ def find_velocity(source: Source, context: Context) -> FoundVelocity:
     that double until one holds the whole capture.
 
     Raises:
-        InputError: the capture has fewer than 8 frames.
+        InputError: the capture has fewer than 8 frames, or they are tiny.
         LocationError: no velocity stands out, what stands out stands still, or the velocity changes.
     """
     varying, seen, n_frames = _residuals(source, context)
@@ -180,6 +181,10 @@ def _residuals(source: Source, context: Context) -> tuple[Images, Images, int]:
             f"motion.start: {len(spans)} frames are too few to find a constant velocity; at least {_FEWEST_SPANS} are needed"
         )
     means = np.stack(list(context.in_order(partial(binned_mean, source), spans)))
+    if min(means.shape[1:]) < _FEWEST_PIXELS:
+        raise InputError(
+            f"motion.start: frames of {source.info.height}x{source.info.width} px are too small to show a velocity"
+        )
     seen = np.isfinite(means[0]).astype(np.float32)
     images = np.nan_to_num(means)
     brightness = images.sum(axis=(1, 2))
