@@ -30,6 +30,7 @@ _ARRAYS = ("instants", "shown", "filled")
 _INSTANTS = 400  # at which frames are compared with the background
 # Wanted photons of a square in a sum of frames, most frames of a sum, and most motion within them.
 _PHOTONS, _LONGEST, _MOTION_PX = 400.0, 96, 4.0
+_FEWEST_PHOTONS, _FEWEST_SUMS = 100.0, 24  # of a square, and of frames, by which something is told from the background
 _PROBES = 5  # frames by which the flux is estimated
 _COVERED = 0.5  # share of the frames of a sum that must have seen a square
 # Standard deviation of the Gaussian that weights the pixels of a square, in halves of its side: sums must not depend on the
@@ -48,7 +49,7 @@ _APART = 9.0  # mean square of the residuals of a patch that does not follow the
 _THICK = 5  # least height and width of a patch, in squares, with those beside it
 _FEWEST = 4  # squares of a patch that are sure
 _ROUNDS, _TINY = 4, 1e-6  # of the fit of light and shift
-_LEAST, _MOST = 0.02, 0.6  # least share of what frames see that is hidden, and largest share of a frame
+_LEAST, _MOST = 0.06, 0.6  # least share of what frames see that is hidden, and largest share of a frame
 _SMOOTH = 5  # sums over which deviations are averaged where the background was never seen
 _LEAST_HIDDEN = 0.25  # share of the sums that are taken for the background there
 
@@ -92,7 +93,7 @@ def find_background(source: Source, trajectory: Trajectory, span: FrameSpan, con
     patch of squares that differs from it by more than photon noise hides it.
     """
     seen = _seen(source, trajectory, span, context)
-    if len(seen.spans) < _SMOOTH:
+    if seen is None or len(seen.spans) < _FEWEST_SUMS:
         return None
     known = seen.known
     usual, _ = _usual(seen, seen.root)
@@ -144,11 +145,14 @@ def decision_of(background: Background) -> Decision:
     return Decision(MOVERS, round(float(hidden.mean()), 4), f"{hidden.mean():.1%} of the frames {reason}; they are left out")
 
 
-def _seen(source: Source, trajectory: Trajectory, span: FrameSpan, context: Context) -> _Seen:
+def _seen(source: Source, trajectory: Trajectory, span: FrameSpan, context: Context) -> _Seen | None:
+    """Sum the frames all over a span; None if too few photons arrive while the image hardly moves."""
     probes = [binned_mean(source, each) for each in source.info.spread(_PROBES, 1)]
     photons = float(np.nanmean(probes)) * np.pi * (_BLUR * CELL_PX) ** 2
     longest = min(_PHOTONS / max(photons, 1e-9), _MOTION_PX / max(speed_px(source, trajectory), 1e-9))
     length = int(np.clip(longest, 1, min(_LONGEST, len(span))))
+    if length * photons < _FEWEST_PHOTONS:
+        return None
     centres = np.linspace(span.start + length / 2, span.stop - length / 2, min(_INSTANTS, len(span) // length))
     spans = [FrameSpan(start, start + length) for start in (centres - length / 2).astype(int).tolist()]
     motions = trajectory.at([each.centre for each in spans])

@@ -15,11 +15,12 @@ from photonpano.values import BoolArray, FloatArray, Located, Patches
 # (graduated non-convexity, Black and Rangarajan 1996).
 TOLERANCES_PX = (2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 _CERTAIN = 0.5  # least error of a patch beside photon noise, as a share of the tolerance
+_TELLING = 48  # patches of most pairs that must show something
 _FEWEST = 8.0  # patches, by their weights, that determine the motion of a pair
 _UNCERTAIN = 1e-4  # factor of the information of a pair that has fewer
 _FAR, _FAR_PX = 4.0, 0.5  # standard deviations, and px, beyond which a patch contradicts a motion
 _ALIKE_PX = 0.1  # error of patches beside photon noise
-_DAMPING = 1e-6
+_DAMPING, _TINY = 1e-6, 1e-12
 
 
 def agreeing(motions: Sequence[Located], residuals: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> list[Located]:
@@ -33,17 +34,25 @@ def agreeing(motions: Sequence[Located], residuals: FloatArray, tolerance_px: fl
 
 
 def contradicting(motions: Sequence[Located], residuals: FloatArray) -> float:
-    """Return the share of the patches that lie elsewhere than a motion lets expect, of those that show something."""
+    """Return the share of the patches that lie elsewhere than a motion lets expect; 0 if too few show anything to tell."""
     shown = [(motion.patches, left) for motion, left in zip(motions, residuals, strict=True) if motion.patches is not None]
-    found = np.concatenate([_far(*each) for each in shown]) if shown else np.zeros(1, bool)
-    return float(found.mean()) if found.size else 0.0
+    found = [_far(*each) for each in shown]
+    if np.median([len(each) for each in found] or [0]) < _TELLING:
+        return 0.0
+    return float(np.concatenate(found).mean())
 
 
 def _far(patches: Patches, residuals: FloatArray) -> BoolArray:
     """Return which of the patches that show something are far from where they are expected."""
     seen = patches.information[:, 0, 0] > 0
-    variances = np.trace(np.linalg.inv(patches.information[seen]), axis1=1, axis2=2)
+    variances = np.trace(_covariances(patches.information[seen]), axis1=1, axis2=2)
     return np.asarray((residuals[seen] ** 2).sum(axis=-1) > _FAR**2 * variances + _FAR_PX**2)
+
+
+def _covariances(information: FloatArray) -> FloatArray:
+    """Return the inverses of (N, 2, 2) information; what nothing is known of varies by much, but not without end."""
+    traces = np.trace(information, axis1=1, axis2=2)
+    return np.linalg.inv(information + np.maximum(_DAMPING * traces, _TINY)[:, None, None] * np.eye(2))
 
 
 def layers(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: FloatArray, n_nodes: int) -> FloatArray:
@@ -55,7 +64,7 @@ def layers(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: Fl
     for (moving, _), motion, left in zip(pairs, motions, residuals, strict=True):
         if motion.patches is not None:
             seen = motion.patches.information[:, 0, 0] > 0
-            limited = np.linalg.inv(motion.patches.information[seen]) + _ALIKE_PX**2 * np.eye(2)
+            limited = _covariances(motion.patches.information[seen]) + _ALIKE_PX**2 * np.eye(2)
             squares[moving, seen] += (
                 np.einsum("pi,pi->p", left[seen], np.linalg.solve(limited, left[seen, :, None])[..., 0]) / 2
             )
@@ -73,7 +82,7 @@ def _by_patches(motion: Located, weights: FloatArray, tolerance_px: float, shape
     moves = generators(shape)
     by_points = slopes(there, moves @ there).reshape(len(middles), 2, 8)
     shown = patches.information[:, 0, 0] > 0
-    limited = np.linalg.pinv(patches.information, hermitian=True) + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
+    limited = _covariances(patches.information) + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
     information = np.where(shown[:, None, None], weights[:, None, None] * np.linalg.inv(limited), 0)
     if (weights * shown).sum() < _FEWEST:
         return replace(motion, information=motion.information * _UNCERTAIN, patches=Patches(patches.shifts, information))

@@ -35,6 +35,7 @@ from photonpano.values import BoolArray, Edge, FloatArray, Located
 
 # Share of the patches that contradict a camera that only turns, above which they are told from the background.
 _CONTRADICTED = 0.005
+_FEWEST_NODES = 12  # of which pairs tell what is the background over time
 
 
 class GraphOptions(Protocol):
@@ -134,19 +135,22 @@ def _of_background(
     Returns the pairs by these patches, and all models fitted to them.
     """
     costs = {model: cost for model, cost in _costs(fits).items() if model.kind == "rotation"}
-    if not costs:
+    if not costs or len(tied.order) < _FEWEST_NODES:
         return tied, fits
     turning = likeliest(costs)
     first, fit = fits[turning].adjustment, fits[turning]
     assert isinstance(first, RotationAdjustment)
-    if not turning.layered and contradicting(tied.motions, first.beside(fit.state)) < _CONTRADICTED:
+    if contradicting(tied.motions, first.beside(fit.state)) <= (0 if turning.layered else _CONTRADICTED):
         return tied, fits
     background = tied
     for tolerance_px in TOLERANCES_PX:
         motions = agreeing(tied.motions, first.beside(fit.state), tolerance_px, tied.frame_shape)
         background = replace(tied, motions=motions)
         adjustment = RotationAdjustment(background.problem, turning.seen_by(tied.frame_shape), turning.unknown)
-        fit = background.fit(adjustment, fit.state)
+        try:
+            fit = background.fit(adjustment, fit.state)
+        except (ValueError, np.linalg.LinAlgError):
+            return tied, fits  # too few patches agree
     found = layers(tied.pairs, tied.motions, first.beside(fit.state), len(tied.located))
     background = replace(background, layers=found)
     others = [model for model in fits if model is not turning]

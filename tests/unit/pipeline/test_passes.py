@@ -94,7 +94,10 @@ def test_single_level_is_located_again_if_the_capture_was_corrected_since(
     levels = tuple(make_level(number=number) for number in range(1, n_levels + 1))
     first = SimpleNamespace(trajectory=pan(0.3))
     source: Any = MemorySource(np.zeros((9, 8, 16)))
-    tried(replace(BEFORE, source=source, levels=levels, results=(first,), outdated=outdated), partial(later_levels, journal=[]))
+    tried(
+        replace(BEFORE, source=source, levels=levels, results=(first,), outdated=outdated, watched=True),
+        partial(later_levels, journal=[]),
+    )
     assert ran == [(located, first.trajectory)]
 
 
