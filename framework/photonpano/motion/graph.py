@@ -140,7 +140,7 @@ def _of_background(
     turning = likeliest(costs)
     first, fit = fits[turning].adjustment, fits[turning]
     assert isinstance(first, RotationAdjustment)
-    if contradicting(tied.motions, first.beside(fit.state)) <= (0 if turning.layered else _CONTRADICTED):
+    if not turning.layered and contradicting(tied.motions, first.beside(fit.state)) < _CONTRADICTED:
         return tied, fits
     background = tied
     for tolerance_px in TOLERANCES_PX:
