@@ -339,6 +339,16 @@ def _standing(run: _Run) -> _Found | None:
 
 
 @_doubtful_above(
+    0.5,
+    "more than half of what the frames show does not follow one turn of the camera, as where it travels past near things",
+    "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
+)
+def _layers(run: _Run) -> _Found | None:
+    shares = [float(each.value) for each in run.decisions if each.what == "movers"]
+    return _Found(shares[-1], "share of the frames that is left out, on average") if shares else None
+
+
+@_doubtful_above(
     0,
     "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
     "leave these frames out, or keep the light on",
