@@ -18,7 +18,9 @@ import numpy as np
 from photonpano import FloatArray, InputError
 from photonpano.geometry import Camera, camera_matrix, inverse, normalised, rescaling, rotation_matrices, transform_points
 from photonpano.reading import read_array, read_arrays
-from photonpano_simulator.config import (
+from photonpano_simulator.config import SimulationConfig
+from photonpano_simulator.lens import camera, middle_of, outline
+from photonpano_simulator.path_config import (
     FilePath,
     HandShakePath,
     LoopPath,
@@ -26,11 +28,9 @@ from photonpano_simulator.config import (
     PanPath,
     ScanPath,
     Shake,
-    SimulationConfig,
     SplinePath,
     TurnPath,
 )
-from photonpano_simulator.lens import camera, middle_of, outline
 from photonpano_simulator.sensor import Draw, generator
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from photonpano import Config, SpecPath
-from photonpano_simulator.config import Sensor, Shake
+from photonpano_simulator.config import Sensor
+from photonpano_simulator.path_config import Shake
 from photonpano_simulator.recording import Drift, Drops, FrameCount, FrameRate, FrameShape, Repeats
 
 Metres = Annotated[float, Field(ge=-1000, le=1000)]

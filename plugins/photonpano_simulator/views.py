@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from photonpano import FloatArray
 from photonpano.compiling import compiled
 from photonpano.geometry import transform_points, translation
-from photonpano_simulator.config import FrameObject, SimulationConfig, TurnPath
+from photonpano_simulator.config import FrameObject, SimulationConfig
 from photonpano_simulator.lens import camera, distorts, pixel_grid, undistorted
+from photonpano_simulator.path_config import TurnPath
 from photonpano_simulator.sensor import Draw, generator
 
 _DETAIL_PX = (1.5, 5.0, 15.0)  # standard deviations of the Gaussian kernels that make a texture of white noise
