@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -28,12 +27,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from harness import Study, chosen, command, packed, passing, record_of, simulator
+from harness import Study, chosen, command, simulator
 from harness import table as table_of
 from joint_bound import Model, joint_bound
-from trust import figures_of_run, reasons, status
+from trust import reasons, scored, status
 
-from photonpano import InputError, PhotonpanoError, open_source, parse_spec
+from photonpano import InputError, open_source, parse_spec
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import load_truth
 from photonpano.geometry import Camera
@@ -98,20 +97,8 @@ def measured(task: tuple[Path, str, float, str], frames: int, captures: Path) ->
     """Simulate a capture if it is not there, run it, and return the scores."""
     photo, path, flux, motion = task
     cube = simulated(*task, frames, Study(captures))
-    result: dict[str, Any] = {"photograph": photo.stem, "path": path, "flux": flux, "motion": motion, "frames": frames}
-    result |= {"exit_code": 0, "message": "", "verdict": None, **bounds_of(cube, motion)}
-    with passing() as study:
-        start = time.process_time()
-        try:
-            folder = study.run("run", packed(cube, run={"threads": 1}))
-        except Exception as error:  # a defect of photonpano is a result too
-            code, message = (1, str(error)) if isinstance(error, PhotonpanoError) else (None, repr(error))
-            return result | {"exit_code": code, "message": message, "cpu_s": time.process_time() - start}
-        result["cpu_s"] = time.process_time() - start
-        record = record_of(folder)
-        result |= {"verdict": record.get("verdict"), "warnings": list(record["warnings"]), "decisions": record["decisions"]}
-        result["cuts"] = sum(each["what"] == "cut" for each in record["decisions"])
-        return result | figures_of_run(folder, load_truth(truth_path(cube)))
+    task_of = {"photograph": photo.stem, "path": path, "flux": flux, "motion": motion, "frames": frames}
+    return task_of | bounds_of(cube, motion) | scored(cube)
 
 
 def row(result: dict[str, Any]) -> Iterator[str]:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -25,13 +24,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from harness import Study, chosen, command, packed, passing, record_of, simulator
+from harness import Study, chosen, command, simulator
 from harness import table as table_of
-from trust import figures_of_run, is_honest, reasons, status
-
-from photonpano import PhotonpanoError
-from photonpano.capture.writing import truth_path
-from photonpano.evaluation import load_truth
+from trust import is_honest, reasons, scored, status
 
 SHAPE, HEIGHT = (254, 496), 900
 BASE: dict[str, Any] = {
@@ -122,19 +117,7 @@ def settings(name: str, photographs: Path) -> dict[str, Any]:
 def measured(name: str, photographs: Path, frames: int, captures: Path) -> dict[str, Any]:
     """Simulate a capture if it is not there, run it, and return the scores."""
     cube = Study(captures).capture(name.replace(",", ""), simulator(**settings(name, photographs), n_frames=frames))
-    result: dict[str, Any] = {"row": name, "frames": frames, "exit_code": 0, "message": "", "verdict": None}
-    with passing() as study:
-        start = time.process_time()
-        try:
-            folder = study.run("run", packed(cube, run={"threads": 1}))
-        except Exception as error:  # a defect of photonpano is a result too
-            code, message = (1, str(error)) if isinstance(error, PhotonpanoError) else (None, repr(error))
-            return result | {"exit_code": code, "message": message, "cpu_s": time.process_time() - start}
-        result["cpu_s"] = time.process_time() - start
-        record = record_of(folder)
-        result |= {"verdict": record.get("verdict"), "warnings": list(record["warnings"]), "decisions": record["decisions"]}
-        result["cuts"] = sum(each["what"] == "cut" for each in record["decisions"])
-        return result | figures_of_run(folder, load_truth(truth_path(cube)))
+    return {"row": name, "frames": frames, **scored(cube)}
 
 
 def row(result: dict[str, Any]) -> Iterator[str]:

@@ -177,6 +177,23 @@ def figures_of_run(folder: Path, truth: Truth) -> Result:
     return figures_of(estimated | {"homographies": found.homographies @ lens}, truth)
 
 
+def scored(cube: Path) -> Result:
+    """Run a capture with a source alone, and one thread; return its scores, or why there are none."""
+    result: Result = {"exit_code": 0, "message": "", "verdict": None}
+    with passing() as study:
+        start = time.process_time()
+        try:
+            folder = study.run("run", packed(cube, run={"threads": 1}))
+        except Exception as error:  # a defect of photonpano is a result too
+            code, message = (1, str(error)) if isinstance(error, PhotonpanoError) else (None, repr(error))
+            return result | {"exit_code": code, "message": message, "cpu_s": time.process_time() - start}
+        result["cpu_s"] = time.process_time() - start
+        record = record_of(folder)
+        result |= {"verdict": record.get("verdict"), "warnings": list(record["warnings"]), "decisions": record["decisions"]}
+        result["cuts"] = sum(each["what"] == "cut" for each in record["decisions"])
+        return result | figures_of_run(folder, load_truth(truth_path(cube)))
+
+
 def status(result: Result) -> str:
     """Return what a run says of itself: trusted, doubtful, refused, crashed, or - without a verdict."""
     if result["exit_code"] is None:
