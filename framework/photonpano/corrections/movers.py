@@ -11,7 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from photonpano.capture import before, capture_of
 from photonpano.contracts.protocols import Source, Trajectory
@@ -121,18 +121,18 @@ def without_layers(
 
     Given are, at N instants, the mean squares of the residuals of patches, (N, P): see `GraphSolution`.
     """
-    shape = frame_shape
-    apart = (layers > _APART).reshape(len(layers), PATCHES, PATCHES).astype(np.uint8)
+    apart = (layers > _APART).reshape(len(layers), PATCHES, PATCHES)
     if not apart.any():
         return background
-    near = np.array([cv2.dilate(each, np.ones((3, 3), np.uint8)) for each in np.maximum(apart[:-1], apart[1:])])
-    near = np.concatenate([near[:1], np.maximum(near[:-1], near[1:]), near[-1:]]) > 0
+    near = maximum_filter1d(apart, 3, axis=0, mode="nearest")
     rows, columns = (
-        ((np.arange(0, side, CELL_PX) + CELL_PX / 2) * PATCHES / side).astype(int).clip(0, PATCHES - 1) for side in shape
+        ((np.arange(0, side, CELL_PX) + CELL_PX / 2) * PATCHES / side).astype(int).clip(0, PATCHES - 1) for side in frame_shape
     )
-    cells = near[:, rows][:, :, columns]
+    # A patch is not divided where what is near ends.
+    wider = np.ones((5, 5), np.uint8)
+    cells = np.array([cv2.dilate(each, wider) for each in near[:, rows][:, :, columns].astype(np.uint8)]) > 0
     if background is None:
-        return Background(instants, ~cells, np.ones_like(cells), shape)
+        return Background(instants, ~cells, np.ones_like(cells), frame_shape)
     nearest = np.abs(background.instants[:, None] - instants).argmin(axis=1)
     return replace(background, shown=background.shown & ~cells[nearest])
 
