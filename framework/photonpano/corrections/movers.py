@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import warnings
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -39,19 +39,29 @@ _BLUR = 1.0
 _BINS, _TAIL = 64, 1e-3  # of the histograms of brightness, and the share of squares beyond their ends
 _NEAR = 2.5  # standard deviations from the usual brightness within which squares are averaged
 _USUAL = 0.3  # least share of the sums that show a place, in which it has its usual brightness
-# What squares may differ by beyond photon noise: a share of their brightness, and errors of the motion.
-_UNEVEN, _MISPLACED_PX = 0.02, 0.75
+_UNEVEN = 0.02  # share of their brightness that squares may differ by beyond photon noise
 _MEDIAN = 0.455  # the median of the square of a Gaussian number of unit variance
 _AROUND = np.ones((3, 3))  # squares that are tested together
-# Standard deviations by which a patch hides the background, and by which squares beside it belong to it.
-_SURE, _BESIDE = 6.0, 2.5
+_SURE = 6.0  # standard deviations by which a patch hides the background
 _APART = 9.0  # mean square of the residuals of a patch that does not follow the motion, in variances
-_THICK = 5  # least height and width of a patch, in squares, with those beside it
 _FEWEST = 4  # squares of a patch that are sure
 _ROUNDS, _TINY = 4, 1e-6  # of the fit of light and shift
-_LEAST, _MOST = 0.06, 0.6  # least share of what frames see that is hidden, and largest share of a frame
+_CHANGING, _FEWEST_SEEN = 6.0, 8  # mean square, in variances, of a place that has no usual brightness, and times it was seen
 _SMOOTH = 5  # sums over which deviations are averaged where the background was never seen
 _LEAST_HIDDEN = 0.25  # share of the sums that are taken for the background there
+
+
+class _Tolerance(NamedTuple):
+    """How carefully the background is told from what hides it, as the motion is known."""
+
+    misplaced_px: float  # errors of the motion, by which squares may differ beyond photon noise
+    thick: int  # least height and width of a patch, in squares, with those beside it: errors of the motion are thin
+    beside: float  # standard deviations by which squares beside a patch belong to it
+    least: float  # least share of what all frames see that is hidden
+    most: float  # largest share of what a frame sees that is hidden
+
+
+_ROUGH, _EXACT = _Tolerance(0.75, 5, 2.5, 0.06, 0.6), _Tolerance(0.5, 3, 2.0, 0.02, 0.8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,12 +96,16 @@ class _Seen:
         return steady
 
 
-def find_background(source: Source, trajectory: Trajectory, span: FrameSpan, context: Context) -> Background | None:
+def find_background(
+    source: Source, trajectory: Trajectory, span: FrameSpan, context: Context, *, exact: bool = False
+) -> Background | None:
     """Find the parts of the frames of a span that show the background; None if all do.
 
     The background of a place is the brightness that it has most often: that of things that pass is spread over many values. A
-    patch of squares that differs from it by more than photon noise hides it.
+    patch of squares that differs from it by more than photon noise hides it. Along an `exact` motion, smaller patches do, and
+    the background is not known where what is left of a place still changes.
     """
+    tolerance = _EXACT if exact else _ROUGH
     seen = _seen(source, trajectory, span, context)
     if seen is None or len(seen.spans) < _FEWEST_SUMS:
         return None
@@ -99,13 +113,16 @@ def find_background(source: Source, trajectory: Trajectory, span: FrameSpan, con
     usual, _ = _usual(seen, seen.root)
     steady = seen.steady(usual)
     usual, sure = _usual(seen, steady)
-    deviation = _deviation(seen, steady, usual)
-    hidden = np.array([_patches(*each) for each in zip(deviation, known, strict=True)])
+    squares = _squares(seen, steady, usual, tolerance.misplaced_px)
+    deviation = _deviation(squares, known)
+    hidden = np.array([_patches(*each, tolerance) for each in zip(deviation, known, strict=True)])
     # Where nearly all differs, the motion is wrong.
-    hidden &= (hidden.sum(axis=(1, 2)) < _MOST * known.sum(axis=(1, 2)))[:, None, None]
-    if hidden[known].mean() < _LEAST:
-        return None
+    hidden &= (hidden.sum(axis=(1, 2)) < tolerance.most * known.sum(axis=(1, 2)))[:, None, None]
+    if exact:
+        sure &= ~_changing(squares, known & ~hidden)
     hidden |= known & ~sure
+    if hidden[known].mean() < tolerance.least:
+        return None
     instants = np.array([each.centre for each in seen.spans])
     filled = _seen_somewhere(hidden, deviation, known)
     shown, filled = (~_in_frames(source, seen, _beyond_borders(each, known)) for each in (hidden, filled))
@@ -124,17 +141,15 @@ def without_layers(
     apart = (layers > _APART).reshape(len(layers), PATCHES, PATCHES)
     if not apart.any():
         return background
-    near = maximum_filter1d(apart, 3, axis=0, mode="nearest")
+    around = maximum_filter1d(apart, 3, axis=0, mode="nearest")
     rows, columns = (
         ((np.arange(0, side, CELL_PX) + CELL_PX / 2) * PATCHES / side).astype(int).clip(0, PATCHES - 1) for side in frame_shape
     )
     # A patch is not divided where what is near ends.
     wider = np.ones((5, 5), np.uint8)
-    cells = np.array([cv2.dilate(each, wider) for each in near[:, rows][:, :, columns].astype(np.uint8)]) > 0
-    if background is None:
-        return Background(instants, ~cells, np.ones_like(cells), frame_shape)
-    nearest = np.abs(background.instants[:, None] - instants).argmin(axis=1)
-    return replace(background, shown=background.shown & ~cells[nearest])
+    cells = np.array([cv2.dilate(each, wider) for each in around[:, rows][:, :, columns].astype(np.uint8)]) > 0
+    near = Background(instants, ~cells, np.ones_like(cells), frame_shape)
+    return near if background is None else background.without(near)
 
 
 def decision_of(background: Background) -> Decision:
@@ -201,27 +216,40 @@ def _usual(seen: _Seen, root: FluxImage) -> tuple[FluxImage, BoolArray]:
     return np.asarray(usual, np.float32), near.sum(axis=0) >= _USUAL * known.sum(axis=0)
 
 
-def _deviation(seen: _Seen, root: FluxImage, usual: FluxImage) -> FluxImage:
+def _squares(seen: _Seen, root: FluxImage, usual: FluxImage, misplaced_px: float) -> FluxImage:
+    """Return the squared difference of squares from the usual, in variances; NaN where they are not seen: (S, h, w)."""
+    slopes = np.square(np.gradient(usual)).sum(axis=0)
+    tolerated = (_UNEVEN * usual) ** 2 + (misplaced_px / CELL_PX) ** 2 * slopes
+    return np.where(seen.known, (root - usual) ** 2 / (np.where(seen.known, seen.std, 1) ** 2 + tolerated), np.nan)
+
+
+def _deviation(squares: FluxImage, known: BoolArray) -> FluxImage:
     """Return by how much squares and those around them differ from the usual, in standard deviations of noise: (S, h, w)."""
-    known, slopes = seen.known, np.square(np.gradient(usual)).sum(axis=0)
-    tolerated = (_UNEVEN * usual) ** 2 + (_MISPLACED_PX / CELL_PX) ** 2 * slopes
-    squares = np.where(known, (root - usual) ** 2 / (np.where(known, seen.std, 1) ** 2 + tolerated), np.nan)
     # What frames sample of a thin line differs more, always.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # squares that are never seen
-        squares /= np.maximum(np.nanmedian(squares, axis=0) / _MEDIAN, 1)
-    found = np.zeros_like(root)
-    for index, (of_sum, there) in enumerate(zip(np.nan_to_num(squares), known, strict=True)):
+        always = np.maximum(np.nanmedian(squares, axis=0) / _MEDIAN, 1)
+    found = np.zeros_like(squares)
+    for index, (of_sum, there) in enumerate(zip(np.nan_to_num(squares / always), known, strict=True)):
         total, number = (cv2.filter2D(each, -1, _AROUND, borderType=cv2.BORDER_CONSTANT) for each in (of_sum, there * 1.0))
         found[index] = (total - number) / np.sqrt(2 * np.maximum(number, 1))
     return found
 
 
-def _patches(deviation: FluxImage, known: BoolArray) -> BoolArray:
+def _changing(squares: FluxImage, shown: BoolArray) -> BoolArray:
+    """Return the places that change even where no patch hides them, as where something is most of the time: (h, w)."""
+    number = shown.sum(axis=0)
+    mean = np.where(shown, squares, 0).sum(axis=0) / np.maximum(number, 1)
+    changing = (mean > _CHANGING) & (number >= _FEWEST_SEEN)
+    thick = cv2.morphologyEx(changing.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return cv2.dilate(thick, np.ones((3, 3), np.uint8)) > 0
+
+
+def _patches(deviation: FluxImage, known: BoolArray, tolerance: _Tolerance) -> BoolArray:
     """Return the patches of squares that hide the background: (h, w)."""
-    differs = known & (deviation > _BESIDE)
+    differs, side = known & (deviation > tolerance.beside), tolerance.thick
     # Errors of the motion differ along edges, which are thin.
-    thick = cv2.morphologyEx((differs | ~known).astype(np.uint8), cv2.MORPH_OPEN, np.ones((_THICK, _THICK), np.uint8))
+    thick = cv2.morphologyEx((differs | ~known).astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     _, labels = cv2.connectedComponents((differs & (cv2.dilate(thick, np.ones((3, 3), np.uint8)) > 0)).astype(np.uint8))
     sure = np.bincount(labels[known & (deviation > _SURE)], minlength=labels.max() + 1) >= _FEWEST
     sure[0] = False

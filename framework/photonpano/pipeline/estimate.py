@@ -7,9 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from photonpano.capture import capture_of, leaving_out
+from photonpano.capture import leaving_out
 from photonpano.contracts.protocols import Source
-from photonpano.corrections.movers import decision_of as background_decision
 from photonpano.execution.context import Context
 from photonpano.motion.diagnosis import UntiedError, also_tried
 from photonpano.motion.loop import LevelResult
@@ -69,8 +68,6 @@ def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decisio
     for each in tried:
         n_decisions, state = len(state.decisions), passes.tried(state, each).state
         journal += state.decisions[n_decisions:]
-    if (background := capture_of(state.source).background) is not None:
-        journal.append(background_decision(background))
     journal += [*state.timeline.decisions, *_model_decisions(plan, state.results)]
     return state
 

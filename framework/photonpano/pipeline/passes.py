@@ -32,12 +32,14 @@ from photonpano.pipeline.state import State, within
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.residuals.cuts import SMALLEST_PX, find_cuts
 from photonpano.residuals.refinement import MotionFit
+from photonpano.residuals.verdict import changing_places
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, Light
+from photonpano.values import Background, Decision, Light
 
 logger = logging.getLogger(__name__)
 
 _FAILED = 0.05  # share of the pairs that are not located beyond which the motion is not trusted to tell what moves by itself
+_CHANGING = 0.003  # share of the panorama that changes over time beyond which what moves is looked for again
 _EXPLAINED = 0.9  # changing light is accepted if it lowers the reduced chi-square of the photons to this fraction
 
 
@@ -214,11 +216,26 @@ def without_movers(state: State) -> Proposal | None:
     if (layers := located.solution.layers) is not None:
         there = located.solution.located
         found = without_layers(found, located.instants, layers[there], state.source.info.frame_shape)
-    watched = replace(state, watched=True)
-    if found is not None:
-        watched = replace(watched, source=before(state.source, found), context=within(state.context, found), outdated=True)
+    watched = replace(state if found is None else _with_background(state, found), watched=True)
     # Residuals of what is left out, and not, cannot be compared.
     return Proposal(lambda: watched, worse=None)
+
+
+def without_what_changes(state: State) -> Proposal | None:
+    """Leave out what hides the background by the refined motion, too, if parts of the panorama change over time."""
+    share, _ = changing_places(state.fit.residuals)
+    if share < _CHANGING or _uncertain(state):
+        return None
+    source, known = before(state.view.source, None), capture_of(state.source).background
+    found = find_background(source, state.motion.trajectory, state.motion.span, state.context, exact=True)
+    if found is None:
+        return None
+    found = found if known is None else found.without(known)
+    return Proposal(lambda: replace(_with_background(state, found), known_fit=None), worse=None)
+
+
+def _with_background(state: State, found: Background) -> State:
+    return replace(state, source=before(state.source, found), context=within(state.context, found), outdated=True)
 
 
 def _uncertain(state: State) -> bool:

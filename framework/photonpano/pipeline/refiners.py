@@ -15,7 +15,7 @@ from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displaceme
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.level import Recorder
 from photonpano.pipeline.components import built, stage_context
-from photonpano.pipeline.passes import Proposal, tried
+from photonpano.pipeline.passes import Proposal, tried, without_what_changes
 from photonpano.pipeline.state import State
 from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement
 from photonpano.specs.plan import Plan
@@ -53,6 +53,7 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Expla
             if len(rounds) == 1 and _change_px(before, state.motion) > _BLURRED_PX:
                 state = tried(state, _relocated).state
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(before, state.motion), kept_out))
+    state = tried(state, without_what_changes).state
     return state, state.fit.explained(refinements)
 
 

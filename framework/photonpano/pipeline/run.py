@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from photonpano.capture import capture_of
 from photonpano.contracts.protocols import light_of
+from photonpano.corrections.movers import decision_of
 from photonpano.errors import InputError
 from photonpano.execution.context import Progress, usual
 from photonpano.pipeline.checkpoints.work_folder import Continuation
@@ -105,6 +107,8 @@ def make_panorama(run: BegunRun) -> None:
         with naming_obstacles(run.source, journal):
             state = estimate(plan, run.source, journal, context)
         state, explained = refine(state, build_refiners(plan, state.view.source, journal))
+        if (background := capture_of(state.source).background) is not None:
+            journal.append(decision_of(background))
         source, context = state.view
         verdict = judge(explained, state.results, journal)
         panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context)

@@ -16,6 +16,7 @@ from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import DARK_JUMP, SHOTS
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import lens_distortion
+from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
 from photonpano.values import BoolArray, Decision, Located
 
@@ -155,20 +156,23 @@ def _photons(run: _Run) -> _Found | None:
     return _Found(reduced_chi2, f"on average by {contrast:.0%} of the light") if contrast > MAX_CONTRAST else None
 
 
+def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
+    """Return the share of the panorama that changes over time by more than noise explains, and its squares of 16 px: (h, w)."""
+    counted = residuals.cell_count >= _MIN_BLOCKS
+    expected = 1 + _STANDARD_DEVIATIONS * np.sqrt(2 / np.maximum(residuals.cell_count, 1))
+    contrast = np.sqrt(np.maximum(residuals.cell_chi2 - 1, 0) * residuals.cell_noise)
+    changing = counted & (residuals.cell_chi2 > np.maximum(expected, 1.5)) & (contrast > 0.05)
+    return float(changing.sum() / max(counted.sum(), 1)), changing
+
+
 @_doubtful_above(
     0.03,
     "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
     "mask what moves (corrections: mask); the motion may be that of the thing instead of the scene",
 )
 def _moving(run: _Run) -> _Found | None:
-    residuals = run.explained.residuals
-    counted = residuals.cell_count >= _MIN_BLOCKS
-    expected = 1 + _STANDARD_DEVIATIONS * np.sqrt(2 / np.maximum(residuals.cell_count, 1))
-    contrast = np.sqrt(np.maximum(residuals.cell_chi2 - 1, 0) * residuals.cell_noise)
-    changing = counted & (residuals.cell_chi2 > np.maximum(expected, 1.5)) & (contrast > 0.05)
-    if not changing.any():
-        return None
-    return _Found(float(changing.sum() / counted.sum()), _box(changing, "px of the panorama"))
+    share, changing = changing_places(run.explained.residuals)
+    return _Found(share, _box(changing, "px of the panorama")) if share else None
 
 
 @_doubtful_above(0.03, "the light changes over time", "keep the light steady, or shorten the capture")

@@ -48,6 +48,11 @@ class Background:
         """What is shown in a panorama, which is to have no holes."""
         return replace(self, shown=self.filled)
 
+    def without(self, other: Background) -> Background:
+        """Return what both show of the background."""
+        nearest = np.abs(self.instants[:, None] - other.instants).argmin(axis=1)
+        return replace(self, shown=self.shown & other.shown[nearest])
+
     def part(self, span: FrameSpan) -> Background:
         """Return that of some frames."""
         return replace(self, instants=self.instants - span.start)
