@@ -211,8 +211,10 @@ def without_movers(state: State) -> Proposal | None:
     """Leave out what hides the background by the motion known so far: pairs that show both follow something in between."""
     if _uncertain(state):
         return None
-    found = find_background(before(state.view.source, None), state.trajectory, state.motion.span, state.context)
-    located = state.results[-1].located
+    last, source = state.results[-1], before(state.view.source, None)
+    exact = last.level.number == state.levels[-1].number > 1
+    found = find_background(source, state.trajectory, state.motion.span, state.context, exact=exact)
+    located = last.located
     if (layers := located.solution.layers) is not None:
         there = located.solution.located
         found = without_layers(found, located.instants, layers[there], state.source.info.frame_shape)
