@@ -7,7 +7,6 @@ from .interpolators.smoothing_spline import SmoothingSplineInterpolator as Smoot
 from .mergers.burst import BurstMerger as BurstMerger
 from .mergers.local_flow import LocalFlowMerger as LocalFlowMerger
 from .mergers.photon_mle import PhotonMleMerger as PhotonMleMerger
-from .mergers.robust_merge import RobustMerger as RobustMerger
 from .mergers.splat import SplatMerger as SplatMerger
 from .refiners import ShortSpansRefiner as ShortSpansRefiner
 from .resamplers import AutoResampler as AutoResampler

@@ -68,32 +68,6 @@ class PhotonMleConfig(Config):
     )
 
 
-class RobustMergeConfig(Config):
-    """Keys of `robust-merge`."""
-
-    blocks: int = Field(
-        7,
-        ge=2,
-        le=64,
-        description="number of blocks of frames into which a group is divided; each is compared with the block around the "
-        "reference instant, which an odd number puts in the middle",
-    )
-    smoothing_px: float = Field(
-        2.0,
-        ge=0.5,
-        le=32,
-        description="standard deviation of the Gaussian that blurs blocks before they are compared, in px of a frame: about "
-        "the size of the smallest moving object",
-    )
-    tolerated_std: float = Field(
-        3.0, ge=0, le=20, description="difference that costs no weight, in standard deviations of the photon noise"
-    )
-    tolerated_px: float = Field(
-        0.5, ge=0, le=8, description="error of the motion, in px of a frame, whose effect costs no weight either"
-    )
-    tolerance_px: Tolerance = 0.5
-
-
 class LocalFlowConfig(Config):
     """Keys of `local-flow`."""
 

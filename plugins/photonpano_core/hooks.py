@@ -71,18 +71,12 @@ def photonpano_resamplers() -> Iterator[ResamplerContribution]:
 
 @hookimpl
 def photonpano_mergers() -> Iterator[MergerContribution]:
-    """Offer maximum-likelihood merging: of all frames, without moving objects, and photon by photon."""
+    """Offer maximum-likelihood merging: of sums of frames, photon by photon, and along a flow."""
     yield MergerContribution(
         name="photon-mle",
         summary="Maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
         config=configs.PhotonMleConfig,
         build=lambda config, context: plugin.PhotonMleMerger(config, context.decide),
-    )
-    yield MergerContribution(
-        name="robust-merge",
-        summary="photon-mle without ghosts: moving objects get less weight (Ma et al. 2020)",
-        config=configs.RobustMergeConfig,
-        build=lambda config, _: plugin.RobustMerger(config),
     )
     yield MergerContribution(
         name="splat",

@@ -77,11 +77,11 @@ def test_noisy_compressed_video_is_nearly_as_accurate_as_clean_one(scored: Calla
     "sections",
     [
         {"resample": {"with": {"group_size": 1}}, "levels": 1},
-        {"resample": {"with": {"group_size": 3}}, "merge": {"use": "robust-merge"}, "levels": 2},
+        {"resample": {"with": {"group_size": 3}}, "merge": {"use": "local-flow"}, "levels": 2},
         {"resample": {"with": {"group_size": 5}}, "merge": {"use": "splat"}, "levels": 2},
         {"resample": {"use": "constant-groups", "with": {"group_size": 5}}, "locate": {"use": "opencv-sift"}, "levels": 1},
     ],
-    ids=["single frames", "robust", "splat", "sift"],
+    ids=["single frames", "local flow", "splat", "sift"],
 )
 def test_alternative_stages_accept_grey_frames(scored: Callable, sections: dict[str, Any]) -> None:
     """Measured: 0.08 px for keypoints, and less for the others."""

@@ -45,7 +45,6 @@ TestConstantGroupsAuto = of(ResamplerConformance, "constant-groups")
 
 TestPhotonMle = of(MergerConformance, "photon-mle", config={"tolerance_px": 0.5})
 TestNaiveAverage = of(MergerConformance, "photon-mle", config={"compensate": False}, compensates=False)
-TestRobustMerge = of(MergerConformance, "robust-merge")
 TestSplat = of(MergerConformance, "splat")
 TestLocalFlow = of(MergerConformance, "local-flow")
 # It finds the motion by itself, as well as patches of 40x56 px allow.

@@ -47,7 +47,7 @@ class BurstMerger:
     def merge(self, source: Source, group: Group, trajectory: Trajectory | None, scale: float) -> VirtualExposure:
         """Merge a group; see `photonpano.Merger`. Raises an `InputError` if the lens distorts, or the light changes."""
         del trajectory
-        require_plain(source, "burst", "photon-mle")
+        require_plain(source, "burst")
         burst = _Burst(source, group, self._config)
         photons = burst.merged(burst.motion())
         return exposure_of(photons if scale == 1 else rescaled(photons, scale), source, group, scale)

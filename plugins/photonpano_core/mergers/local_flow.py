@@ -57,7 +57,7 @@ class LocalFlowMerger:
         return GhostMap(enlarged(found.significance, shape), enlarged(found.moving, shape))
 
     def _divided(self, source: Source, group: Group, trajectory: Trajectory) -> SubExposures:
-        require_plain(source, "local-flow", "robust-merge or photon-mle")
+        require_plain(source, "local-flow")
         wanted = self._config.sub_exposures
         number = min(number_of(source, group), _USUAL) if wanted == "auto" else wanted
         return SubExposures(source, group, trajectory, number)

@@ -84,13 +84,13 @@ def parts_of(group: Group, n: int) -> tuple[list[FrameSpan], int]:
     return spans, next(place for place, span in enumerate(spans) if group.reference < span.stop)
 
 
-def require_plain(source: Source, merger: str, instead: str) -> None:
-    """Raise an `InputError` for a lens that distorts, or light that changes, and name what handles them."""
+def require_plain(source: Source, merger: str) -> None:
+    """Raise an `InputError` for a lens that distorts, or light that changes, which `photon-mle` handles."""
     capture = capture_of(source)
     if capture.camera is not None and capture.camera.distorts:
-        raise InputError(f"merge.use: {merger} does not warp through a lens that distorts; use {instead}")
+        raise InputError(f"merge.use: {merger} does not warp through a lens that distorts; use photon-mle")
     if capture.light is not None:
-        raise InputError(f"merge.use: {merger} does not divide by light that changes; use {instead}")
+        raise InputError(f"merge.use: {merger} does not divide by light that changes; use photon-mle")
 
 
 def exposure_shape(source: Source, scale: float) -> tuple[int, int]:
