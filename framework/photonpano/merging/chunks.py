@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from threading import Lock
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source, Trajectory
@@ -31,7 +32,9 @@ class Chunk:
     homography: Homography
 
 
-def chunks_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, int], tolerance_px: float) -> tuple[Chunk, ...]:
+def chunks_of(
+    span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, int], tolerance_px: float, cuts: ArrayLike = ()
+) -> tuple[Chunk, ...]:
     """Split a span so that no corner of a frame moves further than `tolerance_px` within a chunk.
 
     Args:
@@ -40,12 +43,15 @@ def chunks_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, i
         frame_shape: (height, width) of a frame.
         tolerance_px: length of a corner's path, in pixels of a frame, that one warp may ignore. A chunk is warped at its
             centre instant, so that a photon is misplaced by about half of it at most.
+        cuts: instants that no chunk contains.
     """
     blocks = [FrameSpan(block.start, min(block.stop + 1, span.stop)) for block in span.blocks(BLOCK_FRAMES)]
     # The motion of each frame in pixels of the frame before.
     steps = [steps_px(trajectory.at(np.arange(block.start, block.stop)), frame_shape).max(axis=-1) for block in blocks]
     path_px = np.cumsum(np.concatenate([[0.0], *steps]))
     starts = span.start + np.flatnonzero(np.diff(np.floor(path_px / tolerance_px), prepend=-1.0))
+    inside = np.ceil(np.asarray(cuts, float)).astype(int)
+    starts = np.union1d(starts, inside[(span.start < inside) & (inside < span.stop)])
     stops = np.append(starts[1:], span.stop)
     spans = [FrameSpan(start, stop) for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
     centres = trajectory.at([chunk.centre for chunk in spans])

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Renderer, Source, Trajectory
 from photonpano.errors import ExtentError
 from photonpano.execution.context import Context
@@ -46,7 +47,9 @@ class MergeRenderer:
         advance: Callable[[int], None],
     ) -> Panorama:
         """Merge the frames of a span on a canvas: see `Renderer`."""
-        chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px)
+        background = capture_of(source).background
+        cuts = () if background is None else background.instants
+        chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px, cuts)
         photons = accumulate(source, chunks, canvas, canvas.shape, advance, self._in_order)
         flux, weight = photons.estimate(source.response)
         return Panorama(debiased(flux, weight, source.response), weight, canvas.transform)

@@ -12,16 +12,17 @@ from threading import Lock
 
 import numpy as np
 
-from photonpano import FloatArray, FluxImage, FrameSpan, Homography, Panorama, Source, Trajectory
+from photonpano import FloatArray, FluxImage, FrameSpan, Homography, Panorama, Source, Trajectory, capture_of
 from photonpano.geometry import Canvas, corners, inverse, transform_points, translation
-from photonpano.merging import Chunk
+from photonpano.merging import Chunk, chunks_of
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano_core.configs import SuperResolutionConfig
 from photonpano_core.super_resolution.estimate import STRENGTHS, Observations, coarser, gain_of, pixel_area, rounds_of
-from photonpano_core.super_resolution.sums import PhotonSums, pieces_of, sums_on, visible
+from photonpano_core.super_resolution.sums import PhotonSums, sums_on, visible
 
 Decide = Callable[[str, int | bool, str], None]
 
+_MANY_PIECES = 64  # a span is divided into at least this many chunks, if it has the frames: some of them are held out
 Box = tuple[slice, slice]  # rows and columns of an image
 
 logger = logging.getLogger("photonpano.super_resolution")
@@ -79,7 +80,10 @@ class SuperResolutionRenderer:
         """Render the frames of a span on a canvas: see `Renderer`."""
         # Frames are sorted by where their pixels lie on the canvas.
         tolerance_px = min(tolerance_px, 0.25 / _scale_of(canvas))
-        scan = _Scan(source, trajectory, span, pieces_of(span, trajectory, source.info.frame_shape, tolerance_px))
+        background = capture_of(source).background
+        every = max(1, len(span) // _MANY_PIECES)
+        cuts = np.arange(span.start, span.stop, every) if background is None else background.instants
+        scan = _Scan(source, trajectory, span, chunks_of(span, trajectory, source.info.frame_shape, tolerance_px, cuts))
         if not scan.near(canvas):
             advance(len(span))
             return Panorama(np.full(canvas.shape, np.nan, np.float32), np.zeros(canvas.shape, np.float32), canvas.transform)

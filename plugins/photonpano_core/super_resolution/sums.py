@@ -15,15 +15,14 @@ from typing import TypeAlias
 
 import numpy as np
 
-from photonpano import BoolArray, Capture, FloatArray, FluxImage, FrameSpan, Homography, Source, Trajectory, capture_of
+from photonpano import BoolArray, Capture, FloatArray, FluxImage, Homography, Source, capture_of
 from photonpano.compiling import compiled
 from photonpano.geometry import Canvas, corners, transform_points
-from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
+from photonpano.merging import Chunk, LightTerms, LitFrames, divided
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 
 _BATCH = 16  # chunks that are summed before they are added to the grid
 _PART_ROWS = 64  # approximate number of rows of the grid that a thread adds to at a time
-_MANY_PIECES = 64  # a span is divided into at least this many chunks, if it has the frames: some of them are held out
 _Summed: TypeAlias = tuple[FluxImage, FluxImage, BoolArray]  # see `_summed`
 
 _UP = 0.5 + 1e-6  # a centre on the border of two cells belongs to the second one, whatever the rounding of its coordinates
@@ -41,18 +40,6 @@ class PhotonSums:
         """Return some rows and columns."""
         lit, seen = (np.ascontiguousarray(each[box]) for each in (self.lit, self.seen))
         return PhotonSums(lit, seen, None if self.light is None else self.light.part(box))
-
-
-def pieces_of(span: FrameSpan, trajectory: Trajectory, frame_shape: tuple[int, int], tolerance_px: float) -> list[Chunk]:
-    """Divide a span as `chunks_of` does; long chunks, of a camera that hardly moves, are divided further."""
-    longest = max(1, len(span) // _MANY_PIECES)
-    pieces = []
-    for chunk in chunks_of(span, trajectory, frame_shape, tolerance_px):
-        if len(chunk.span) <= longest:
-            pieces.append(chunk)
-        else:
-            pieces += [Chunk(part, chunk.homography) for part in chunk.span.blocks(longest)]
-    return pieces
 
 
 def visible(chunks: Sequence[Chunk], canvas: Canvas, frame_shape: tuple[int, int]) -> list[Chunk]:

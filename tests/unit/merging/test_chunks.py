@@ -29,6 +29,11 @@ def test_chunks_of_splits_pan_where_it_moved_by_tolerance(pan: Callable) -> None
     assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 7), pan(3), SHAPE, 0.25)] == [1] * 7
 
 
+def test_chunks_of_cuts_at_instants_inside_the_span(pan: Callable) -> None:
+    chunks = chunks_of(FrameSpan(10, 20), pan(0), SHAPE, 0.5, [3.0, 10.0, 12.5, 17.0, 20.0, 31.0])
+    assert [chunk.span for chunk in chunks] == [FrameSpan(10, 13), FrameSpan(13, 17), FrameSpan(17, 20)]
+
+
 @pytest.mark.parametrize("zoom", [0.5, 2.0])
 def test_chunks_of_measures_tolerance_in_frame_pixels(known_motion: type, zoom: float) -> None:
     """The number of chunks does not depend on the scale of the reference plane."""
