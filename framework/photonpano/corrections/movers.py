@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from photonpano.capture import before, capture_of
-from photonpano.contracts.protocols import Source, Trajectory
+from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.corrections.lighting.finding import speed_px
 from photonpano.corrections.lighting.gains import scene_canvas
 from photonpano.errors import InputError
@@ -171,7 +172,7 @@ def _seen(source: Source, trajectory: Trajectory, span: FrameSpan, context: Cont
     centres = np.linspace(span.start + length / 2, span.stop - length / 2, min(_INSTANTS, len(span) // length))
     spans = [FrameSpan(start, start + length) for start in (centres - length / 2).astype(int).tolist()]
     motions = trajectory.at([each.centre for each in spans])
-    fine = scene_canvas(trajectory, motions, source.info.frame_shape, 2 / CELL_PX)
+    fine = scene_canvas(camera_of_motion(trajectory), motions, source.info.frame_shape, 2 / CELL_PX)
     canvas = fine.part(0, 0, fine.height // 2 * 2, fine.width // 2 * 2)
     summed = partial(_brightness, source, canvas)
     root, std = (
@@ -274,18 +275,23 @@ def _beyond_borders(hidden: BoolArray, known: BoolArray) -> BoolArray:
 
 def _in_frames(source: Source, seen: _Seen, hidden: BoolArray) -> BoolArray:
     """Return the cells of the frames that hidden squares cover: (S, h', w')."""
+    cells = []
+    for image, places in zip(hidden, places_of_cells(source, seen.canvas, seen.motions), strict=True):
+        x, y = np.moveaxis(places.astype(np.float32) / 2 - np.float32(0.5), -1, 0)
+        cells.append(cv2.remap(image.view(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0)
+    return np.array(cells)
+
+
+def places_of_cells(source: Source, canvas: Canvas, motions: FloatArray) -> Iterator[FloatArray]:
+    """Yield where the middles of the cells of frames lie on a canvas, far off it where they are behind its plane: (h, w, 2)."""
     height, width = source.info.frame_shape
     rows, columns = (np.arange(0, side, CELL_PX) + (CELL_PX - 1) / 2 for side in (height, width))
     middles = np.stack(np.meshgrid(np.minimum(columns, width - 1), np.minimum(rows, height - 1)), axis=-1)
     camera = capture_of(source).camera
     ideal = middles if camera is None else camera.ideal(middles)
     ideal = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=-1)
-    cells = np.zeros((len(hidden), *ideal.shape[:2]), bool)
-    for index, (image, motion) in enumerate(zip(hidden, seen.motions, strict=True)):
-        places = seen.canvas.pixels(ideal @ (seen.canvas.plane_to_rays @ motion).T)
-        x, y = np.moveaxis(np.nan_to_num(places, nan=-1e6).astype(np.float32) / 2 - np.float32(0.5), -1, 0)
-        cells[index] = cv2.remap(image.view(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
-    return cells
+    for motion in motions:
+        yield np.nan_to_num(canvas.pixels(ideal @ (canvas.plane_to_rays @ motion).T), nan=-1e6)
 
 
 def write_background(folder: Path, background: Background) -> None:

@@ -12,12 +12,13 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Exporter, Renderer, Source, Trajectory, camera_of, light_of
 from photonpano.contracts.results import FILES, require_panorama
 from photonpano.contracts.rules import BrokenContract, attributing
 from photonpano.corrections import Vignette, write_vignette
 from photonpano.corrections.lighting import write_light
+from photonpano.corrections.moments import showing
 from photonpano.corrections.movers import write_background
 from photonpano.errors import ExtentError, InputError, OutputError, ProjectionError
 from photonpano.execution.context import Context
@@ -49,10 +50,8 @@ def render_into(
 
     `source` is divided by the vignette and in its light. Returns the panorama, and the decisions of renderer and exporters.
     """
-    decisions: list[Decision] = []
     background = capture_of(source).background
-    if background is not None:
-        source = before(source, background.complete if plan.render.movers == "hide" else None)
+    source, decisions = showing(source, motion.trajectory, motion.camera, plan.render.movers)
     renderer = build_renderer(plan, source, decisions, context.in_order)
     exporters = build_exporters(plan, source, decisions)
     with naming_key_of_canvas(plan):

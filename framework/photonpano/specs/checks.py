@@ -19,7 +19,7 @@ MAX_COMPLAINTS = 100  # of one component that are reported
 
 
 def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
-    """Check a plan against its capture: all stages, refiners and the renderer, and the reference frame.
+    """Check a plan against its capture: all stages, refiners and the renderer, and the frames of the panorama.
 
     Reads no data. What levels share is reported once, and each problem at its place in the spec.
     """
@@ -31,10 +31,11 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
         for sentence in complaints(choice, info):
             found.setdefault((choice.contribution.name, sentence), choice.place.problem(sentence))
     problems = list(found.values())
-    reference = plan.render.reference
-    if isinstance(reference, int) and reference >= info.n_frames:
-        message = f"expected a frame of the capture, 0 to {info.n_frames - 1}, got {reference}"
-        problems.append(plan.place("render.reference").problem(message))
+    for key in ("reference", "movers"):
+        frame = getattr(plan.render, key)
+        if isinstance(frame, int) and frame >= info.n_frames:
+            message = f"expected a frame of the capture, 0 to {info.n_frames - 1}, got {frame}"
+            problems.append(plan.place(f"render.{key}").problem(message))
     return problems
 
 

@@ -117,10 +117,11 @@ class RenderSettings(Config):
         description="where the horizon of a cylinder or a sphere lies: in the middle of the reference camera's view, as it was "
         "held, or level along the whole motion",
     )
-    movers: Literal["hide", "show"] = Field(
+    movers: Literal["hide", "show", "action"] | Annotated[int, Field(ge=0)] = Field(
         "hide",
         description="what hides the background for a time, since it moves by itself or is near: hide leaves it out of the "
-        "panorama, as far as the background was ever seen, and show merges all photons",
+        "panorama, as far as the background was ever seen, and show merges all photons; action shows it several times along "
+        "its way, and a frame index as it was at that frame",
     )
     tolerance_px: float = Field(
         0.125,

@@ -43,11 +43,6 @@ class Background:
         height, width = self.frame_shape
         return cells.view(np.uint8).repeat(CELL_PX, axis=0)[:height].repeat(CELL_PX, axis=1)[:, :width]
 
-    @property
-    def complete(self) -> Background:
-        """What is shown in a panorama, which is to have no holes."""
-        return replace(self, shown=self.filled)
-
     def without(self, other: Background) -> Background:
         """Return what both show of the background."""
         nearest = np.abs(self.instants[:, None] - other.instants).argmin(axis=1)

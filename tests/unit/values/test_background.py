@@ -33,7 +33,6 @@ def test_pixels_are_those_of_cells_of_8_px_and_the_last_ones_are_cut_off() -> No
     assert background.pixels(FrameSpan(40, 50)) is None
 
 
-def test_parts_keep_their_instants_and_the_panorama_shows_what_is_filled() -> None:
+def test_parts_keep_their_instants() -> None:
     background = hidden_at((1, 0, 2))
     assert not background.part(FrameSpan(15, 50)).cells(FrameSpan(5, 6))[0, 2]
-    assert background.complete.pixels(FrameSpan(20, 21)) is None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.execution.context import Context
-from photonpano.geometry import Canvas, canvas_around, canvas_of, covered_by, depths
+from photonpano.geometry import Camera, Canvas, canvas_around, canvas_of, covered_by, depths
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.accumulate import weights_of
 from photonpano.robust import huber_weights, robust_std
@@ -91,15 +91,16 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
     shape = source.info.frame_shape
     spans = capture_of(source).shown(spans)
     motions = trajectory.at([span.centre for span in spans])
-    if camera_of_motion(trajectory) is None:
+    camera = camera_of_motion(trajectory)
+    if camera is None:
         # A first motion may be wrong somewhere. Frames far to the side of the plane would need a canvas without end.
         near = depths(motions, shape).min(axis=1) > _LEAST_DEPTH
         spans, motions = [span for span, is_near in zip(spans, near, strict=True) if is_near], motions[near]
     half = int(np.clip(min(shape) // _CELLS, 2, _LARGEST_PX)) // 2
-    canvas = scene_canvas(trajectory, motions, shape, 1 / half)
+    canvas = scene_canvas(camera, motions, shape, 1 / half)
     while canvas.height * canvas.width > 4 * _MOST_CELLS:
         half *= 2
-        canvas = scene_canvas(trajectory, motions, shape, 1 / half)
+        canvas = scene_canvas(camera, motions, shape, 1 / half)
     n_rows, n_columns = canvas.height // 2, canvas.width // 2
     covered = _COVERED * _least_weight(source, 2 * half)
 
@@ -150,9 +151,8 @@ def _seen(
     return index, np.asarray(np.maximum(flux, 0) * exposure, np.float64), exposure.astype(np.float64)
 
 
-def scene_canvas(trajectory: Trajectory, motions: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
-    """Return a canvas that holds all frames: a sphere if the camera turns far."""
-    camera = camera_of_motion(trajectory)
+def scene_canvas(camera: Camera | None, motions: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
+    """Return a canvas that holds all frames: a sphere if the camera, None unless it turns, turns far."""
     if camera is not None:
         covered = covered_by(camera.rotations(motions), camera, frame_shape)
         if covered.field_of_view > _WIDEST:
