@@ -14,6 +14,8 @@ import typer
 from photonpano.api.command import command
 from photonpano.api.opened_run import OpenedRun, opened_run
 from photonpano.api.render import require_harmless, require_same_plane
+from photonpano.capture import before
+from photonpano.corrections.moments import showing
 from photonpano.errors import InputError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
@@ -177,7 +179,8 @@ def _exposures(span: FrameSpan, n_frames: int, step: float) -> list[FrameSpan]:
 
 
 def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> Film:
-    plan, source, motion, recorded = opened.plan, opened.source, opened.motion, opened.record["panorama"]
+    plan, motion, recorded = opened.plan, opened.motion, opened.record["panorama"]
+    source = before(opened.source, None)  # what moves is shown, wherever it is
     if recorded is None:
         raise InputError(f"{opened.folder}: the run made no panorama, and a video is as bright as that")
     if view == "panorama":
@@ -192,6 +195,7 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
             f"{byte_size(memory)} of run.memory; lower render.scale, or choose a part with render.extent"
         )
     tolerance_px = plan.render.tolerance_px
+    still, _ = showing(opened.source, motion.trajectory, motion.camera, plan.render.movers)
     brighter = plan.render.exposure_stops - opened.record["spec"]["render"]["exposure_stops"]
     return Film(
         source,
@@ -201,7 +205,7 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
         smooth_frames if view == "smooth" else None,
         recorded["white_flux"] / 2**brighter,
         plan.render.white_balance,
-        merged(source, motion, motion.span, canvas, tolerance_px, thread_count(plan.run.threads)) if trail else None,
+        merged(still, motion, motion.span, canvas, tolerance_px, thread_count(plan.run.threads)) if trail else None,
     )
 
 
