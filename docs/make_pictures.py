@@ -16,12 +16,13 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "benchmarks"))
 from harness import IMAGES, Study, chosen, command
 from picture_parts import encoded
-from pictures import scan, scenes, street, tremor
+from pictures import movers, scan, scenes, street, tremor
 
 PICTURES = {
     "readme levels interpolation": street.pictures,
     "first-panorama baselines hot-pixels": scan.pictures,
     "tremor video": tremor.pictures,
+    "what-moves action-shot": movers.pictures,
     "night depth": scenes.pictures,
     "room": scenes.room,
     "mandrill": scan.mandrill,
