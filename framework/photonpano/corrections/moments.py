@@ -21,6 +21,7 @@ _SIZES = 1.6  # largest ratio of the size of a mover that is shown several times
 _BORDER = 2.0  # largest square of the length of its cut by the border of a frame, in areas
 _APART = np.ones((13, 13), np.uint8)  # half cells around a mover that is shown several times, without others
 _BESIDE = np.ones((5, 5), np.uint8)  # half cells that a cell covers, and those beside it
+_BORDERS = np.ones((7, 7), np.uint8)  # that, and the half cells at the borders of frames, which others may not see
 _MOVED, _LONGEST = 0.03, 8  # share of a mover that leaves its place while it is shown, and most instants, to either side
 
 
@@ -67,9 +68,8 @@ class _Scene:
             stays.append(float(np.mean([self.painted(each, hidden[each])[image > 0] for each in both])))
         # A frame shows what both instants next to it show, so that no frame would be left of a single instant.
         reach = int(np.clip(_MOVED * (_LONGEST - 1) / max(stays[0] - stays[1], 1e-6), 1, _LONGEST))
-        inner = np.pad(np.ones(np.subtract(cells.shape, 2), bool), 1)
         for each in range(max(instant - reach, 0), min(instant + reach + 1, len(hidden))):
-            image = image & self.painted(each, inner)
+            image &= cv2.erode(self.painted(each, np.ones_like(cells)), _BORDERS).astype(np.uint8)
         return reach, image
 
 
