@@ -23,6 +23,8 @@ from photonpano.motion.tracking import StartingMotion, starting_motion
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.values import FloatArray, Group
 
+_SHRINKS = 0.75  # change of the motion by a level, over that by the level before, from which on it no longer converges
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelResult:
@@ -47,6 +49,15 @@ class LevelResult:
         return self.change_px is not None and self.change_px <= self.uncertainty.mean_px
 
 
+def converges(results: Sequence[LevelResult]) -> bool:
+    """Return whether another level may gain: the last one changed the motion by more than its error, and less than before.
+
+    What changes hardly less from level to level is faster than the groups, as a tremor, which refiners correct.
+    """
+    last, before = results[-1], results[-2].change_px if len(results) > 1 else None
+    return not last.converged and (before is None or last.change_px is None or last.change_px < _SHRINKS * before)
+
+
 def estimate_motion(
     source: Source,
     levels: Sequence[Level],
@@ -65,8 +76,8 @@ def estimate_motion(
     it; the description is kept until the last pair of the exposure is registered. Memory therefore does not grow with the
     number of groups. An exposure that a fallback locator or a loop closure needs is merged again.
 
-    The homography of the frame `reference` is the identity. With `until_converged`, the loop ends as soon as a level changes
-    the motion by no more than its expected error. `previous` is the motion known so far, which each level replaces; one that
+    The homography of the frame `reference` is the identity. With `until_converged`, the loop ends as soon as another level
+    would gain nothing: see `converges`. `previous` is the motion known so far, which each level replaces; one that
     `corrects` keeps its tremor. Without a timeline, no frame is missing or repeated.
 
     Raises:
@@ -91,7 +102,7 @@ def estimate_motion(
         context.on_level(results[-1])
         previous = trajectory
         # A level at half size only prepares for one at full size.
-        if until_converged and results[-1].converged and level.scale == levels[-1].scale:
+        if until_converged and level.scale == levels[-1].scale and not converges(results):
             break
     return results
 

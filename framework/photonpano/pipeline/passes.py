@@ -24,6 +24,7 @@ from photonpano.corrections.movers import find_background, without_layers
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import Camera, lenses_apart_px
 from photonpano.motion.diagnosis import UntiedError
+from photonpano.motion.loop import converges
 from photonpano.motion.model import SAME_LENS_PX
 from photonpano.motion.timeline import Cut
 from photonpano.pipeline.components import build_levels
@@ -202,6 +203,8 @@ def later_levels(state: State, journal: list[Decision]) -> Proposal:
             return located.located(left, state.trajectory)
         for level in left:
             located = tried(located.located([level], located.trajectory), without_movers).state
+            if located.plan.until_converged and level.scale == levels[-1].scale and not converges(located.results):
+                break
         return located
 
     return Proposal(make, worse=None)

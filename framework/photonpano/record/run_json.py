@@ -15,7 +15,7 @@ import numpy as np
 from photonpano.errors import InputError
 from photonpano.geometry import Camera
 from photonpano.merging.panorama import RenderedPanorama
-from photonpano.motion.loop import LevelResult
+from photonpano.motion.loop import LevelResult, converges
 from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
 from photonpano.record.fingerprint import CaptureRecord
 from photonpano.record.run_warnings import left_out_warnings, level_warnings, motion_warnings, refinement_warnings
@@ -249,7 +249,7 @@ def levels_decision(results: Sequence[LevelResult]) -> Decision:
     if last.change_px is None or not np.isfinite(last.uncertainty.mean_px):
         reason = "a single exposure has no motion"
     else:
-        compared = "less" if last.converged else "still more"
+        compared = "less" if last.converged else "still more" if converges(results) else "hardly less than before, but more"
         reason = (
             f"the last level changed the motion by {last.change_px:.2g} px, {compared} than its expected error of "
             f"{last.uncertainty.mean_px:.2g} px"

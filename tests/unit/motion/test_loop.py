@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from photonpano.contracts.loop import AttributedTrajectory
 from photonpano.execution.context import Context, Quiet
 from photonpano.geometry import from_parameters, inverse, normalised, translation
 from photonpano.motion.level import Level
-from photonpano.motion.loop import LevelResult, ReferencedTrajectory, estimate_motion
+from photonpano.motion.loop import LevelResult, ReferencedTrajectory, converges, estimate_motion
 from photonpano.motion.timeline import Cut, Timeline
 from photonpano.specs.settings import GraphSettings
 
@@ -106,6 +107,18 @@ def test_estimate_motion_stops_on_convergence_only_if_asked_and_notes_a_line_for
         "level 1: 12 of 12 exposures located",
         "level 2: 23 of 23 exposures located, the motion changed by 0.00 px",
     ]
+
+
+@pytest.mark.parametrize(
+    ("changes_px", "expected"),
+    [((None,), True), ((None, 1.0), True), ((None, 1.0, 0.5), True), ((None, 1.0, 0.9), False), ((None, 0.1), False)],
+)
+def test_the_motion_converges_while_changes_shrink_and_exceed_their_error(
+    changes_px: tuple[float | None, ...], *, expected: bool
+) -> None:
+    """As with a tremor, whose changes do not shrink; the expected error is 0.2 px."""
+    results = [Mock(change_px=each, converged=each is not None and each < 0.2) for each in changes_px]
+    assert converges(results) is expected
 
 
 def raising(error: BaseException) -> Callable[..., Any]:
