@@ -20,7 +20,7 @@ from photonpano.motion.evidence import Evidence
 from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
 from photonpano.motion.level import FrameHomography, Level, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
-from photonpano.motion.pairs import instants_of, pairs_of
+from photonpano.motion.pairs import alike, instants_of, pairs_of
 from photonpano.motion.registration import Registrar
 from photonpano.motion.tracking import StartingMotion
 from photonpano.text import listed
@@ -94,7 +94,9 @@ def locate(
         PluginError: a locator failed, or broke its contract.
     """
     level, groups, shape = exposures.level, exposures.groups, exposures.frame_shape
-    pairs = pairs_of(groups, graph.skips)
+    pairs, previous = pairs_of(groups, graph.skips), exposures.previous
+    if previous is not None:
+        pairs = alike(pairs, previous.at(instants_of(groups)), shape)
     given = groups, pairs, exposures.previous_homographies(), exposures.timeline, camera_of(exposures.source)
     log = context.checkpoints.log(f"level-{level.number}", *given)
     with thread_pool(context.threads) as pool:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from photonpano.geometry import inverse, why_implausible
 from photonpano.values import FloatArray, FrameSpan, Group
 
 
@@ -44,6 +45,13 @@ def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int,
         if labels[later] != labels[later - 1] or not shared_share(groups[later].span, groups[later - 1].span)
     }
     return sorted(pairs)
+
+
+def alike(pairs: Sequence[tuple[int, int]], to_plane: FloatArray, shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Leave out the pairs that see too little alike by the motion known so far, (N, 3, 3), if others tie their exposures."""
+    seen = [pair for pair in pairs if not why_implausible(inverse(to_plane[pair[1]]) @ to_plane[pair[0]], shape)]
+    labels = component_labels(len(to_plane), np.array(seen, dtype=int).reshape(-1, 2))
+    return seen if labels.max() == component_labels(len(to_plane), np.array(pairs, dtype=int)).max() else list(pairs)
 
 
 def shared_share(first: FrameSpan, second: FrameSpan) -> float:

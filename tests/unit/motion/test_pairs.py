@@ -16,7 +16,7 @@ from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.geometry import inverse, rescaling, translation
 from photonpano.motion.closures import _PROMINENCE, _visits, closure_candidates, exposure_similarity
 from photonpano.motion.graph import GraphSolution
-from photonpano.motion.pairs import pairs_of, shared_share
+from photonpano.motion.pairs import alike, pairs_of, shared_share
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import photographed
 from photonpano.testing.scenes import seen_along
@@ -360,3 +360,10 @@ def test_visits_equal_the_prominent_peaks_of_scipy(seed: int) -> None:
         overlap = np.round(overlap * 8) / 8
     expected, _ = find_peaks(np.concatenate([[0.0], overlap, [1.0]]), height=0.5, prominence=_PROMINENCE)
     np.testing.assert_array_equal(_visits(overlap, 0.5), expected - 1)
+
+
+def test_pairs_that_see_too_little_alike_are_left_out_unless_exposures_would_lose_their_only_ones() -> None:
+    """Frames are 100 px wide; the fourth exposure lies beyond the reach of all others."""
+    to_plane = np.array([translation(x, 0) for x in (0, 30, 95, 300)])
+    assert alike([(1, 0), (2, 0), (2, 1)], to_plane[:3], (60, 101)) == [(1, 0), (2, 1)]
+    assert alike([(1, 0), (2, 1), (3, 2)], to_plane, (60, 101)) == [(1, 0), (2, 1), (3, 2)]

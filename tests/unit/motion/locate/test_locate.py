@@ -180,15 +180,14 @@ def test_fallback_without_hypotheses_gets_no_start_at_the_first_level(
     assert fallback.initials == [None]
 
 
-def test_pair_that_does_not_overlap_by_the_motion_known_so_far_is_not_registered(
+def test_pair_that_does_not_overlap_by_the_motion_known_so_far_is_no_pair(
     run: Callable, make_level: Callable, pan: Callable
 ) -> None:
     """Frames of 60 px move by 30 px per group, so that the second neighbour is out of sight."""
     made = make_level(pan(3.0))
     found = run(made, pan(3.0), GraphSettings(skips=(1.0, 2.0)))
     assert len(made.locators[0].component.initials) == 11
-    reasons = {edge.motion.reason for edge in found.failures}
-    assert reasons == {"by the motion known so far, the images overlap by 0% (at least 10% is needed)"}
+    assert len(found.edges) == 11
 
 
 @pytest.mark.parametrize("hypothesis", ["left", np.eye(2), translation(np.nan, 0)], ids=["text", "shape", "NaN"])
