@@ -268,7 +268,12 @@ def cut_at_jumps(state: State) -> Proposal | None:
     def make(cuts: Sequence[Cut] = cuts) -> State | None:
         levels = build_levels(state.plan, state.source, [])
         try:
-            cut = replace(state, timeline=state.timeline.cut_at(cuts), levels=levels).located(levels, state.start)
+            # What hides the background was looked for along a motion without cuts.
+            uncut = replace(state, source=before(state.source, None), watched=False, levels=levels)
+            first = replace(uncut, timeline=state.timeline.cut_at(cuts)).located(levels[:1], state.start)
+            cut = later_levels(tried(first, without_movers).state, []).make()
+            assert cut is not None
+            cut = tried(cut, again_without_movers).state
         except UntiedError as error:
             if shots := shots_of(state.source, error):
                 raise ApartError(shots) from error
