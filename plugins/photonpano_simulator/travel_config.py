@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from photonpano import Config, SpecPath
-from photonpano_simulator.config import Sensor
+from photonpano_simulator.config import Distortion, Sensor
 from photonpano_simulator.path_config import Shake
 from photonpano_simulator.recording import Drift, Drops, FrameCount, FrameRate, FrameShape, Repeats
 
@@ -139,6 +139,7 @@ class TravelConfig(Config):
     centre_px: tuple[float, float] | None = Field(
         None, description="(x, y) of the principal point, in px; by default the middle of the frame"
     )
+    distortion: Distortion = Field(Distortion(), description="distortion of the lens by OpenCV's model")
     drops: Drops = ()
     repeats: Repeats = ()
     seed: int | None = Field(None, ge=0, description="seed of photons, pixels and tremor; by default the seed of the run")

@@ -174,7 +174,7 @@ def travelled(seed: int, depth_m: float, flux: float = 0.3, kind: str = "planes"
     source = TravelSource(config, SourceContext())
     truth = truth_of(source.truth())
     poses, middle = truth.camera_from_world, n_frames // 2
-    from_plane = truth.camera_matrix @ np.stack([poses[:, :, 0], poses[:, :, 1], depth_m * poses[:, :, 2] + poses[:, :, 3]], -1)
+    from_plane = truth.camera.matrix @ np.stack([poses[:, :, 0], poses[:, :, 1], depth_m * poses[:, :, 2] + poses[:, :, 3]], -1)
     homographies = from_plane[0] @ inverse(from_plane)
     homographies /= homographies[:, 2:, 2:]
     pixels = np.stack(np.meshgrid(*map(np.arange, SHAPE[::-1])), axis=-1).astype(float)

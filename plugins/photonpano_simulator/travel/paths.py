@@ -22,11 +22,11 @@ _GRID = 9  # points along each side of such a frame
 _REACH = (1.0, 0.45, 0.6)  # how far a random path reaches along x, y and z, relative to each other
 
 
-def matrix_of(config: TravelConfig) -> FloatArray:
-    """Return K, (3, 3)."""
+def camera_of(config: TravelConfig) -> Camera:
+    """Return the camera."""
     if config.centre_px is None:
-        return Camera.of(config.focal_px, config.frame_shape).matrix
-    return camera_matrix(config.focal_px, config.centre_px)
+        return Camera.of(config.focal_px, config.frame_shape, config.distortion.coefficients)
+    return Camera(camera_matrix(config.focal_px, config.centre_px), np.array(config.distortion.coefficients))
 
 
 def poses_of(config: TravelConfig, middle: FloatArray, seed: int) -> FloatArray:
@@ -58,7 +58,7 @@ def centres(poses: FloatArray) -> FloatArray:
     return np.asarray(-np.swapaxes(poses[:, :, :3], 1, 2) @ poses[:, :, 3:])[:, :, 0]
 
 
-def require_free(poses: FloatArray, matrix: FloatArray, frame_shape: tuple[int, int], planes: Planes, room: FloatArray) -> None:
+def require_free(poses: FloatArray, camera: Camera, frame_shape: tuple[int, int], planes: Planes, room: FloatArray) -> None:
     """Require that the camera stays in the scene, passes through no surface that rests, and sees nothing but the scene.
 
     `room` (2, 3) are the smallest and the largest coordinates that the camera may have, in m.
@@ -82,9 +82,9 @@ def require_free(poses: FloatArray, matrix: FloatArray, frame_shape: tuple[int, 
         )
     height, width = frame_shape
     grid = np.stack(np.meshgrid(np.linspace(0, width - 1, _GRID), np.linspace(0, height - 1, _GRID)), axis=-1).reshape(-1, 2)
-    owner, inverse_depth = np.empty(len(grid), np.int32), np.empty(len(grid))
+    ideal, owner, inverse_depth = camera.ideal(grid), np.empty(len(grid), np.int32), np.empty(len(grid))
     for frame in np.unique(np.linspace(0, last, min(len(poses), _LOOKED)).astype(int)):
-        trace(grid, planes.maps(poses[frame], matrix, 0.0), planes.radii, owner, inverse_depth)
+        trace(ideal, planes.maps(poses[frame], camera.matrix, 0.0), planes.radii, owner, inverse_depth)
         if (owner < 0).any():
             x, y = grid[owner < 0][0]
             raise InputError(

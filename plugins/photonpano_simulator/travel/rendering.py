@@ -15,8 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import FloatArray
+from photonpano import FloatArray, InputError
 from photonpano.compiling import compiled
+from photonpano.geometry import Camera
+from photonpano_simulator.lens import pixel_grid
 from photonpano_simulator.travel.planes import Planes
 
 _PARTS = 4  # parts of a pixel along each axis, for the edges of planes
@@ -24,6 +26,7 @@ _SAMPLES = 16  # samples of a texture along the longer axis of the area of a pix
 _LEVELS = 16  # levels of a texture, at most: each has half the size of the one before
 _STRETCH = 0.3  # largest aspect ratio of the area of a sample, less 1
 _BLOCK = 16  # pixels of a row that share the level and the steps of their samples
+_FINER = 2  # pixels of the image that a lens distorts, along a pixel of the frame
 _SMALLEST = 1e-9  # inverse depth of the furthest point that is seen, in 1 / m
 
 
@@ -73,6 +76,37 @@ class View:
         rows = self.planes.rows(pose, self.matrix, frame, self.frame_shape[0])
         _render(maps, rows, self.planes.radii, self.atlas, image)
         return image
+
+
+class LensView:
+    """Renders the frames of a camera whose lens distorts: finer pixels without a lens, interpolated, and averaged."""
+
+    def __init__(self, planes: Planes, atlas: Atlas, camera: Camera, frame_shape: tuple[int, int]) -> None:
+        height, width = frame_shape
+        parts = (pixel_grid((_FINER * height, _FINER * width)) + 0.5) / _FINER - 0.5
+        ideal = camera.ideal(parts)
+        if np.isnan(ideal).any():
+            raise InputError(
+                f"distortion folds the image of {width}x{height} px at the focal length of {camera.focal_px:g} px, so that "
+                "nothing is imaged at its border; take smaller coefficients"
+            )
+        low, high = (np.floor(each(ideal, axis=(0, 1))) for each in (np.min, np.max))
+        self._x, self._y = np.moveaxis((_FINER * (ideal - low)).astype(np.float32), -1, 0)
+        columns, rows = (_FINER * (high - low) + _FINER + 1).astype(int).tolist()
+        to_fine = np.array([[_FINER, 0, -_FINER * low[0]], [0, _FINER, -_FINER * low[1]], [0, 0, 1]])
+        self._fine, self._size = View(planes, atlas, to_fine @ camera.matrix, (rows, columns)), (width, height)
+
+    def flux(self, pose: FloatArray, frame: float) -> NDArray[np.float32]:
+        """Return the flux in a frame, as `View` does."""
+        parts = cv2.remap(self._fine.flux(pose, frame), self._x, self._y, cv2.INTER_LINEAR)
+        return np.asarray(cv2.resize(parts, self._size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def view_of(planes: Planes, atlas: Atlas, camera: Camera, frame_shape: tuple[int, int]) -> View | LensView:
+    """Return what renders the frames of a camera; raises an `InputError` if the lens folds their image."""
+    if camera.distorts:
+        return LensView(planes, atlas, camera, frame_shape)
+    return View(planes, atlas, camera.matrix, frame_shape)
 
 
 @compiled

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from photonpano import FloatArray, SourceContext
 from photonpano_simulator.source import SimulatedSource
-from photonpano_simulator.travel.paths import matrix_of, poses_of, require_free
-from photonpano_simulator.travel.rendering import View, atlas_of
+from photonpano_simulator.travel.paths import camera_of, poses_of, require_free
+from photonpano_simulator.travel.rendering import atlas_of, view_of
 from photonpano_simulator.travel.stage import Stage, with_objects
 from photonpano_simulator.travel.truth import TravelTruth, sharp_view
 from photonpano_simulator.travel_config import TravelConfig
@@ -21,18 +21,18 @@ class TravelSource(SimulatedSource):
 
     def __init__(self, config: TravelConfig, context: SourceContext) -> None:
         super().__init__(config, context)
-        (stage, poses), matrix = placed(config, self._seed), matrix_of(config)
+        (stage, poses), camera = placed(config, self._seed), camera_of(config)
         scene = stage.drawn(context.threads)
-        metered = View(scene.planes, atlas_of(scene.textures), matrix, config.frame_shape)
+        metered = view_of(scene.planes, atlas_of(scene.textures), camera, config.frame_shape)
         frames = np.linspace(0, len(poses) - 1, _METERED).astype(int)
         mean = float(np.mean([metered.flux(poses[frame], frame) for frame in frames]))
         self._truth = TravelTruth(
             poses[self._taken],
-            matrix,
+            camera,
             config.frame_shape,
             self._taken,
             self._light[self._taken],
-            with_objects(scene, config.objects, poses[0], matrix, config.frame_shape, mean),
+            with_objects(scene, config.objects, poses[0], camera.matrix, config.frame_shape, mean),
             config.flux * config.sensor.quantum_efficiency / mean,
         )
         self._order = np.argsort(self._taken, kind="stable")
@@ -63,5 +63,5 @@ def placed(config: TravelConfig, seed: int) -> tuple[Stage, FloatArray]:
     """Place the scene and the poses of all frames, (T, 3, 4); raises an `InputError` if they do not suit each other."""
     stage = Stage(config)
     poses = poses_of(config, stage.middle, seed)
-    require_free(poses, matrix_of(config), config.frame_shape, stage.planes, stage.free)
+    require_free(poses, camera_of(config), config.frame_shape, stage.planes, stage.free)
     return stage, poses

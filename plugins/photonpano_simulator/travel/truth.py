@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FloatArray, InputError
+from photonpano.geometry import Camera
 from photonpano.reading import read_arrays
 from photonpano_simulator.lens import pixel_grid
 from photonpano_simulator.travel.planes import Planes, Scene, trace
-from photonpano_simulator.travel.rendering import View, atlas_of
+from photonpano_simulator.travel.rendering import LensView, View, atlas_of, view_of
 
 # Names of arrays in a truth file: the fields of `Planes`, and the others.
 _PLANES = {
@@ -31,6 +32,7 @@ _PLANES = {
     "plane_is_disc": "is_disc",
 }
 _ARRAYS = ["camera_from_world", "camera_matrix", "frame_shape", "taken", "light", "textures", "texture_shapes", "texture_flux"]
+_UNFOLDED_PX = 1e-3
 _SAME = 1e-6  # relative difference below which two inverse depths are of the same point
 
 
@@ -39,7 +41,7 @@ class TravelTruth:
     """The truth of a capture of a scene with depth."""
 
     camera_from_world: FloatArray  # (T, 3, 4), the pose of each frame of the capture
-    camera_matrix: FloatArray
+    camera: Camera
     frame_shape: tuple[int, int]
     taken: NDArray[np.int64]  # (T,), when each frame was taken: its index before any were dropped or repeated
     light: FloatArray  # (T,), light of each frame, relative to the first that was taken
@@ -47,16 +49,17 @@ class TravelTruth:
     flux: float  # photons per pixel per frame that are detected where a texture is 1
 
     @cached_property
-    def view(self) -> View:
+    def view(self) -> View | LensView:
         """The renderer of frames."""
-        return View(self.scene.planes, atlas_of(self.scene.textures, self.flux), self.camera_matrix, self.frame_shape)
+        return view_of(self.scene.planes, atlas_of(self.scene.textures, self.flux), self.camera, self.frame_shape)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return the truth as arrays by name; `truth_of` is the inverse."""
         planes, textures = self.scene.planes, self.scene.textures
         return {
             "camera_from_world": self.camera_from_world,
-            "camera_matrix": self.camera_matrix,
+            "camera_matrix": self.camera.matrix,
+            **({"distortion": self.camera.distortion} if self.camera.distorts else {}),
             "frame_shape": np.array(self.frame_shape),
             "taken": self.taken,
             "light": self.light,
@@ -96,7 +99,7 @@ def truth_of(arrays: Mapping[str, NDArray[Any]], name: str = "the truth") -> Tra
     height, width = arrays["frame_shape"].tolist()
     return TravelTruth(
         arrays["camera_from_world"],
-        arrays["camera_matrix"],
+        Camera(arrays["camera_matrix"], arrays.get("distortion", np.zeros(4))),
         (height, width),
         arrays["taken"],
         arrays["light"],
@@ -107,7 +110,8 @@ def truth_of(arrays: Mapping[str, NDArray[Any]], name: str = "the truth") -> Tra
 
 def depth(truth: TravelTruth, frame: int) -> FloatArray:
     """Return the depth of what a frame shows at its pixel centres: (H, W), along the optical axis in m; inf for nothing."""
-    _, inverse_depth = _traced(truth, _require(truth, frame), pixel_grid(truth.frame_shape).reshape(-1, 2))
+    ideal = truth.camera.ideal(pixel_grid(truth.frame_shape).reshape(-1, 2))
+    _, inverse_depth = _traced(truth, _require(truth, frame), ideal)
     with np.errstate(divide="ignore"):
         return np.asarray((1 / inverse_depth).reshape(truth.frame_shape))
 
@@ -116,23 +120,27 @@ def flow(truth: TravelTruth, from_frame: int, to_frame: int) -> Flow:
     """Return where the points that a frame shows at its pixel centres are in another frame."""
     start, end = _require(truth, from_frame), _require(truth, to_frame)
     pixels = pixel_grid(truth.frame_shape).reshape(-1, 2)
-    owner, inverse_depth = _traced(truth, start, pixels)
+    ideal, matrix, planes = truth.camera.ideal(pixels), truth.camera.matrix, truth.scene.planes
+    owner, inverse_depth = _traced(truth, start, ideal)
     shown = owner >= 0
-    matrix, planes = truth.camera_matrix, truth.scene.planes
-    rays = np.concatenate([pixels[shown], np.ones((int(shown.sum()), 1))], axis=1) @ np.linalg.inv(matrix).T
+    rays = np.concatenate([ideal[shown], np.ones((int(shown.sum()), 1))], axis=1) @ np.linalg.inv(matrix).T
     first, second = truth.camera_from_world[start], truth.camera_from_world[end]
     world = (rays / inverse_depth[shown, None] - first[:, 3]) @ first[:, :3]
     world += (truth.taken[end] - truth.taken[start]) * planes.velocity[owner[shown]]
     seen = (world @ second[:, :3].T + second[:, 3]) @ matrix.T
     ahead = seen[:, 2] > 0
     there = np.full((len(pixels), 2), np.nan)
-    there[shown] = np.where(ahead[:, None], seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None], np.nan)
+    passed = np.where(ahead[:, None], seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None], np.nan)
+    there[shown] = truth.camera.distorted(passed)
     height, width = truth.frame_shape
     visible = np.asarray((there >= -0.5).all(axis=1) & (there <= (width - 0.5, height - 0.5)).all(axis=1), np.bool_)
     own = np.zeros(len(pixels))
     own[shown] = 1 / np.where(ahead, seen[:, 2], np.inf)
-    _, nearest = _traced(truth, end, there[visible])
-    visible[visible] = nearest <= own[visible] * (1 + _SAME)
+    ideal = truth.camera.ideal(there[visible])
+    _, nearest = _traced(truth, end, ideal)
+    # Beyond the radius at which a lens folds the image over, it would image points that it does not.
+    unfolded = (np.abs(ideal - passed[visible[shown]]) < _UNFOLDED_PX).all(axis=1)
+    visible[visible] = unfolded & (nearest <= own[visible] * (1 + _SAME))
     return Flow((there - pixels).reshape(height, width, 2), visible.reshape(height, width))
 
 
@@ -150,9 +158,9 @@ def _require(truth: TravelTruth, frame: int) -> int:
 
 
 def _traced(truth: TravelTruth, frame: int, points: FloatArray) -> tuple[NDArray[np.int32], FloatArray]:
-    """Return the plane that is seen at some points (N, 2) of a frame, (N,), -1 for none, and its inverse depth, (N,)."""
+    """Return the plane that is seen at some ideal pixels (N, 2) of a frame, (N,), -1 for none, and its inverse depth, (N,)."""
     planes = truth.scene.planes
-    maps = planes.maps(truth.camera_from_world[frame], truth.camera_matrix, float(truth.taken[frame]))
+    maps = planes.maps(truth.camera_from_world[frame], truth.camera.matrix, float(truth.taken[frame]))
     owner, inverse_depth = np.empty(len(points), np.int32), np.empty(len(points))
     trace(points, maps, planes.radii, owner, inverse_depth)
     return owner, inverse_depth

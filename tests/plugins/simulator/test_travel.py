@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
-from photonpano.geometry import apply, camera_matrix, corners, rotation_matrices
+from photonpano.geometry import Camera, apply, camera_matrix, corners, rotation_matrices
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
 from photonpano_simulator.paths import camera_path
@@ -50,11 +50,11 @@ def wall(width: float, height: float, distance: float, x: float = 0.0, y: float 
 def truth() -> Callable[..., TravelTruth]:
     """Return a truth of some planes with noise on them, and of some poses."""
 
-    def make(scene: Planes, *poses: np.ndarray) -> TravelTruth:
+    def make(scene: Planes, *poses: np.ndarray, distortion: tuple[float, ...] = (0, 0, 0, 0)) -> TravelTruth:
         rng = np.random.default_rng(0)
         textures = tuple(rng.random((40, 50)).astype(np.float16) for _ in range(len(scene)))
-        n = len(poses)
-        return TravelTruth(np.stack(poses), K, SHAPE, np.arange(n), np.ones(n), Scene(scene, textures), 0.5)
+        n, camera = len(poses), Camera(K, np.array(distortion))
+        return TravelTruth(np.stack(poses), camera, SHAPE, np.arange(n), np.ones(n), Scene(scene, textures), 0.5)
 
     return make
 
@@ -82,6 +82,30 @@ def test_depth_of_a_frontal_plane_is_its_distance(truth) -> None:
     assert found[:, 24:40] == pytest.approx(4.0)
     assert np.isinf(found[:, :24]).all()
     assert np.isinf(found[:, 40:]).all()
+
+
+def test_lens_images_points_as_opencv_does(truth) -> None:
+    poses, lens = (
+        (pose((0.02, -0.03, 0.05), (0.1, 0, 0)), pose((-0.05, 0.04, -0.02), (-0.1, 0.05, 0.2))),
+        (-0.2, 0.05, 0.01, -0.01),
+    )
+    made = truth_of(truth(planes(wall(40, 40, 6.0), wall(1.0, 1.0, 2.0)), *poses, distortion=lens).arrays())
+    found, far = flow(made, 0, 1), depth(made, 0)
+    for x, y in ((0, 0), (63, 47), (31, 23), (5, 40)):
+        [[[a, b]]] = cv2.undistortPoints(np.array([[[x, y]]], float), K, np.array(lens))
+        world = poses[0][:, :3].T @ (far[y, x] * np.array([a, b, 1]) - poses[0][:, 3])
+        there, _ = cv2.projectPoints(world, poses[1][:, :3], poses[1][:, 3], K, np.array(lens))
+        np.testing.assert_allclose(found.vectors[y, x] + (x, y), there.ravel(), atol=1e-3)
+
+
+def test_lens_bends_the_image(truth) -> None:
+    scene, here = planes(wall(20, 20, 4.0)), pose((0.02, -0.03, 0.05), (0.1, 0, 0))
+    straight, bent = sharp_view(truth(scene, here), 0), truth(scene, here, distortion=(0.2, 0, 0, 0))
+    ideal = bent.camera.ideal(np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), axis=-1)).astype(np.float32)
+    expected, seen = cv2.remap(straight, ideal, None, cv2.INTER_LINEAR), sharp_view(bent, 0)
+    assert np.std(seen - expected) < 0.1 * np.std(seen - straight)
+    with pytest.raises(InputError, match="distortion folds the image of 64x48 px"):
+        sharp_view(truth(scene, here, distortion=(-2, 0, 0, 0)), 0)
 
 
 def test_flow_hides_what_a_nearer_plane_covers(truth) -> None:
@@ -260,7 +284,7 @@ def test_turn_only_has_no_parallax(travelling) -> None:
     assert np.ptp(centres(made.camera_from_world), axis=0).max() < 1e-12
     first, last = made.camera_from_world[[0, -1], :, :3]
     turn = last @ first.T
-    homography = made.camera_matrix @ turn @ np.linalg.inv(made.camera_matrix)
+    homography = made.camera.matrix @ turn @ np.linalg.inv(made.camera.matrix)
     x, y, w = homography @ (30, 20, 1)
     np.testing.assert_allclose(flow(made, 0, 399).vectors[20, 30], (x / w - 30, y / w - 20), atol=1e-9)
     # To the right: what is seen goes left, by 20 degrees.
