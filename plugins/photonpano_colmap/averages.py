@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ _FEW_MATCH = 0.25
 _ANOTHER_SIZE = "choose a larger pose.with.group_size for less noise, or a smaller one for less blur"
 _FOCAL_SHARE = 0.02  # relative standard error of an estimated focal length above which poses are doubtful
 # Relative error of an estimated focal length that residuals do not show: blur shifts keypoints alike in many averages.
-_FOCAL_BIAS = 0.01
+FOCAL_BIAS = 0.01
 _PLANE = 0.01  # points lie in a plane if their smallest extent is below this fraction of the largest
 _SHOWN_PIECES = 4
 _MISSED_SHARE = 0.5  # interpolation error of the spline, as a fraction of the variance of leave-one-out errors
@@ -61,7 +61,11 @@ class AveragesEstimator:
         self._context = context
 
     def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
-        """Estimate the poses of a capture: see `photonpano.PoseEstimator`.
+        """Estimate the poses of a capture: see `photonpano.PoseEstimator`."""
+        return with_focal_judged(self.averaged(source, camera, progress), self._context)
+
+    def averaged(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
+        """Estimate the poses, without judging a focal length that was found.
 
         Raises a `LocationError` if averages show too little texture, the camera only turns or hardly travels, or poses fall
         into pieces.
@@ -76,11 +80,7 @@ class AveragesEstimator:
             found = reconstruct(images, camera, self._config, self._context.seed)
             advance(1)
         piece = self._chosen(found, spans)
-        estimate = _Assembly(source, spans, found, piece, camera).estimate()
-        if camera.focal_px is None:
-            reason = f"found with the poses, with an expected error of {estimate.std_focal_px:.2g} px; calibrate to be sure"
-            self._context.decide("focal_px", round(piece.focal_px, 2), reason)
-        return estimate
+        return _Assembly(source, spans, found, piece, camera).estimate()
 
     def _spans(self, n_frames: int) -> list[FrameSpan]:
         """Return the frames of each average."""
@@ -179,7 +179,7 @@ class _Assembly:
             views=views,
             lost=self._lost(located),
             levels=(self._level(noise),),
-            doubts=tuple(self._doubts(noise)),
+            doubts=tuple(self._doubts()),
         )
 
     def _located(self, n_frames: int) -> BoolArray:
@@ -239,16 +239,10 @@ class _Assembly:
 
     def _std_focal(self, noise: PoseNoise) -> float:
         """Return the expected error of the focal length, 0 if it was given."""
-        return math.hypot(noise.std_focal_px, _FOCAL_BIAS * self.piece.focal_px) if self.guess.focal_px is None else 0.0
+        return math.hypot(noise.std_focal_px, FOCAL_BIAS * self.piece.focal_px) if self.guess.focal_px is None else 0.0
 
-    def _doubts(self, noise: PoseNoise) -> list[str]:
+    def _doubts(self) -> list[str]:
         doubts = []
-        focal = self.piece.focal_px
-        if (std := self._std_focal(noise)) > _FOCAL_SHARE * focal:
-            doubts.append(
-                f"the focal length was found as {focal:.0f} px with an expected error of {std:.2g} px, "
-                f"{100 * std / focal:.2g} %; calibrate the camera, and give camera.focal_px"
-            )
         extents = np.linalg.svd(self.piece.points - np.median(self.piece.points, axis=0), compute_uv=False)
         if self.guess.focal_px is None and extents[2] < _PLANE * extents[0]:
             doubts.append("the points lie in a plane, from which no focal length can be found; give camera.focal_px")
@@ -258,6 +252,23 @@ class _Assembly:
                 f"only {len(self.piece.images)} of {len(self.spans)} averages have a pose; choose another pose.with.group_size"
             )
         return doubts
+
+
+def with_focal_judged(estimate: PoseEstimate, context: StageContext) -> PoseEstimate:
+    """Record a focal length that was found, and doubt it if its expected error is large."""
+    focal, std = float(estimate.camera_matrix[0, 0]), estimate.std_focal_px
+    if not std:
+        return estimate
+    context.decide(
+        "focal_px", round(focal, 2), f"found with the poses, with an expected error of {std:.2g} px; calibrate to be sure"
+    )
+    if std <= _FOCAL_SHARE * focal:
+        return estimate
+    doubt = (
+        f"the focal length was found as {focal:.0f} px with an expected error of {std:.2g} px, "
+        f"{100 * std / focal:.2g} %; calibrate the camera, and give camera.focal_px"
+    )
+    return replace(estimate, doubts=(doubt, *estimate.doubts))
 
 
 def flux_of_points(views: Sequence[PosedView], n_points: int) -> FluxImage:

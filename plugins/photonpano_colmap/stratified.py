@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -12,7 +13,6 @@ from photonpano import (
     CameraGuess,
     FloatArray,
     FluxImage,
-    LocationError,
     LostFrames,
     PosedView,
     PoseEstimate,
@@ -21,12 +21,15 @@ from photonpano import (
     Source,
     StageContext,
 )
-from photonpano_colmap.averages import AveragesEstimator, flux_of_points, relative_std
+from photonpano.geometry import Camera, camera_matrix, corners
+from photonpano_colmap.averages import FOCAL_BIAS, AveragesEstimator, flux_of_points, relative_std, with_focal_judged
 from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
 from photonpano_colmap.posing.merging import PosedExposure
 from photonpano_colmap.posing.path import Path, PoseSpline, positions_of
 
+# A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
+_CONTRADICTION, _CONTRADICTION_PX = 5.0, 0.5
 _MISSED = 0.5  # expected next pose update, as a fraction of the last one
 
 
@@ -37,14 +40,10 @@ class StratifiedEstimator:
         self._config = config
         self._context = context
 
-    def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
-        """Estimate the poses of a capture: see `photonpano.PoseEstimator`; raises a `LocationError` if the lens distorts."""
-        if any(camera.distortion):
-            raise LocationError(
-                "stratified-pose merges no frames through a lens that distorts; leave out camera.distortion, or take "
-                "pose: {use: colmap-averages}"
-            )
-        first = AveragesEstimator(self._config, self._context).estimate(source, camera, progress)
+    def estimate(self, source: Source, guess: CameraGuess, progress: Progress) -> PoseEstimate:
+        """Estimate the poses of a capture: see `photonpano.PoseEstimator`."""
+        first = AveragesEstimator(self._config, self._context).averaged(source, guess, progress)
+        camera = Camera(first.camera_matrix, first.distortion)
         instants = np.array([view.instant for view in first.views])
         spline = PoseSpline(instants, np.array([view.camera_from_world for view in first.views]))
         path = Path(spline.at(_frames(source)))
@@ -53,11 +52,12 @@ class StratifiedEstimator:
             for number in range(2, self._config.levels + 1):
                 before = scene.path.poses
                 with progress.stage(f"level {number}: merge, locate, adjust", 1, "level") as advance:
-                    level = refine(source, scene, len(first.views[0].span), first.camera_matrix, pool)
+                    level = refine(source, scene, len(first.views[0].span), camera, guess.focal_px is None, pool)
                     advance(1)
+                camera = Camera(camera_matrix(level.adjusted.focal_px, camera.centre_px), camera.distortion)
                 scene = level.scene
                 levels.append(_record(level, scene))
-        return _Assembly(source, first, level, before, tuple(levels)).estimate()
+        return with_focal_judged(_Assembly(source, camera, first, level, before, tuple(levels)).estimate(), self._context)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,13 +65,14 @@ class _Assembly:
     """Makes the estimate of all frames from the exposures of the last level."""
 
     source: Source
+    camera: Camera
     first: PoseEstimate
     level: PosedLevel
     before: FloatArray
     levels: tuple[Mapping[str, float | int | str | None], ...]
 
     def estimate(self) -> PoseEstimate:
-        level, frames = self.level, _frames(self.source)
+        level, frames, std_focal = self.level, _frames(self.source), self.level.adjusted.std_focal_px
         poses = level.path.poses.copy()
         instants = np.array([group.reference for group in level.groups])[level.is_located]
         stds = [np.interp(frames, instants, std) for std in (level.adjusted.std_position, level.adjusted.std_rotation)]
@@ -88,6 +89,8 @@ class _Assembly:
         views = self._views()
         return replace(
             self.first,
+            camera_matrix=self.camera.matrix,
+            std_focal_px=math.hypot(std_focal, FOCAL_BIAS * self.camera.focal_px) if std_focal else 0.0,
             camera_from_world=poses,
             located=located,
             std_position=std_position,
@@ -96,7 +99,22 @@ class _Assembly:
             views=views,
             lost=self._lost(),
             levels=self.levels,
+            doubts=(*self.first.doubts, *self._contradictions()),
         )
+
+    def _contradictions(self) -> list[str]:
+        """Doubt a lens that the exposures contradict."""
+        adjusted, camera = self.level.adjusted, self.camera
+        corner = camera.ideal(corners(self.source.info.frame_shape)) - camera.centre_px
+        farthest = float(np.nanmax(np.linalg.norm(corner, axis=1))) / camera.focal_px
+        moved_px = abs(adjusted.missed_k1) * farthest**3 * camera.focal_px
+        if abs(adjusted.missed_k1) < _CONTRADICTION * adjusted.std_k1 or moved_px < _CONTRADICTION_PX:
+            return []
+        return [
+            f"the exposures contradict the lens: k1 is off by about {adjusted.missed_k1:+.2g}, with a standard error of "
+            f"{adjusted.std_k1:.1g}, which moves the corners of a frame by {moved_px:.2g} px, or the focal length is wrong; "
+            "calibrate the camera, and give camera.focal_px and camera.distortion"
+        ]
 
     def _lost(self) -> tuple[LostFrames, ...]:
         reason = "too few patches of other exposures were found in theirs"
@@ -110,7 +128,7 @@ class _Assembly:
         for number, (posed, pose) in enumerate(zip(kept, level.adjusted.poses, strict=True)):
             seen = level.observations.views == number
             # A point is sought from several key exposures, but is one point of one of them: it is seen once.
-            points, pixels = level.observations.points[seen], level.observations.pixels[seen]
+            points, pixels = level.observations.points[seen], self.camera.distorted(level.observations.pixels[seen])
             group = posed.exposure.group
             views.append(PosedView(group.span, group.reference, pose, points, pixels, _flux_of(posed)))
         return tuple(views)

@@ -14,7 +14,7 @@ from photonpano.contracts.results import POSES
 from photonpano.errors import LocationError
 from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
-from photonpano.geometry import camera_matrix, rotation_matrices
+from photonpano.geometry import Camera, camera_matrix, rotation_matrices, transform_points
 from photonpano.plugins.contributions import PoseEstimatorContribution
 from photonpano.record.poses import in_standard_world
 from photonpano.testing.captures import MemorySource, ReadOnlySource
@@ -41,8 +41,10 @@ def true_poses(travels: bool = True) -> FloatArray:
 
 
 @cache
-def capture(travels: bool = True) -> MemorySource:
-    """Simulate binary frames of a scene with depth, one photon a pixel."""
+def capture(travels: bool = True, distortion: tuple[float, float, float, float] = (0, 0, 0, 0)) -> MemorySource:
+    """Simulate binary frames of a scene with depth, one photon a pixel, through a lens: k1, k2, p1, p2 as OpenCV has them."""
+    pixels = np.stack(np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0])), axis=-1)
+    ideal = Camera(_MATRIX, np.array(distortion)).ideal(pixels)
     rng = np.random.default_rng(4)
     textures = []
     for depth, (left, top, right, bottom) in _PLANES:
@@ -55,7 +57,8 @@ def capture(travels: bool = True) -> MemorySource:
             height, width = texture.shape
             to_world = np.array([[(right - left) / width, 0, left], [0, (bottom - top) / height, top], [0, 0, depth]])
             to_frame = _MATRIX @ (pose[:, :3] @ to_world + np.outer(pose[:, 3], [0, 0, 1]))
-            seen = cv2.warpPerspective(texture, to_frame, SHAPE[::-1], flags=cv2.INTER_LINEAR, borderValue=-1)
+            x, y = np.moveaxis(transform_points(np.linalg.inv(to_frame), ideal).astype(np.float32), -1, 0)
+            seen = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderValue=-1)
             flux = np.where(seen > 0, seen, flux)
         frames[frame] = rng.random(SHAPE) < -np.expm1(-flux)
     return ReadOnlySource(frames)

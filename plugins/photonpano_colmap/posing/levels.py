@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import BoolArray, FloatArray, FrameSpan, Group, LocationError, Source
+from photonpano.geometry import Camera
 from photonpano_colmap.posing.adjustment import Adjusted, Observations, adjust
 from photonpano_colmap.posing.merging import PosedExposure, inverse_depth_of, merge_through_depth
 from photonpano_colmap.posing.patches import Found, find_patches, patches_of, stabilised
@@ -71,12 +72,14 @@ class PosedLevel:
         return Scene(self.path, located, self.adjusted.points[self.adjusted.confirmed])
 
 
-def refine(source: Source, scene: Scene, group_size: int, camera_matrix: FloatArray, pool: ThreadPoolExecutor) -> PosedLevel:
+def refine(
+    source: Source, scene: Scene, group_size: int, camera: Camera, finds_focal: bool, pool: ThreadPoolExecutor
+) -> PosedLevel:
     """Locate groups (paper, section 4) that are merged and registered through the depth of the scene."""
     groups = resample(scene.located, group_size)
-    merged = merge(source, groups, scene, camera_matrix, pool)
-    points, observations = locate(merged.exposures, camera_matrix, pool)
-    return interpolate(groups, merged, points, observations, camera_matrix)
+    merged = merge(source, groups, scene, camera, pool)
+    points, observations = locate(merged.exposures, camera, pool)
+    return interpolate(groups, merged, points, observations, camera, finds_focal)
 
 
 def resample(located: BoolArray, group_size: int) -> tuple[Group, ...]:
@@ -91,24 +94,24 @@ def resample(located: BoolArray, group_size: int) -> tuple[Group, ...]:
     return tuple(groups)
 
 
-def merge(source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: FloatArray, pool: ThreadPoolExecutor) -> Merged:
+def merge(source: Source, groups: Sequence[Group], scene: Scene, camera: Camera, pool: ThreadPoolExecutor) -> Merged:
     """Merge each group as its reference instant sees it: along the path, and along the tremor that its frames show then."""
 
     def depth_of(group: Group) -> NDArray[np.float32]:
         pose, shape = scene.path.at([group.reference])[0], source.info.frame_shape
-        depth = inverse_depth_of(pose, scene.points, camera_matrix, shape)
+        depth = inverse_depth_of(pose, scene.points, camera, shape)
         if depth is None:  # a view of no use will have no observations
             seen = scene.points @ pose[2, :3] + pose[2, 3]
             depth = np.full(shape, 1 / np.median(seen[seen > 0]) if (seen > 0).any() else 0, np.float32)
         return depth
 
     def along(path: Path) -> list[PosedExposure]:
-        return list(pool.map(lambda *each: merge_through_depth(source, each[0], path, each[1], camera_matrix), groups, depths))
+        return list(pool.map(lambda *each: merge_through_depth(source, each[0], path, each[1], camera), groups, depths))
 
     path, depths = scene.path, list(pool.map(depth_of, groups))
     exposures, tremor = along(path), None
     for _ in range(_MOST_TREMORS):
-        before, tremor = tremor, find_tremor(source, exposures, path, camera_matrix, pool)
+        before, tremor = tremor, find_tremor(source, exposures, path, camera, pool)
         if tremor is None or tremor.rms_px < _LEFT_PX or (before and tremor.rms_px > before.rms_px):
             break
         path = path.rotated(tremor.rotations)
@@ -116,9 +119,7 @@ def merge(source: Source, groups: Sequence[Group], scene: Scene, camera_matrix: 
     return Merged(exposures, path, tremor)
 
 
-def locate(
-    exposures: Sequence[PosedExposure], camera_matrix: FloatArray, pool: ThreadPoolExecutor
-) -> tuple[FloatArray, Observations]:
+def locate(exposures: Sequence[PosedExposure], camera: Camera, pool: ThreadPoolExecutor) -> tuple[FloatArray, Observations]:
     """Choose points in key exposures, (N, 3) where the depth so far has them, and find them in the others.
 
     Raises a `LocationError` if hardly a patch of an exposure is found in another one.
@@ -131,13 +132,14 @@ def locate(
         here = exposures[key]
         patches = patches_of(here, views[key], _PATCHES)
         found = [
-            (other, find_patches(patches, (here, views[key]), (exposures[other], views[other]), camera_matrix))
+            (other, find_patches(patches, (here, views[key]), (exposures[other], views[other]), camera))
             for other in range(number)
             if other != key
             and (abs(other - key) <= _NEIGHBOURS or (other - key) % _FURTHER == 0)
-            and _overlap(here, exposures[other], camera_matrix)
+            and _overlap(here, exposures[other], camera)
         ]
-        rays = np.concatenate([patches.pixels, np.ones((len(patches.pixels), 1))], axis=1) @ np.linalg.inv(camera_matrix).T
+        ideal = camera.ideal(patches.pixels)
+        rays = np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1) @ np.linalg.inv(camera.matrix).T
         return (rays / patches.inverse_depth[:, :1] - here.pose[:, 3]) @ here.pose[:, :3], found
 
     points: list[FloatArray] = []
@@ -158,7 +160,12 @@ def locate(
 
 
 def interpolate(
-    groups: Sequence[Group], merged: Merged, points: FloatArray, observations: Observations, camera_matrix: FloatArray
+    groups: Sequence[Group],
+    merged: Merged,
+    points: FloatArray,
+    observations: Observations,
+    camera: Camera,
+    finds_focal: bool = False,
 ) -> PosedLevel:
     """Adjust exposures and points to the observations, and correct the path by the poses of the exposures."""
     exposures = merged.exposures
@@ -173,10 +180,10 @@ def interpolate(
     number = np.cumsum(located) - 1
     observations = Observations(observations.points, number[observations.views], observations.pixels, observations.covariance)
     poses = np.array([exposure.pose for exposure in exposures])[located]
-    adjusted = adjust(poses, points, observations, camera_matrix)
+    adjusted = adjust(poses, points, observations, camera, finds_focal)
     kept = [group for group, is_located in zip(groups, located, strict=True) if is_located]
     depth = np.median([np.median(each.inverse_depth) for each in exposures])
-    units = float(camera_matrix[0, 0]) * np.array([1, 1, 1, depth, depth, depth])
+    units = camera.focal_px * np.array([1, 1, 1, depth, depth, depth])
     covariance = np.linalg.inv(adjusted.information / units[:, None] / units).astype(np.float64)
     means = exceeding_noise_of_poses(moves(poses, adjusted.poses) * units, covariance)
     return PosedLevel(
@@ -190,9 +197,9 @@ def _borders(groups: Sequence[Group]) -> FloatArray:
     return np.array([groups[0].span.start - 0.5, *between, groups[-1].span.stop - 0.5])
 
 
-def _overlap(here: PosedExposure, there: PosedExposure, camera_matrix: FloatArray) -> bool:
+def _overlap(here: PosedExposure, there: PosedExposure, camera: Camera) -> bool:
     """Return whether the middle of an exposure lies in another one, or not far outside."""
-    turn, shift = between(here.pose, there.pose, camera_matrix)
+    turn, shift = between(here.pose, there.pose, camera.matrix)
     height, width = here.inverse_depth.shape
     middle = np.array([(width - 1) / 2, (height - 1) / 2, 1.0])
     x, y, depth = turn @ middle + shift * float(np.median(here.inverse_depth))

@@ -12,8 +12,9 @@ from scipy.spatial import cKDTree
 
 from photonpano import FloatArray, FrameSpan, Group, Source, VirtualExposure, capture_of
 from photonpano.compiling import compiled
-from photonpano.geometry import inverse, scaled_ahead
+from photonpano.geometry import Camera, inverse, scaled_ahead
 from photonpano.merging import PhotonSum, chunks_of
+from photonpano_colmap.posing.lens import Lens, imaged, lens_of
 from photonpano_colmap.posing.path import Path, between
 
 Image = NDArray[np.float32]
@@ -36,21 +37,19 @@ class PosedExposure:
     inverse_depth: Image  # (H, W) of its pixels
 
 
-def merge_through_depth(
-    source: Source, group: Group, path: Path, inverse_depth: Image, camera_matrix: FloatArray
-) -> PosedExposure:
+def merge_through_depth(source: Source, group: Group, path: Path, inverse_depth: Image, camera: Camera) -> PosedExposure:
     """Merge the frames of a group as its reference instant sees them (paper, section 6: aggregation that is consistent in 3D).
 
     Each chunk of frames is interpolated once, where its frames see the points of the reference view. Occlusions are ignored.
     """
     pose = path.at([group.reference])[0]
     counts, weight = np.zeros((2, *source.info.frame_shape), np.float32)
-    valid = source.valid.astype(np.float32)
-    plane = _Plane(path, pose, float(np.median(inverse_depth)), camera_matrix)
+    valid, lens = source.valid.astype(np.float32), lens_of(camera, source.info.frame_shape)
+    plane = _Plane(path, pose, float(np.median(inverse_depth)), camera)
     for chunk in chunks_of(group.span, plane, source.info.frame_shape, _CHUNK_PX):
-        turn, shift = between(pose, path.at([chunk.span.centre])[0], camera_matrix)
+        turn, shift = between(pose, path.at([chunk.span.centre])[0], camera.matrix)
         frames = lit_counts(source, chunk.span) * valid
-        _add(frames, valid * np.float32(len(chunk.span)), inverse_depth, turn, shift, counts, weight)
+        _add(frames, valid * np.float32(len(chunk.span)), inverse_depth, lens, turn, shift, counts, weight)
     flux, seen = PhotonSum(counts, weight).estimate(source.response)
     return PosedExposure(VirtualExposure(flux, seen, group, 1.0, source.response), pose, inverse_depth)
 
@@ -58,8 +57,8 @@ def merge_through_depth(
 class _Plane:
     """The motion of a plane before a view at the median depth, by which frames are divided into chunks."""
 
-    def __init__(self, path: Path, pose: FloatArray, inverse_depth: float, camera_matrix: FloatArray) -> None:
-        self._path, self._pose, self._inverse_depth, self._matrix = path, pose, inverse_depth, camera_matrix
+    def __init__(self, path: Path, pose: FloatArray, inverse_depth: float, camera: Camera) -> None:
+        self._path, self._pose, self._inverse_depth, self._matrix = path, pose, inverse_depth, camera.matrix
 
     def at(self, frame_indices: ArrayLike) -> FloatArray:
         """Return the maps from pixels of frames to those of the view: (N, 3, 3)."""
@@ -75,19 +74,27 @@ def lit_counts(source: Source, span: FrameSpan) -> Image:
 
 @compiled
 def _add(
-    frames: Image, frame_weight: Image, inverse_depth: Image, turn: FloatArray, shift: FloatArray, counts: Image, weight: Image
+    frames: Image,
+    frame_weight: Image,
+    inverse_depth: Image,
+    lens: Lens,
+    turn: FloatArray,
+    shift: FloatArray,
+    counts: Image,
+    weight: Image,
 ) -> None:
     """Add (H, W) counts and weights of frames to those of a view, interpolated bilinearly; see `path.between`."""
     height, width = frames.shape
     for y in range(height):
         row, counts_of, weight_of = inverse_depth[y], counts[y], weight[y]
         for x in range(width):
-            q = row[x]
-            depth = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] + q * shift[2]
+            q, px, py = row[x], lens.ideal[y, x, 0], lens.ideal[y, x, 1]
+            depth = turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] + q * shift[2]
             if not depth > 0:
                 continue
-            u = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] + q * shift[0]) / depth
-            v = (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] + q * shift[1]) / depth
+            u = (turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] + q * shift[0]) / depth
+            v = (turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] + q * shift[1]) / depth
+            u, v = imaged(lens, u, v)
             if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
                 continue
             i, j = min(int(u), width - 2), min(int(v), height - 2)
@@ -103,7 +110,7 @@ def _add(
             )
 
 
-def inverse_depth_of(pose: FloatArray, points: FloatArray, camera_matrix: FloatArray, shape: tuple[int, int]) -> Image | None:
+def inverse_depth_of(pose: FloatArray, points: FloatArray, camera: Camera, shape: tuple[int, int]) -> Image | None:
     """Return the inverse depth of the pixels of a view, (H, W), from points of the world; None if it sees fewer than 4.
 
     It is linear between points, as that of a plane is. At the edges of things it is wrong by the width of a triangle; within a
@@ -112,10 +119,12 @@ def inverse_depth_of(pose: FloatArray, points: FloatArray, camera_matrix: FloatA
     height, width = shape
     seen = points @ pose[:, :3].T + pose[:, 3]
     seen = seen[seen[:, 2] > 0]
-    pixels = seen @ camera_matrix.T
+    pixels = seen @ camera.matrix.T
     pixels = pixels[:, :2] / pixels[:, 2:]
     margin = _MARGIN * max(shape)
-    inside = ((pixels > -margin) & (pixels < (width + margin, height + margin))).all(axis=1)
+    ideal = lens_of(camera, shape).ideal
+    low, high = np.nanmin(ideal, axis=(0, 1)) - margin, np.nanmax(ideal, axis=(0, 1)) + 1 + margin
+    inside = ((pixels > low) & (pixels < high)).all(axis=1)
     pixels, inverse_depth = pixels[inside], 1 / seen[inside, 2]
     if len(pixels) >= _NEIGHBOURS:
         _, nearest = cKDTree(pixels).query(pixels, k=_NEIGHBOURS)
@@ -127,7 +136,9 @@ def inverse_depth_of(pose: FloatArray, points: FloatArray, camera_matrix: FloatA
     rows, columns = -(-height // _STEP_PX), -(-width // _STEP_PX)
     middle = (_STEP_PX - 1) / 2
     x, y = np.meshgrid(np.arange(columns) * _STEP_PX + middle, np.arange(rows) * _STEP_PX + middle)
-    grid = LinearNDInterpolator(pixels, inverse_depth)(x, y)
-    grid = np.where(np.isfinite(grid), grid, NearestNDInterpolator(pixels, inverse_depth)(x, y)).astype(np.float32)
+    places = camera.ideal(np.stack([x, y], axis=-1))
+    places = np.where(np.isfinite(places), places, camera.centre_px)
+    grid = LinearNDInterpolator(pixels, inverse_depth)(places)
+    grid = np.where(np.isfinite(grid), grid, NearestNDInterpolator(pixels, inverse_depth)(places)).astype(np.float32)
     fine = cv2.resize(grid, (columns * _STEP_PX, rows * _STEP_PX), interpolation=cv2.INTER_LINEAR)
     return np.ascontiguousarray(fine[:height, :width])

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from photonpano import FloatArray
 from photonpano.compiling import compiled
+from photonpano.geometry import Camera
 from photonpano.locating import view_of
+from photonpano_colmap.posing.lens import Lens, imaged, lens_of
 from photonpano_colmap.posing.merging import Image, PosedExposure
 from photonpano_colmap.posing.path import between
 
@@ -48,7 +50,7 @@ class Found(NamedTuple):
     """Where some patches are in another exposure."""
 
     patches: NDArray[np.intp]  # (M,) their numbers
-    pixels: FloatArray  # (M, 2) px
+    pixels: FloatArray  # (M, 2) px, ideal ones
     covariance: FloatArray  # (M, 2, 2) px^2, as photon noise has it
 
 
@@ -78,29 +80,31 @@ def patches_of(posed: PosedExposure, view: Stabilised, most: int) -> Patches:
 
 
 def find_patches(
-    patches: Patches, here: tuple[PosedExposure, Stabilised], there: tuple[PosedExposure, Stabilised], camera_matrix: FloatArray
+    patches: Patches, here: tuple[PosedExposure, Stabilised], there: tuple[PosedExposure, Stabilised], camera: Camera
 ) -> Found:
     """Find the patches of an exposure, `here`, in another one, `there`.
 
     The noise of the patch itself shifts it alike in all other exposures, and with it the point of the scene that it stands for.
     """
     (posed, view), (other, image) = here, there
-    turn, shift = between(posed.pose, other.pose, camera_matrix)
+    turn, shift = between(posed.pose, other.pose, camera.matrix)
     number = len(patches.pixels)
     pixels, hessian, chi_square = np.full((number, 2), np.nan), np.zeros((number, 2, 2)), np.full(number, np.inf)
     noise = view.noise + image.noise
     # Central differences of noise, which the blur has correlated.
     gradient_noise = 0.5 * (1 - np.exp(-1 / _BLUR_PX**2)) * image.noise * image.noise_left
-    _find(
-        view.image, image.image, patches.pixels, patches.inverse_depth, turn, shift, gradient_noise, pixels, hessian, chi_square
-    )
+    lens, middles, depth = lens_of(camera, posed.inverse_depth.shape), patches.pixels, patches.inverse_depth
+    _find(view.image, image.image, middles, depth, lens, turn, shift, gradient_noise, pixels, hessian, chi_square)
     chi_square /= noise * view.noise_left
     determinant = np.linalg.det(hessian)
     kept = np.isfinite(pixels[:, 0]) & (chi_square < _LARGEST_CHI_SQUARE) & (determinant > 0) & (hessian[:, 0, 0] > 0)
     found = np.flatnonzero(kept)
     covariance = noise * np.linalg.inv(hessian[found])
-    certain = np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]) < _LARGEST_STD_PX**2
-    return Found(found[certain], pixels[found][certain], covariance[certain])
+    ideal = camera.ideal(pixels[found])
+    by_pixel = np.stack([camera.ideal_shift(ideal, np.broadcast_to(axis, ideal.shape)) for axis in np.eye(2)], axis=2)
+    certain = (np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]) < _LARGEST_STD_PX**2) & np.isfinite(ideal[:, 0])
+    covariance = by_pixel @ covariance @ np.swapaxes(by_pixel, 1, 2)
+    return Found(found[certain], ideal[certain], covariance[certain])
 
 
 @compiled
@@ -109,6 +113,7 @@ def _find(
     image: Image,
     middles: FloatArray,
     inverse_depth: FloatArray,
+    lens: Lens,
     turn: FloatArray,
     shift: FloatArray,
     gradient_noise: float,
@@ -118,9 +123,9 @@ def _find(
 ) -> None:
     """Find patches of a template, (H, W), in an image by Gauss-Newton steps; those that are lost stay NaN.
 
-    `middles` are (N, 2) px; `turn` and `shift` are from `path.between`; `gradient_noise` is the variance of a gradient by
-    noise. Writes the middles in the image, (N, 2), the weighted sums of products of gradients of the scene, (N, 2, 2), and the
-    weighted mean square of the residuals less their mean, (N,).
+    `middles` are (N, 2) px, whole numbers; `turn` and `shift` are from `path.between`; `gradient_noise` is the variance of a
+    gradient by noise. Writes the middles in the image, (N, 2), the weighted sums of products of gradients of the scene,
+    (N, 2, 2), and the weighted mean square of the residuals less their mean, (N,).
     """
     size = (2 * _HALF + 1) ** 2
     values, us, vs, weights = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
@@ -132,11 +137,13 @@ def _find(
         for j in range(-_HALF, _HALF + 1):
             for i in range(-_HALF, _HALF + 1):
                 q_there = q + q_x * i + q_y * j
-                depth = turn[2, 0] * (x + i) + turn[2, 1] * (y + j) + turn[2, 2] + q_there * shift[2]
+                ideal = lens.ideal[int(y) + j, int(x) + i]
+                depth = turn[2, 0] * ideal[0] + turn[2, 1] * ideal[1] + turn[2, 2] + q_there * shift[2]
                 values[n] = _sample(template, x + i, y + j)
                 known = known and depth > 0 and np.isfinite(values[n])
-                us[n] = (turn[0, 0] * (x + i) + turn[0, 1] * (y + j) + turn[0, 2] + q_there * shift[0]) / depth
-                vs[n] = (turn[1, 0] * (x + i) + turn[1, 1] * (y + j) + turn[1, 2] + q_there * shift[1]) / depth
+                u = (turn[0, 0] * ideal[0] + turn[0, 1] * ideal[1] + turn[0, 2] + q_there * shift[0]) / depth
+                v = (turn[1, 0] * ideal[0] + turn[1, 1] * ideal[1] + turn[1, 2] + q_there * shift[1]) / depth
+                us[n], vs[n] = imaged(lens, u, v)
                 weights[n] = np.exp(-(i * i + j * j) / (2 * (0.6 * _HALF) ** 2))
                 weight += weights[n]
                 n += 1

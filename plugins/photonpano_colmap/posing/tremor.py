@@ -20,7 +20,9 @@ from scipy.interpolate import CubicSpline
 from photonpano import FloatArray, FrameSpan, Source
 from photonpano.compiling import compiled
 from photonpano.filtering import exceeding_noise
+from photonpano.geometry import Camera
 from photonpano.photometry import flux_std
+from photonpano_colmap.posing.lens import Lens, imaged, lens_of
 from photonpano_colmap.posing.merging import Image, PosedExposure, lit_counts
 from photonpano_colmap.posing.path import Path, between
 
@@ -49,7 +51,7 @@ class Tremor:
 
 
 def find_tremor(
-    source: Source, exposures: Sequence[PosedExposure], path: Path, camera_matrix: FloatArray, pool: ThreadPoolExecutor
+    source: Source, exposures: Sequence[PosedExposure], path: Path, camera: Camera, pool: ThreadPoolExecutor
 ) -> Tremor | None:
     """Find how the camera moves within groups, side by side, that were merged along a path; None if the frames are too few.
 
@@ -57,12 +59,12 @@ def find_tremor(
     squares, and denoised with a Wiener filter. The result does not depend on the number of threads of the pool.
     """
     inverse_depth = float(np.median([np.median(each.inverse_depth) for each in exposures]))
-    predicted = list(pool.map(lambda posed: _prediction(posed, camera_matrix, inverse_depth), exposures))
+    predicted = list(pool.map(lambda posed: _prediction(posed, camera, inverse_depth), exposures))
     size = _span_frames(predicted)
 
     def measured(posed: PosedExposure, prediction: _Prediction) -> list[_Equations]:
         spans = _divided(posed.exposure.group.span, size)
-        maps = between(posed.pose, path.at([span.centre for span in spans]), camera_matrix)
+        maps = between(posed.pose, path.at([span.centre for span in spans]), camera.matrix)
         return [_measured(source, *each, posed, prediction) for each in zip(spans, *maps, strict=True)]
 
     found = [equations for each in pool.map(measured, exposures, predicted) for equations in each]
@@ -80,7 +82,7 @@ def find_tremor(
     at_frames = CubicSpline(instants, rotations)(np.clip(frames, instants[0], instants[-1]))
     # A turn about x or y moves all pixels alike, but for the corners.
     moved_px = np.sqrt(np.mean(np.einsum("si,ij,sj->s", rotations, mean, rotations)) / max(np.trace(mean[:2, :2]) / 2, 1e-12))
-    focal_px = float(camera_matrix[0, 0])
+    focal_px = camera.focal_px
     shift = _beyond_noise(_solved(gradient, information)[0][:, _SIDEWAYS]) / (focal_px * inverse_depth)
     return Tremor(at_frames / focal_px, np.interp(frames, instants, noise) / focal_px, float(moved_px), shift)
 
@@ -97,12 +99,12 @@ class _Prediction(NamedTuple):
     """Expected counts of a frame of a group, seen from its reference instant."""
 
     mean: Image  # (H, W) expected count of a frame
-    slope_x: Image  # (H, W) its slope along x, divided by the variance of a frame; 0 where it is not known
+    slope_x: Image  # (H, W) its slope along x of ideal pixels, divided by the variance of a frame; 0 where it is not known
     slope_y: Image  # (H, W) the same along y
     gain: Image  # (H, W) the mean, divided by that variance; 0 where the slopes are not known
     inverse_depth: Image  # (H, W)
     mean_depth: float  # inverse depth at which a shift of the camera counts in px
-    to_ideal: FloatArray  # (3, 3) pixels to directions
+    lens: Lens
     information: FloatArray  # (7, 7) of one frame that sees all of it
 
 
@@ -123,7 +125,7 @@ def _solved(gradient: FloatArray, information: FloatArray) -> tuple[FloatArray, 
     return np.where(known[:, None], steps, 0.0), np.where(known[:, None], variances, np.inf)
 
 
-def _prediction(posed: PosedExposure, camera_matrix: FloatArray, mean_depth: float) -> _Prediction:
+def _prediction(posed: PosedExposure, camera: Camera, mean_depth: float) -> _Prediction:
     exposure, response = posed.exposure, posed.exposure.response
     known = np.isfinite(exposure.flux) & (exposure.weight > 0)
     flux, frames = np.where(known, exposure.flux, np.float32(0)), np.where(known, exposure.weight, np.float32(1))
@@ -134,13 +136,15 @@ def _prediction(posed: PosedExposure, camera_matrix: FloatArray, mean_depth: flo
     inner = cv2.erode(known.astype(np.uint8), np.ones((2 * _BORDER + 1,) * 2, np.uint8), borderValue=0).astype(bool)
     smooth = cv2.GaussianBlur(mean, (0, 0), _BLUR_PX)
     slope_x, slope_y = (np.where(inner, cv2.filter2D(smooth, cv2.CV_32F, each), np.float32(0)) for each in _DIFFERENCES)
+    lens = lens_of(camera, flux.shape)
+    (x_x, x_y), (y_x, y_y) = np.moveaxis(lens.slopes.astype(np.float32), (2, 3), (0, 1))
+    slope_x, slope_y = slope_x * x_x + slope_y * y_x, slope_x * x_y + slope_y * y_y
     # The gradient of noise would count as structure.
-    noise = np.where(inner, np.float32(_SLOPE_NOISE) / frames, np.float32(0))
+    noise = np.where(inner, np.float32(_SLOPE_NOISE) * (x_x * y_y - x_y * y_x) / frames, np.float32(0))
     gain = np.where(inner, mean / variance, np.float32(0))
     information = np.zeros((_GAIN + 1, _GAIN + 1))
-    to_ideal: FloatArray = np.linalg.inv(camera_matrix).astype(np.float64)
     predicted = _Prediction(
-        mean, slope_x / variance, slope_y / variance, gain, posed.inverse_depth, mean_depth, to_ideal, information
+        mean, slope_x / variance, slope_y / variance, gain, posed.inverse_depth, mean_depth, lens, information
     )
     _add_information(predicted, slope_x, slope_y, noise)
     information += np.triu(information, 1).T
@@ -195,7 +199,7 @@ def _add_information(predicted: _Prediction, slope_x: Image, slope_y: Image, noi
             if gain == 0:
                 continue
             q = predicted.inverse_depth[row, column]
-            _moves(row, column, q / predicted.mean_depth, predicted.to_ideal, along_x, along_y)
+            _moves(row, column, q / predicted.mean_depth, predicted.lens, along_x, along_y)
             x_x = predicted.slope_x[row, column] * slope_x[row, column] - noise[row, column]
             x_y = predicted.slope_x[row, column] * slope_y[row, column]
             y_y = predicted.slope_y[row, column] * slope_y[row, column] - noise[row, column]
@@ -214,19 +218,20 @@ def _add_residuals(
     frames: Image, frame_weight: Image, predicted: _Prediction, turn: FloatArray, shift: FloatArray, sums: FloatArray
 ) -> None:
     """Add the right-hand side of the equations of a span, and the light that it sees, to the (8,) sums; see `path.between`."""
-    height, width = frames.shape
+    (height, width), lens = frames.shape, predicted.lens
     along_x, along_y = np.zeros(6), np.zeros(6)
     for row in range(height):
         for column in range(width):
             gain = predicted.gain[row, column]
             if gain == 0:
                 continue
-            q = predicted.inverse_depth[row, column]
-            depth = turn[2, 0] * column + turn[2, 1] * row + turn[2, 2] + q * shift[2]
+            q, x, y = predicted.inverse_depth[row, column], lens.ideal[row, column, 0], lens.ideal[row, column, 1]
+            depth = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] + q * shift[2]
             if not depth > 0:
                 continue
-            u = (turn[0, 0] * column + turn[0, 1] * row + turn[0, 2] + q * shift[0]) / depth
-            v = (turn[1, 0] * column + turn[1, 1] * row + turn[1, 2] + q * shift[1]) / depth
+            u = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] + q * shift[0]) / depth
+            v = (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] + q * shift[1]) / depth
+            u, v = imaged(lens, u, v)
             if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
                 continue
             i, j = min(int(u), width - 2), min(int(v), height - 2)
@@ -239,7 +244,7 @@ def _add_residuals(
             )
             mean = predicted.mean[row, column]
             residual = lit - seen * mean
-            _moves(row, column, q / predicted.mean_depth, predicted.to_ideal, along_x, along_y)
+            _moves(row, column, q / predicted.mean_depth, predicted.lens, along_x, along_y)
             by_x, by_y = residual * predicted.slope_x[row, column], residual * predicted.slope_y[row, column]
             # The image moves against the camera.
             for k in range(6):
@@ -249,10 +254,10 @@ def _add_residuals(
 
 
 @compiled
-def _moves(row: int, column: int, q: float, to_ideal: FloatArray, along_x: FloatArray, along_y: FloatArray) -> None:
+def _moves(row: int, column: int, q: float, lens: Lens, along_x: FloatArray, along_y: FloatArray) -> None:
     """Write, (6,) each, how rotations about the camera's axes and translations along them move a pixel, in focal lengths."""
-    x = to_ideal[0, 0] * column + to_ideal[0, 2]
-    y = to_ideal[1, 1] * row + to_ideal[1, 2]
+    x = (lens.ideal[row, column, 0] - lens.centre[0]) / lens.focal
+    y = (lens.ideal[row, column, 1] - lens.centre[1]) / lens.focal
     along_x[0], along_x[1], along_x[2] = -x * y, 1 + x * x, -y
     along_y[0], along_y[1], along_y[2] = -(1 + y * y), x * y, x
     along_x[3], along_x[4], along_x[5] = q, 0.0, -x * q

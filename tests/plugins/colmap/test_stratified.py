@@ -10,7 +10,7 @@ import pytest
 from photonpano import CameraGuess, FrameSpan, Group, LocationError, StageContext
 from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
-from photonpano.geometry import camera_matrix, rotation_matrices
+from photonpano.geometry import Camera, rotation_matrices
 from photonpano.testing import MemorySource
 from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses
 
@@ -19,13 +19,17 @@ pytest.importorskip("gtsam")
 
 from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.posing.adjustment import Observations, adjust
+from photonpano_colmap.posing.lens import imaged, lens_of
 from photonpano_colmap.posing.levels import Merged, Scene, interpolate, locate, merge, resample
 from photonpano_colmap.posing.merging import inverse_depth_of, merge_through_depth
 from photonpano_colmap.posing.path import Path, PoseSpline, between, moves, posed, positions_of, projected
 from photonpano_colmap.posing.tremor import _beyond_noise, find_tremor
 from photonpano_colmap.stratified import StratifiedEstimator
 
-MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
+CAMERA = Camera.of(FOCAL_PX, SHAPE)
+MATRIX = CAMERA.matrix
+LENS = (-0.1, 0.0, 0.0, 0.0)
+LENS_CAMERA = Camera(MATRIX, np.array(LENS))
 TRUE = Path(true_poses())
 EVERYWHERE = np.ones(N_FRAMES, np.bool_)
 
@@ -49,12 +53,12 @@ def test_inverse_depth_of_a_plane_is_exact_between_points() -> None:
     normal, pose = np.array([0.1, -0.05, 0.25]), true_poses()[40]
     rays = np.concatenate([np.random.default_rng(0).uniform(-0.6, 0.6, (300, 2)), np.ones((300, 1))], axis=1)
     points = (rays / (rays @ normal)[:, None] - pose[:, 3]) @ pose[:, :3]
-    found = inverse_depth_of(pose, points, MATRIX, SHAPE)
+    found = inverse_depth_of(pose, points, CAMERA, SHAPE)
     y, x = np.mgrid[20:108, 20:140]
     expected = ((x - 79.5) * normal[0] + (y - 63.5) * normal[1]) / FOCAL_PX + normal[2]
     assert found is not None
     np.testing.assert_allclose(found[20:108, 20:140], expected, rtol=0.02)
-    assert inverse_depth_of(pose, points[:3], MATRIX, SHAPE) is None
+    assert inverse_depth_of(pose, points[:3], CAMERA, SHAPE) is None
 
 
 def test_frames_merge_sharp_through_depth_and_blurred_without() -> None:
@@ -63,7 +67,7 @@ def test_frames_merge_sharp_through_depth_and_blurred_without() -> None:
     edges = {}
     for name, depth in (("true", 3.0), ("wrong", 5.0)):
         plane = np.full(SHAPE, 1 / depth, np.float32)
-        found = merge_through_depth(source, group, TRUE, plane, MATRIX)
+        found = merge_through_depth(source, group, TRUE, plane, CAMERA)
         assert found.exposure.weight.max() == pytest.approx(320, rel=1e-3)
         np.testing.assert_array_equal(found.pose, instant)
         # The rectangle at 3 m lies about here.
@@ -115,7 +119,7 @@ def trembling(rms_px: float) -> tuple[Path, np.ndarray]:
 def test_tremor_within_a_group_is_found() -> None:
     path, tremor = trembling(1.0)
     with ThreadPoolExecutor(2) as pool:
-        merged = merge(capture(), resample(EVERYWHERE, 160), Scene(path, EVERYWHERE, _seen_points()), MATRIX, pool)
+        merged = merge(capture(), resample(EVERYWHERE, 160), Scene(path, EVERYWHERE, _seen_points()), CAMERA, pool)
     left, before = (np.sqrt(np.mean(moves(each.poses, true_poses())[:, :3] ** 2, axis=0)) for each in (merged.path, path))
     np.testing.assert_allclose(before, np.sqrt(np.mean(tremor**2, axis=0)), rtol=0.02)
     assert (left < 0.3 * before).all(), left / before
@@ -123,9 +127,9 @@ def test_tremor_within_a_group_is_found() -> None:
 
 def test_steady_path_has_no_tremor() -> None:
     with ThreadPoolExecutor(2) as pool:
-        merged = merge(capture(), resample(EVERYWHERE, 160), Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
-        found = find_tremor(capture(), merged.exposures, TRUE, MATRIX, pool)
-        short = merge(capture(), resample(EVERYWHERE, 40)[:2], Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
+        merged = merge(capture(), resample(EVERYWHERE, 160), Scene(TRUE, EVERYWHERE, _seen_points()), CAMERA, pool)
+        found = find_tremor(capture(), merged.exposures, TRUE, CAMERA, pool)
+        short = merge(capture(), resample(EVERYWHERE, 40)[:2], Scene(TRUE, EVERYWHERE, _seen_points()), CAMERA, pool)
     assert found is not None
     assert found.rms_px < 0.15
     assert found.std.max() < np.deg2rad(0.1)
@@ -146,13 +150,13 @@ def test_noise_of_located_groups_does_not_move_the_path() -> None:
     # Observations with noise move exposures; along a path that is right, only what exceeds this noise is a correction.
     rng, points = np.random.default_rng(5), points_on_planes(150, seed=2)
     with ThreadPoolExecutor(2) as pool:
-        merged = merge(capture(), resample(EVERYWHERE, 16), Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
+        merged = merge(capture(), resample(EVERYWHERE, 16), Scene(TRUE, EVERYWHERE, _seen_points()), CAMERA, pool)
     groups = [each.exposure.group for each in merged.exposures]
     poses = TRUE.at([group.reference for group in groups])
     views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
     pixels = projected(poses[views], points[numbers], MATRIX) + rng.normal(0, 0.3, (3000, 2))
     observations = Observations(numbers, views, pixels, np.tile(0.3**2 * np.eye(2), (3000, 1, 1)))
-    level = interpolate(groups, Merged(merged.exposures, TRUE, None), points, observations, MATRIX)
+    level = interpolate(groups, Merged(merged.exposures, TRUE, None), points, observations, CAMERA)
     located = _after_similarity(positions_of(level.adjusted.poses), positions_of(poses))
     path = _after_similarity(positions_of(level.path.at([group.reference for group in groups])), positions_of(poses))
     assert np.sqrt(np.mean(path**2)) < 0.7 * np.sqrt(np.mean(located**2)), (path, located)
@@ -174,7 +178,7 @@ def test_adjustment_finds_poses_and_knows_its_errors() -> None:
         pixels = projected(true[views], points[numbers], MATRIX) + rng.normal(0, 0.1, (3000, 2))
         observations = Observations(numbers, views, pixels, np.tile(0.1**2 * np.eye(2), (3000, 1, 1)))
         start = posed(rotation_matrices(rng.normal(0, 0.003, (20, 3))) @ true[:, :, :3], positions_of(true))
-        found = adjust(start, points + rng.normal(0, 0.02, points.shape), observations, MATRIX)
+        found = adjust(start, points + rng.normal(0, 0.02, points.shape), observations, CAMERA)
         errors.append(_after_similarity(positions_of(found.poses), positions_of(true)))
         expected.append(found.std_position)
         assert found.confirmed.mean() > 0.95
@@ -191,7 +195,7 @@ def test_patches_at_edges_of_things_count_less() -> None:
     pixels = projected(true[views], points[numbers], MATRIX) + rng.normal(0, 0.05, (3000, 2))
     pixels[numbers < 15, 0] += 0.15 * (views[numbers < 15] - 10)
     observations = Observations(numbers, views, pixels, np.tile(0.05**2 * np.eye(2), (3000, 1, 1)))
-    found = adjust(true, points, observations, MATRIX)
+    found = adjust(true, points, observations, CAMERA)
     error = _after_similarity(positions_of(found.poses), positions_of(true))
     assert np.sqrt(np.mean(error**2)) < 0.003, error
     assert found.confirmed[15:].mean() > 0.9
@@ -200,8 +204,8 @@ def test_patches_at_edges_of_things_count_less() -> None:
 def test_exposures_along_the_true_path_are_found_where_they_are() -> None:
     source, groups = capture(), resample(EVERYWHERE, 40)
     with ThreadPoolExecutor(2) as pool:
-        merged = merge(source, groups, Scene(TRUE, EVERYWHERE, _seen_points()), MATRIX, pool)
-        points, observations = locate(merged.exposures, MATRIX, pool)
+        merged = merge(source, groups, Scene(TRUE, EVERYWHERE, _seen_points()), CAMERA, pool)
+        points, observations = locate(merged.exposures, CAMERA, pool)
     poses = merged.path.at([group.reference for group in groups])
     away = observations.pixels - projected(poses[observations.views], points[observations.points], MATRIX)
     assert len(observations.points) > 500
@@ -212,17 +216,77 @@ def test_exposures_without_anything_in_common_are_an_error() -> None:
     source = MemorySource(np.random.default_rng(0).integers(0, 2, (40, *SHAPE)))
     with ThreadPoolExecutor(2) as pool:
         everywhere = np.ones(40, np.bool_)
-        merged = merge(source, resample(everywhere, 20), Scene(TRUE, everywhere, _seen_points()), MATRIX, pool)
+        merged = merge(source, resample(everywhere, 20), Scene(TRUE, everywhere, _seen_points()), CAMERA, pool)
         with pytest.raises(LocationError, match="no patch of one was found in another"):
-            locate(merged.exposures, MATRIX, pool)
+            locate(merged.exposures, CAMERA, pool)
 
 
-def test_lens_that_distorts_is_refused() -> None:
-    source = MemorySource(np.zeros((N_FRAMES, *SHAPE)))
-    context = StageContext(source.info, source.response, 0, 2)
-    estimator = StratifiedEstimator(StratifiedPoseConfig(group_size=20), context)
-    with pytest.raises(LocationError, match="through a lens that distorts; leave out"):
-        estimator.estimate(source, CameraGuess(FOCAL_PX, distortion=(-0.1, 0, 0, 0)), Quiet())
+def test_lens_is_undone_and_images_nothing_beyond_the_frame() -> None:
+    camera = Camera(MATRIX, np.array([-0.3, 0.05, 0.01, -0.02]))
+    lens = lens_of(camera, SHAPE)
+    for x, y in ((0, 0), (159, 0), (80, 64), (3, 120)):
+        np.testing.assert_allclose(imaged(lens, *lens.ideal[y, x]), (x, y), atol=1e-9)
+        moved = camera.distorted(lens.ideal[y, x] + (0.01, -0.02)) - (x, y)
+        np.testing.assert_allclose(lens.slopes[y, x] @ (0.01, -0.02), moved, atol=1e-5)
+    # Beyond the fold of this barrel, a formula alone would image points again.
+    assert np.isnan(imaged(lens, 900.0, 63.5)).all()
+
+
+def test_frames_from_one_place_merge_as_they_are_through_a_lens() -> None:
+    source, rests = capture(distortion=LENS), Path(np.repeat(true_poses()[:1], N_FRAMES, axis=0))
+    found = merge_through_depth(source, Group(FrameSpan(0, 8), 3.5), rests, np.full(SHAPE, 0.2, np.float32), LENS_CAMERA)
+    np.testing.assert_allclose(found.exposure.weight[1:-1, 1:-1], 8, atol=1e-4)
+    counts = source.frames(FrameSpan(0, 8)).sum(axis=0)
+    unsaturated = counts < 8
+    unsaturated[[0, -1]] = unsaturated[:, [0, -1]] = False
+    expected = source.response.flux(counts / np.float32(8), 8.0)
+    np.testing.assert_allclose(found.exposure.flux[unsaturated], expected[unsaturated], atol=1e-3)
+
+
+def observed_through(camera: Camera, noise_px: float = 0.03) -> tuple[np.ndarray, np.ndarray, Observations]:
+    """Return poses, points, and where a camera sees the points, taken as ideal pixels."""
+    rng = np.random.default_rng(6)
+    poses, points = true_poses()[::16], points_on_planes(150, seed=2)
+    views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
+    pixels = camera.distorted(projected(poses[views], points[numbers], camera.matrix)) + rng.normal(0, noise_px, (3000, 2))
+    return poses, points, Observations(numbers, views, pixels, np.tile(noise_px**2 * np.eye(2), (3000, 1, 1)))
+
+
+@pytest.mark.parametrize("k1", [0.0, -0.02, 0.02])
+def test_adjustment_tells_distortion_that_is_not_that_of_the_lens(k1: float) -> None:
+    poses, points, observations = observed_through(Camera(MATRIX, np.array([k1, 0, 0, 0])))
+    found = adjust(poses, points, observations, CAMERA)
+    assert found.std_k1 < 0.003
+    assert abs(found.missed_k1 - k1) < 3 * found.std_k1 + 0.1 * abs(k1), (found.missed_k1, found.std_k1)
+
+
+def test_adjustment_finds_the_focal_length() -> None:
+    poses, points, observations = observed_through(CAMERA)
+    found = adjust(poses, points, observations, Camera.of(1.04 * FOCAL_PX, SHAPE), finds_focal=True)
+    assert found.std_focal_px < 0.7
+    assert abs(found.focal_px - FOCAL_PX) < 3 * found.std_focal_px
+    given = adjust(poses, points, observations, CAMERA)
+    assert (given.focal_px, given.std_focal_px) == (FOCAL_PX, 0)
+
+
+@pytest.mark.parametrize("given", [LENS, (0.0, 0.0, 0.0, 0.0)], ids=["right", "wrong"])
+def test_lens_is_seen_through_and_a_wrong_one_is_doubted(given: tuple[float, float, float, float]) -> None:
+    source = capture(distortion=LENS)
+    config, context = StratifiedPoseConfig(group_size=20, levels=2), StageContext(source.info, source.response, 0, 2)
+    estimate = StratifiedEstimator(config, context).estimate(source, CameraGuess(FOCAL_PX, distortion=given), Quiet())
+    score = pose_errors(estimate.camera_from_world, true_poses(), estimate.located, 10, estimate.std_position)
+    if given == LENS:
+        assert score.ate_share < 0.005
+        assert score.turns_deg < 0.15
+        assert estimate.doubts == ()
+        view = estimate.views[8]
+        seen = projected(
+            np.repeat(view.camera_from_world[None], len(view.xy), axis=0), estimate.points.positions[view.points], MATRIX
+        )
+        assert np.median(np.linalg.norm(LENS_CAMERA.distorted(seen) - view.xy, axis=1)) < 0.5
+    else:
+        [doubt] = estimate.doubts
+        assert "the exposures contradict the lens: k1 is off by about -0." in doubt
 
 
 def test_frames_that_show_nothing_are_lost_and_the_others_refined() -> None:
