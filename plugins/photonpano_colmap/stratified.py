@@ -30,6 +30,7 @@ from photonpano_colmap.posing.path import Path, PoseSpline, positions_of
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
 _CONTRADICTION, _CONTRADICTION_PX = 5.0, 0.5
+_LARGEST_EXCESS = 1.0  # residuals relative to photon noise; of right poses it was a third, since noise is partly blurred away
 _MISSED = 0.5  # expected next pose update, as a fraction of the last one
 
 
@@ -103,17 +104,24 @@ class _Assembly:
         )
 
     def _contradictions(self) -> list[str]:
-        """Doubt a lens that the exposures contradict."""
-        adjusted, camera = self.level.adjusted, self.camera
+        """Doubt poses, and a lens, that the exposures contradict."""
+        if self.level.adjusted.excess > _LARGEST_EXCESS:
+            return [
+                f"points are {self.level.adjusted.residual_px:.2f} px from where exposures show them (the median), "
+                f"{self.level.adjusted.excess:.2g} times as far as photon noise explains, so that the poses are likely wrong; "
+                "choose another pose.with.group_size, or move farther"
+            ]
+        adjusted, camera, given = self.level.adjusted, self.camera, float(self.camera.distortion[0])
         corner = camera.ideal(corners(self.source.info.frame_shape)) - camera.centre_px
         farthest = float(np.nanmax(np.linalg.norm(corner, axis=1))) / camera.focal_px
         moved_px = abs(adjusted.missed_k1) * farthest**3 * camera.focal_px
-        if abs(adjusted.missed_k1) < _CONTRADICTION * adjusted.std_k1 or moved_px < _CONTRADICTION_PX:
+        off = abs(adjusted.missed_k1) / adjusted.std_k1
+        if off < _CONTRADICTION or moved_px < _CONTRADICTION_PX:
             return []
         return [
-            f"the exposures contradict the lens: k1 is off by about {adjusted.missed_k1:+.2g}, with a standard error of "
-            f"{adjusted.std_k1:.1g}, which moves the corners of a frame by {moved_px:.2g} px, or the focal length is wrong; "
-            "calibrate the camera, and give camera.focal_px and camera.distortion"
+            f"the exposures contradict the lens: they ask for a k1 of about {given + adjusted.missed_k1:.2f} instead of "
+            f"{given:.4g}, which moves the corners of a frame by {moved_px:.2g} px and is {off:.0f} standard errors; calibrate "
+            "the camera, and give camera.focal_px and camera.distortion"
         ]
 
     def _lost(self) -> tuple[LostFrames, ...]:

@@ -1,12 +1,13 @@
 """Compare pose estimators where the true poses are known: the table of docs/how-to/poses.md.
 
     python tests/benchmarks/poses.py docs/how-to/poses.md --work FOLDER
-    python tests/benchmarks/poses.py --work FOLDER --only room-1 --flux 0.3
+    python tests/benchmarks/poses.py --work FOLDER --only room-1 --flux 0.3 --k1 -0.1
 
 Five simulated captures of 10,000 frames of 254 x 496 pixels, held by a hand with a tremor of 2 px, at three light levels. Each
 method is a run of the program as users start it; the seconds and the memory that are printed are those of its process. COLMAP
 on sharp frames gets every 200th frame without noise and without blur, and is scored at these. Captures and results stay in the
-folder, and what is there already is not measured again. With captures of 160 MB, the whole table takes an hour.
+folder, and what is there already is not measured again. `k1` is the distortion of a lens, which each method is given. With
+captures of 160 MB, the whole table takes an hour.
 """
 
 from __future__ import annotations
@@ -44,24 +45,29 @@ HEADER = (
 )  # fmt: skip
 
 
-def simulated(scene: str, flux: str, work: Path, n_frames: int = N_FRAMES) -> Path:
+def simulated(scene: str, flux: str, work: Path, n_frames: int = N_FRAMES, k1: float = 0.0) -> Path:
     """Return a capture, simulated if it is not there."""
-    cube = work / f"{scene}-{flux}-{n_frames}.npy"
+    cube = work / f"{scene}{_lens(k1)}-{flux}-{n_frames}.npy"
     if not cube.exists():
         keys = SCENES[scene]
-        camera = {"n_frames": n_frames, "frame_shape": list(SHAPE), "frame_rate_hz": 10_000 * n_frames / N_FRAMES}
+        camera = {
+            "distortion": {"k1": k1},
+            "n_frames": n_frames,
+            "frame_shape": list(SHAPE),
+            "frame_rate_hz": 10_000 * n_frames / N_FRAMES,
+        }
         path = {"kind": "travel", **keys["path"], "tremor": TREMOR}
         capture = simulator("travel-simulator", scene=keys["scene"], path=path, flux=float(flux), focal_px=FOCAL_PX, **camera)
         simulate(parse_spec(capture), cube, sharp_every=SHARP_EVERY)
     return cube
 
 
-def measured(scene: str, flux: str, method: str, study: Study, n_frames: int) -> dict[str, Any]:
+def measured(scene: str, flux: str, method: str, study: Study, n_frames: int, k1: float) -> dict[str, Any]:
     """Return the figures of a method on a capture."""
-    cube = simulated(scene, flux, study.folder, n_frames)
+    cube = simulated(scene, flux, study.folder, n_frames, k1)
     if method == SHARP:
-        return _figures(_sharp(cube, truth_path(cube)))
-    spec = packed(cube, None, pose={"use": method}, camera={"focal_px": FOCAL_PX})
+        return _figures(_sharp(cube, truth_path(cube), k1))
+    spec = packed(cube, None, pose={"use": method}, camera={"focal_px": FOCAL_PX, "distortion": {"k1": k1}})
     try:
         folder, seconds, _, mib = in_child(study.run, f"{cube.stem}-{method}", spec)
     except PhotonpanoError as error:
@@ -69,12 +75,16 @@ def measured(scene: str, flux: str, method: str, study: Study, n_frames: int) ->
     return _figures(evaluate_poses(folder, truth_path(cube))) | {"seconds": seconds, "mib": mib}
 
 
-def _sharp(cube: Path, truth: Path) -> PoseScore:
+def _lens(k1: float) -> str:
+    return f"-k1={k1:g}" if k1 else ""
+
+
+def _sharp(cube: Path, truth: Path, k1: float) -> PoseScore:
     """Score COLMAP on sharp frames."""
     pictures = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in sorted(cube.with_suffix(".sharp").glob("*.png"))]
     everywhere = np.full(SHAPE, 255, np.uint8)
-    config = ColmapAveragesConfig()
-    found = reconstruct([(picture, everywhere) for picture in pictures], CameraGuess(focal_px=FOCAL_PX), config, 0)
+    config, guess = ColmapAveragesConfig(), CameraGuess(FOCAL_PX, distortion=(k1, 0, 0, 0))
+    found = reconstruct([(picture, everywhere) for picture in pictures], guess, config, 0)
     piece = found.pieces[0]
     true = load_true_poses(truth).camera_from_world[::SHARP_EVERY]
     poses, located = np.full(true.shape, np.nan), np.zeros(len(true), np.bool_)
@@ -108,16 +118,17 @@ def main(
     flux: Sequence[str] = FLUXES,
     methods: Sequence[str] = METHODS,
     frames: int = N_FRAMES,
+    k1: float = 0.0,
 ) -> None:
     """Measure, and write the page."""
     work.mkdir(parents=True, exist_ok=True)
 
     def figures(scene: str, light: str, method: str) -> dict[str, Any]:
         # Sharp frames are the same whatever the flux.
-        name = f"{scene}-{frames}" if method == SHARP else f"{scene}-{light}-{frames}"
+        name = f"{scene}{_lens(k1)}-{frames}" if method == SHARP else f"{scene}{_lens(k1)}-{light}-{frames}"
         file = work / f"{name}-{method.replace(' ', '-')}.json"
         if not file.exists():
-            file.write_text(json.dumps(measured(scene, light, method, Study(work), frames)))
+            file.write_text(json.dumps(measured(scene, light, method, Study(work), frames, k1)))
         of: dict[str, Any] = json.loads(file.read_text())
         if "seconds" in of:
             print(f"{scene}, {light}, {method}: {of['seconds']:.0f} s, {of['mib']:.0f} MiB", flush=True)

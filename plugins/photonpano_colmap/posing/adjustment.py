@@ -64,6 +64,7 @@ class Adjusted:
     missed_k1: float  # the distortion k1 that observations show beyond that of the lens, to first order
     std_k1: float
     residual_px: float  # median distance of an observation from where its point is seen
+    excess: float  # that in standard deviations, relative to what is expected
 
 
 def adjust(
@@ -76,7 +77,8 @@ def adjust(
     settings = gtsam.LevenbergMarquardtParams()
     settings.setMaxIterations(_MOST_STEPS)
     settings.setRelativeErrorTol(1e-4)
-    covariance, shared = observations.covariance + _FLOOR_PX**2 * np.eye(2), _shared(observations)
+    expected, shared = observations.covariance + _FLOOR_PX**2 * np.eye(2), _shared(observations)
+    covariance = expected
     for _ in range(_REWEIGHTINGS):
         graph, values = _problem(poses, points, observations, covariance * shared[:, None, None], camera, finds_focal)
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
@@ -115,6 +117,7 @@ def adjust(
         float(of_k1 @ gradient[with_k1]),
         float(np.sqrt(of_k1[-1])),
         float(np.median(np.linalg.norm(residuals, axis=1))),
+        float(np.sqrt(np.median(np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(expected), residuals)) / _MEDIAN_OF_TWO)),
     )
 
 
