@@ -29,8 +29,8 @@ from photonpano_colmap.posing.merging import PosedExposure
 from photonpano_colmap.posing.path import Path, PoseSpline, positions_of
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
-_CONTRADICTION, _CONTRADICTION_PX = 5.0, 0.5
-_LARGEST_EXCESS = 1.0  # residuals relative to photon noise; of right poses it was a third, since noise is partly blurred away
+_CONTRADICTION, _CONTRADICTION_PX = 10.0, 0.5
+_LARGEST_EXCESS = 1.0  # residuals relative to photon noise; of right poses it was below a half
 _MISSED = 0.5  # expected next pose update, as a fraction of the last one
 
 

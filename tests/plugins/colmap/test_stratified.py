@@ -28,7 +28,7 @@ from photonpano_colmap.stratified import StratifiedEstimator
 
 CAMERA = Camera.of(FOCAL_PX, SHAPE)
 MATRIX = CAMERA.matrix
-LENS = (-0.1, 0.0, 0.0, 0.0)
+LENS = (-0.2, 0.0, 0.0, 0.0)
 LENS_CAMERA = Camera(MATRIX, np.array(LENS))
 TRUE = Path(true_poses())
 EVERYWHERE = np.ones(N_FRAMES, np.bool_)
@@ -286,7 +286,7 @@ def test_lens_is_seen_through_and_a_wrong_one_is_doubted(given: tuple[float, flo
         assert np.median(np.linalg.norm(LENS_CAMERA.distorted(seen) - view.xy, axis=1)) < 0.5
     else:
         [doubt] = estimate.doubts
-        assert "the exposures contradict the lens: they ask for a k1 of about -0.0" in doubt or "about -0.1" in doubt
+        assert doubt.startswith("the exposures contradict the lens: they ask for a k1 of about -0.")
 
 
 def test_frames_that_show_nothing_are_lost_and_the_others_refined() -> None:
