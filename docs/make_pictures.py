@@ -23,6 +23,7 @@ PICTURES = {
     "first-panorama baselines hot-pixels": scan.pictures,
     "tremor video": tremor.pictures,
     "what-moves action-shot": movers.pictures,
+    "real-world": movers.real_world,
     "night depth": scenes.pictures,
     "room": scenes.room,
     "mandrill": scan.mandrill,

@@ -24,6 +24,10 @@ def pictures(study: Study) -> Iterator[tuple[str, draw.Picture]]:
     """Yield each picture with its name."""
     yield "what-moves.png", panoramas(study, "crowd", CROWD, "show", "hide")
     yield "action-shot.png", panoramas(study, "pair", PAIR, "3000", "action")
+
+
+def real_world(study: Study) -> Iterator[tuple[str, draw.Picture]]:
+    """Yield the picture of three captures in which much happens at once."""
     yield "real-world.png", draw.in_rows([row for name in REAL for row in as_if_and_as_it_is(study, name)])
 
 

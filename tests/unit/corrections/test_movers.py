@@ -27,7 +27,7 @@ STEADY = np.ones(N)
 
 
 @cache
-def panned(with_mover: bool, light: float = 0.0, tremor_px: float = 0.0) -> MemorySource:
+def panned(with_mover: bool, light: float = 0.0, tremor_px: float = 0.0, side: int = 32, speed: float = 0.06) -> MemorySource:
     """A pan over a scene; a square of 32 px walks through the frame in 1,600 frames."""
     scene, rng = Scene(0, (0.1, 0.5)), np.random.default_rng(0)
     frames = np.empty((N, *SHAPE), np.uint8)
@@ -35,25 +35,25 @@ def panned(with_mover: bool, light: float = 0.0, tremor_px: float = 0.0) -> Memo
         at = MOTION.at([first + 3.5])[0] @ translation(tremor_px * np.sin(first / 60), 0)
         view = scene.view(at, SHAPE).copy()
         if with_mover:
-            view[walker(first + 4)] = 0.9
+            view[walker(first + 4, side, speed)] = 0.9
         lit = view * (1 + light * np.cos((first + np.arange(8)) / 40))[:, None, None]
         frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-lit)
     return MemorySource(frames)
 
 
-def walker(frame: int) -> tuple[slice, slice]:
-    left = round(0.06 * frame)
-    return slice(30, 62), slice(left, left + 32)
+def walker(frame: int, side: int = 32, speed: float = 0.06) -> tuple[slice, slice]:
+    left = round(speed * frame)
+    return slice(30, 30 + side), slice(left, left + side)
 
 
-def shares(found: object, frames: range) -> tuple[float, float]:
+def shares(found: object, frames: range, side: int = 32, speed: float = 0.06) -> tuple[float, float]:
     """Return which share of the square is hidden, and of all else."""
     hits, false = [], []
     for frame in frames:
         pixels = found.pixels(FrameSpan(frame, frame + 1))
         hidden = np.zeros(SHAPE, bool) if pixels is None else pixels == 0
         square = np.zeros(SHAPE, bool)
-        square[walker(frame)] = True
+        square[walker(frame, side, speed)] = True
         hits.append(hidden[square].mean())
         false.append(hidden[~square].mean())
     return float(np.mean(hits)), float(np.mean(false))
@@ -70,8 +70,31 @@ def test_what_walks_before_the_background_is_hidden_whatever_the_light(light: fl
 
 
 @pytest.mark.parametrize(("light", "tremor_px"), [(0.0, 0.0), (0.4, 0.0), (0.0, 2.5)], ids=["still", "flicker", "tremor"])
-def test_nothing_is_hidden_where_nothing_moves(light: float, tremor_px: float) -> None:
-    assert find_background(panned(with_mover=False, light=light, tremor_px=tremor_px), MOTION, ALL, Context(1)) is None
+@pytest.mark.parametrize("exact", [False, True])
+def test_nothing_is_hidden_where_nothing_moves(light: float, tremor_px: float, *, exact: bool) -> None:
+    source = panned(with_mover=False, light=light, tremor_px=tremor_px)
+    assert find_background(source, MOTION, ALL, Context(1), exact=exact) is None
+
+
+def test_what_is_small_is_hidden_along_an_exact_motion_alone() -> None:
+    """A square of 16 px covers 2 % of the frame, as much as the errors of a first motion may."""
+    source = panned(with_mover=True, side=16)
+    assert find_background(source, MOTION, ALL, Context(1)) is None
+    found = find_background(source, MOTION, ALL, Context(1), exact=True)
+    assert found is not None
+    hit, false = shares(found, range(100, 1500, 100), side=16)
+    assert hit > 0.9
+    assert false < 0.2
+
+
+def test_places_that_something_hides_most_of_the_time_are_not_taken_for_background_along_an_exact_motion() -> None:
+    """It follows the camera, and so stays before a place that leaves the frame."""
+    source, frames = panned(with_mover=True, speed=0.02), range(0, 1600, 100)
+    rough, exact = (find_background(source, MOTION, ALL, Context(1), exact=each) for each in (False, True))
+    assert rough is not None
+    assert exact is not None
+    assert shares(exact, frames, speed=0.02)[0] > shares(rough, frames, speed=0.02)[0]
+    assert shares(exact, frames, speed=0.02)[0] > 0.9
 
 
 def test_the_merged_background_is_that_without_the_walker() -> None:
