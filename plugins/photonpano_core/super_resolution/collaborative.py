@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct
 
 from photonpano.compiling import compiled
 
@@ -19,16 +20,7 @@ GROUP = 16  # similar patches that are filtered together; a power of 2
 SEARCH = 10  # similar patches are looked for at this distance at most along x and y, px
 STEP = 4  # distance of reference patches, px
 _THRESHOLD = np.float32(2.7)  # coefficients below this many standard deviations of the noise are set to 0
-
-
-def _dct_matrix() -> Image:
-    order, at = np.arange(PATCH)[:, None], np.arange(PATCH)
-    matrix = np.cos(np.pi * (at + 0.5) * order / PATCH) * np.sqrt(2 / PATCH)
-    matrix[0] /= np.sqrt(2)
-    return np.asarray(matrix, np.float32)
-
-
-_DCT = _dct_matrix()
+_DCT: Image = dct(np.eye(PATCH), axis=0, norm="ortho").astype(np.float32)
 
 
 class Patches(NamedTuple):
