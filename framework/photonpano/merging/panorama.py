@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,6 @@ from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
 from photonpano.merging.light import bytes_of_light
 from photonpano.photometry import Tone, WhiteBalance, balanced, debiased, picture_of
 from photonpano.values import FluxImage, FrameSpan, Panorama
-
-if TYPE_CHECKING:
-    from photonpano.geometry import Canvas
 
 
 class MergeRenderer:
