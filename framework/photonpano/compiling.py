@@ -181,5 +181,4 @@ def _temporary_folder() -> Path:
 
 @cache
 def _note(message: str) -> None:
-    """Log a warning once."""
     logger.warning(message)

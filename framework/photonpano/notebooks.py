@@ -78,8 +78,6 @@ def picture_of_png(png: bytes, alt: str) -> str:
 
 @dataclass
 class _Bar:
-    """One stage."""
-
     title: str
     total: int
     unit: str
@@ -92,7 +90,6 @@ class _Bar:
         return f"{self.title}: {count(self.done)} of {count(self.total)} {self.unit}, {duration(seconds)}"
 
     def html(self) -> str:
-        """Return a row of the table."""
         title, _, rest = str(self).rpartition(": ")
         bar = f'<progress value="{self.done}" max="{max(self.total, 1)}"></progress>'
         return f'<tr><td style="text-align:left">{escape(title)}</td><td>{bar}</td><td>{escape(rest)}</td></tr>'

@@ -230,7 +230,6 @@ def descend(
 
 @compiled
 def _parameters(homography: Homography) -> FloatArray:
-    """Return p1..p8 of a homography."""
     p = np.empty(8)
     for i in range(8):
         # The matrix column by column: [[1 + p1, p3, p5], [p2, 1 + p4, p6], [p7, p8, 1]].
@@ -241,7 +240,6 @@ def _parameters(homography: Homography) -> FloatArray:
 
 @compiled
 def _from_parameters(p: FloatArray) -> Homography:
-    """Return the homography of p1..p8."""
     homography = np.zeros((3, 3))
     for i in range(3):
         homography[i, i] = 1

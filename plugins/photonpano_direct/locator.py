@@ -40,8 +40,6 @@ _BLUR_DIFFERENCE = 0.1
 
 
 class _Descent(NamedTuple):
-    """The alignment of some layers."""
-
     homography: Homography  # (3, 3) the motion, in pixels of the finest layer
     # scales of the layers on which all parameters were estimated, and their alignments, coarsest first
     found: Sequence[tuple[float, Aligned]]

@@ -115,7 +115,6 @@ def _compared(layers: Sequence[Layer]) -> int:
 
 
 def _layer_of(view: View) -> Layer:
-    """Return a view with its derivatives."""
     # A Gaussian of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
     blur_px = 1 / math.sqrt(4 * math.pi * view.noise_left)
     gradients = np.empty((2, *view.shape), np.float32)

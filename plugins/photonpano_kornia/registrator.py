@@ -91,8 +91,6 @@ class RegistratorLocator:
 
 
 class _Descent:
-    """Alignment of one layer."""
-
     def __init__(self, moving: View, fixed: View, free: tuple[int, ...], device: torch.device) -> None:
         self._moving, self._fixed, self._free, self._device = moving, fixed, list(free), device
         self._here, self._there = images_on(device, moving.image), images_on(device, fixed.image)

@@ -149,7 +149,6 @@ def _tag(stream: Stream, order: str) -> tuple[int, int, bytes | None]:
 
 
 def _element(stream: Stream, order: str) -> bytes:
-    """Read a short element."""
     _, size, inline = _tag(stream, order)
     if size > (_MOST_BYTES if inline is None else len(inline)):
         raise ValueError(f"{size} bytes are too many for a name or dimensions")
@@ -170,7 +169,6 @@ class _Inflated(io.RawIOBase):
         self._file, self._left, self._zlib = file, size, zlib.decompressobj()
 
     def readable(self) -> bool:
-        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:

@@ -138,7 +138,6 @@ class Drawing(Chance):
                     self._mark(mark, place, self.picked(names, mark["pick"]) if "pick" in mark else names)
 
     def _places(self, mark: Mark, parent: Box, names: Names) -> Iterator[Box]:
-        """Yield the boxes of a mark."""
         x, y, width, height = self._box(mark, parent, names)
         if "scatter" in mark:
             for _ in range(round(mark["scatter"] * width * height / 1e4)):
@@ -175,7 +174,6 @@ class Drawing(Chance):
                 yield place * side / count, side / count
 
     def _mark(self, mark: Mark, box: Box, names: Names) -> None:
-        """Draw a mark in its box."""
         if "draw" in mark:
             drawn = mark["draw"]
             is_choice = isinstance(drawn, list) and isinstance(drawn[0], str)

@@ -201,7 +201,6 @@ class Foreground:
 
 
 def _placed(config: SimulationConfig, flux: float) -> list[Cover]:
-    """Return the boards whose places are given."""
     covers = []
     for board in config.boards:
         texel = max(board.distance_m / config.focal_length_px, max(board.size_m) / _FINEST)

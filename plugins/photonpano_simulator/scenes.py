@@ -45,7 +45,6 @@ def scene_flux(
 
 
 def _drawing(scene: StreetScene | NightScene, shape: tuple[int, int], in_colour: bool) -> NDArray[np.float32]:
-    """Return a linear drawing of (height, width)."""
     linear = srgb_to_linear(street(shape, scene.seed))
     if isinstance(scene, NightScene):
         linear = _at_night(linear, scene.seed, scene.range_db)

@@ -228,7 +228,6 @@ def _read_rates(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]
 
 
 def _read_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Read an (H, W) mask."""
     mask = read_array(path, "a mask")
     if mask.shape != frame_shape or mask.dtype != np.bool_:
         raise InputError(f"{path} holds {mask.dtype} of shape {mask.shape}; a mask is bool of the frame's shape {frame_shape}")

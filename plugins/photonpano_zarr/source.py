@@ -137,7 +137,6 @@ class _Chunks(BinarySource):
             raise InputError(f"{path} is damaged: it cannot be decompressed to a chunk of {shape}; copy it again") from error
 
     def close(self) -> None:
-        """Forget the chunks."""
         super().close()
         self._pieces.close()
 

@@ -287,7 +287,6 @@ def _make(directory: Path) -> None:
 
 
 def _line(row: BatchRow) -> str:
-    """Describe a run that has ended in a line."""
     if row.status == "failed":
         return f"{row.label}: failed: {row.reason.partition(chr(10))[0]}"
     error = row.expected_error_px

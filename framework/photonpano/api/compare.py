@@ -98,7 +98,6 @@ class _Run:
 
     @property
     def files(self) -> list[Path]:
-        """The files of the capture."""
         return [Path(file["path"]) for file in (self.record.get("capture") or {}).get("files") or ()]
 
 

@@ -51,7 +51,6 @@ class WrittenCapture:
     sharp: Path | None = None
 
     def _repr_html_(self) -> str:
-        """Show what was written in a notebook."""
         files = {"capture": self.path, "truth": self.truth, "frames without noise": self.sharp}
         rows = [(name, str(path)) for name, path in files.items() if path]
         return facts([*rows, ("frames", str(self.info)), ("source", str(dict(self.source)))])
@@ -74,7 +73,6 @@ def lines_of_capture(written: WrittenCapture) -> Iterator[str]:
 
 
 def _size(path: Path) -> int:
-    """Return the bytes of a file, or of the files in a folder."""
     return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]))
 
 

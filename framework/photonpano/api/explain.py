@@ -120,7 +120,6 @@ class _Writer:
         self._levels = levels
 
     def lines(self) -> Iterator[str]:
-        """Yield the lines of the whole spec."""
         for section, value in self._plan.document.items():
             if section == "levels" and self._plan.until_converged:
                 yield from (f"# {comment}" for comment in self._levels)

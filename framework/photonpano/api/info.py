@@ -100,7 +100,6 @@ class CaptureInfo:
         ]
 
     def _repr_html_(self) -> str:
-        """Show what was found, and the warnings, in a notebook."""
         return facts([*self.rows(), *(("warning", each) for each in self.warnings)])
 
 
@@ -203,7 +202,6 @@ def _warnings(source: Source, found: CaptureInfo, hot_left: float) -> Iterator[s
 
 
 def _spec(plan: Plan) -> dict[str, Any]:
-    """Return the spec of the capture, without defaults."""
     keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
     spec = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
     return spec | ({} if plan.corrects_itself else {"corrections": plan.document["corrections"]})

@@ -43,7 +43,6 @@ class RenderResult:
     record: RunRecord = field(repr=False)
 
     def _repr_html_(self) -> str:
-        """Show picture and files in a notebook."""
         return run_html(self.directory, self.record)
 
 

@@ -210,7 +210,6 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
 
 
 def _canvas(opened: OpenedRun) -> Canvas:
-    """Return the canvas of the panorama."""
     render, motion = opened.plan.render, opened.motion
     shown = motion.trajectory, motion.span, motion.frame_shape
     view = view_of(motion, opened.source, render.projection, level=render.horizon == "level")

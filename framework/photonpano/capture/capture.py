@@ -188,7 +188,6 @@ class Capture(Closing):
         return self.info.n_frames != self.source.info.n_frames
 
     def _read(self, span: FrameSpan) -> FrameSpan:
-        """Return the frames of the source that are a span of this capture."""
         if not self._is_part:
             return span
         self.info.require(span)

@@ -162,7 +162,6 @@ class PluginSource:
 
     @property
     def _highest(self) -> int:
-        """The highest value of a pixel in a frame."""
         return 1 if self.info.kind == "binary" else 2**self.info.bit_depth - 1
 
     def _attributing(self, where: str) -> AbstractContextManager[None]:

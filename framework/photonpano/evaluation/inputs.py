@@ -79,7 +79,6 @@ class RunTrajectory:
         return Turn(nearest_rotations(self.camera.rotations(self.homographies)), self.camera)
 
     def _repr_html_(self) -> str:
-        """Show the path in a notebook."""
         return drawn_path(self.homographies[self.located], self.frame_shape) + facts(self._rows())
 
     def _rows(self) -> Iterator[tuple[str, str]]:

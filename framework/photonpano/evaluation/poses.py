@@ -166,7 +166,6 @@ class PoseScore:
         return rows
 
     def _repr_html_(self) -> str:
-        """Show the scores in a notebook."""
         return facts(self.rows())
 
 

@@ -79,7 +79,6 @@ class Evaluation:
         return rows
 
     def _repr_html_(self) -> str:
-        """Show the scores in a notebook."""
         return facts(self.rows())
 
 
@@ -134,7 +133,6 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
 
 
 def _motion_scores(run: RunTrajectory, truth: Truth) -> tuple[TrajectoryScore, RotationScore | None]:
-    """Compare the motion of a run with the true one."""
     shape, located, found = run.frame_shape, run.located, run.turn
     if found is not None and truth.turn is not None:
         start = turned_alignment(found, truth.turn, truth.ideal_homographies, located)

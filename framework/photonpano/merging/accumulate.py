@@ -145,7 +145,6 @@ def _visible(source: Capture, chunks: Sequence[Chunk], canvas: Canvas) -> _Visib
 
 
 def _sum_of_run(source: Capture, terms: LightTerms | None, canvas: Canvas, chunks: Sequence[Chunk]) -> _Part:
-    """Sum chunks on the part of a canvas that they cover."""
     footprints = [at for _, at in _visible(source, chunks, canvas)]
     top, bottom = min(at.rows.start for at in footprints), max(at.rows.stop for at in footprints)
     columns = [each for at in footprints for each in at.columns]

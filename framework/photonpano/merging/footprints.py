@@ -85,7 +85,6 @@ class _Remap:
     frame_shape: tuple[int, int]
 
     def footprints(self, homographies: FloatArray) -> list[Footprint]:
-        """Return the footprint of each frame."""
         to_rays = _to_rays(self.canvas, homographies)
         shrink = _shrink_factors(to_rays, self.canvas, self.frame_shape)
         rows, columns = self._touched(to_rays, max(shrink, default=1))

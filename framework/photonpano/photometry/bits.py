@@ -79,7 +79,6 @@ def _sum_bits(
 
 @compiled
 def _add_eight(rows: NDArray[np.uint64]) -> None:
-    """Add eight rows of bits to three of counter, and leave the carry."""
     # All rows lie in one array, at distances known at compile time, so that the loop is vectorised.
     for word in range(_WORDS):
         one, two, four = rows[8 * _WORDS + word], rows[9 * _WORDS + word], rows[10 * _WORDS + word]

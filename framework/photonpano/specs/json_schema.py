@@ -154,7 +154,6 @@ def _items(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Sche
 
 
 def _corrections(schemas: dict[type[BaseModel], Schema]) -> Schema:
-    """Return the schema of the list of corrections."""
     alone = [name for name, model in CORRECTIONS.items() if not any(key.is_required() for key in model.model_fields.values())]
     one = {
         "type": "object",

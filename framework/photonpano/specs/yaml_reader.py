@@ -105,7 +105,6 @@ class _Reader:
         return replace(self.root, where=where, line=mark.line + 1, column=mark.column + 1)
 
     def place(self, node: Node, where: str) -> Place:
-        """Return the place where a node begins."""
         return self.marked(node.start_mark, where)
 
     def value(self, node: Node, place: Place) -> Written:
@@ -166,7 +165,6 @@ class _Reader:
         return []
 
     def report(self, node: Node, where: str, message: str) -> None:
-        """Report a problem where a node begins."""
         self.problems.append(self.place(node, where).problem(message))
 
     def unreadable(self, place: Place, message: str) -> Written:
@@ -176,7 +174,6 @@ class _Reader:
         return Written(None, replace(place, is_readable=False))
 
     def is_known(self, node: Node, *names: str) -> bool:
-        """Return whether the tag of a node is one of these."""
         return node.tag in {f"{TAG}{name}" for name in names}
 
     def scalar(self, node: ScalarNode, place: Place) -> Written:

@@ -54,8 +54,6 @@ class BurstMerger:
 
 
 class _Burst:
-    """The blocks of a group."""
-
     def __init__(self, source: Source, group: Group, config: BurstConfig) -> None:
         self._source, self._group, self._config = source, group, config
         self._counts = WeightedFrames(source)

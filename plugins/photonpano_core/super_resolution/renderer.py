@@ -187,7 +187,6 @@ class _Shares:
         self._share, self._done = 0.0, 0
 
     def add(self, share: float, times: int) -> None:
-        """Add a share of the work, some times."""
         self._share += share * times
         done = min(int(self._share * self._n_frames), self._n_frames)
         self._advance(done - self._done)

@@ -58,8 +58,6 @@ class ImageFolderSource(IntensitySource):
 
 
 class _Folder:
-    """A file for each frame."""
-
     def __init__(self, path: Path) -> None:
         require_readable(path)
         self._files = pictures_in(path)

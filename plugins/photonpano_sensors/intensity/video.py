@@ -40,7 +40,6 @@ class _Decoder:
     """Decodes a video from a key frame on: the frame `next`, in the thread that has the lock `turn`; `users` want it."""
 
     def __init__(self, index: VideoIndex, threads: int) -> None:
-        """Open the video once more."""
         self._index = index
         self._container = open_video(index.path)
         self._stream = self._container.streams.video[0]
@@ -76,7 +75,6 @@ class _Decoder:
         return due, _luma(frame, self._index)
 
     def close(self) -> None:
-        """Close the file."""
         self._container.close()
 
     def _seek(self, key: int) -> None:

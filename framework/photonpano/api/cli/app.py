@@ -33,11 +33,9 @@ class _Command(TyperCommand):
 
     @cached_property
     def loaded(self) -> Any:
-        """The command of the module."""
         return loaded(self.words, self._module)
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
-        """Read the command line."""
         return self.loaded.make_context(*arguments, **options)
 
 
@@ -60,7 +58,6 @@ class _Commands(TyperGroup):
                 self.add_command(group)
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Return the parameters."""
         return with_verbosity(super().get_params(ctx))
 
 

@@ -58,7 +58,6 @@ class _Warnings(logging.Handler):
         self._debug = debug
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print a warning."""
         if record.name == SHOWN:
             return
         if self._debug and record.exc_info:

@@ -161,8 +161,6 @@ def _bar(console: Console, unit: str) -> RichProgress:
     from rich.text import Text
 
     class Rate(ProgressColumn):
-        """Units per second."""
-
         def render(self, task: Task) -> Text:
             speed = task.finished_speed or task.speed
             return Text(f"{speed:,.0f} {unit}/s" if speed and speed >= 10 else f"{speed or 0:.1f} {unit}/s")

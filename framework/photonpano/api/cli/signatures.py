@@ -59,7 +59,6 @@ def loaded(words: str, module: str) -> Any:
 
 
 def _callback(declared: Command) -> Callable[..., None]:
-    """Return the function that typer calls, with a parameter for each option."""
     own = [name for name in inspect.signature(declared.function).parameters if name not in _GIVEN]
     printing = [name for name, each in inspect.signature(declared.prints).parameters.items() if each.kind is each.KEYWORD_ONLY]
 
