@@ -13,7 +13,7 @@ from photonpano import render
 
 from . import finished
 
-WIDTH = 900
+WIDTH, SMALL = 900, 620
 CROWD = simulator(**BASE, path=TURN, n_frames=6000, **people(0.25, **FAST))
 PAIR = simulator(**BASE | {"flux": 0.4}, path=TURN, n_frames=6000, **people(0.12, number=2, speed_px=0.12))
 REAL = ("people 40 fast, street 2", "boards 40", "people 14, boards 25, lamps, dark")
@@ -37,7 +37,7 @@ def as_if_and_as_it_is(study: Study, name: str) -> Iterator[draw.Picture]:
     cube = study.capture(name.replace(",", ""), simulator(**BASE | {"path": TURN | path} | others, n_frames=6000))
     for label, spec in (("as if", AS_IF), ("as it is", {})):
         run = finished(study, f"{name} {label}", packed(cube) | spec, cube)
-        yield draw.fitted(cv2.imread(str(run / "panorama.png"), cv2.IMREAD_GRAYSCALE), WIDTH)
+        yield draw.fitted(cv2.imread(str(run / "panorama.png"), cv2.IMREAD_GRAYSCALE), SMALL)
 
 
 def panoramas(study: Study, name: str, spec: dict[str, object], *movers: str) -> draw.Picture:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -268,12 +269,7 @@ def cut_at_jumps(state: State) -> Proposal | None:
     def make(cuts: Sequence[Cut] = cuts) -> State | None:
         levels = build_levels(state.plan, state.source, [])
         try:
-            # What hides the background was looked for along a motion without cuts.
-            uncut = replace(state, source=before(state.source, None), watched=False, levels=levels)
-            first = replace(uncut, timeline=state.timeline.cut_at(cuts)).located(levels[:1], state.start)
-            cut = later_levels(tried(first, without_movers).state, []).make()
-            assert cut is not None
-            cut = tried(cut, again_without_movers).state
+            cut = _located_anew(replace(state, timeline=state.timeline.cut_at(cuts), levels=levels))
         except UntiedError as error:
             if shots := shots_of(state.source, error):
                 raise ApartError(shots) from error
@@ -289,3 +285,13 @@ def cut_at_jumps(state: State) -> Proposal | None:
     places = ", ".join(f"frame {each.frame}" for each in cuts)
     rejection = f"the image seems to jump before {places}, but the motion is not cut there"
     return Proposal(make, (lambda *_: "") if dark else MotionFit.worse_than, rejection=rejection, severity=logging.WARNING)
+
+
+def _located_anew(state: State) -> State:
+    """Locate all levels; what hides the background is found anew, since that was done along another motion."""
+    if capture_of(state.source).background is None:
+        return state.located(state.levels, state.start)
+    anew = replace(state, source=before(state.source, None), watched=False).located(state.levels[:1], state.start)
+    for each in (without_movers, partial(later_levels, journal=[]), again_without_movers):
+        anew = tried(anew, each).state
+    return anew
