@@ -216,7 +216,8 @@ def without_movers(state: State) -> Proposal | None:
     if _uncertain(state):
         return None
     last, source = state.results[-1], before(state.view.source, None)
-    exact = last.level.number == state.levels[-1].number > 1
+    # The motion after a single level is as rough as that after the first of several.
+    exact = len(state.levels) > 1 and last.level.number == state.levels[-1].number
     found = find_background(source, state.trajectory, state.motion.span, state.context, exact=exact)
     located = last.located
     if (layers := located.solution.layers) is not None:
