@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from photonpano.capture import before, capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.geometry import Canvas, inverse, outline_of, rescaling
 from photonpano.merging.colour import channels_of
@@ -23,7 +24,7 @@ from photonpano.report.figures import centre_of, instants_of, places_on
 from photonpano.report.preview import still_exposure
 from photonpano.report.residual_figures import chi2_cells, same_projection
 from photonpano.residuals.refinement import Explained, distance_to_nearest
-from photonpano.values import FloatArray, FluxImage, FrameSpan
+from photonpano.values import Background, FloatArray, FluxImage, FrameSpan
 
 # Maximum number of values of linear data, some megabytes; a larger panorama is reduced.
 LINEAR_VALUES = 1_200_000
@@ -33,6 +34,8 @@ MAP_PIXELS = 500  # longer side of a map
 # Number of short sums of frames on the page; fewer in colour, where a sum takes a hundred times as long.
 GLIMPSES, COLOURED_GLIMPSES = 40, 12
 GLIMPSE_PIXELS = 240
+TINT = "#ff3d9a"  # over what hides the background; its opacity, and that of its outline, follow
+_OPACITY, _OUTLINE = 80, 255
 VIEW_PIXELS = 1000  # longer side of the pictures of one instant
 _INSTANTS = 600  # number of frames whose outline is on the page
 _COLOURS = 6  # colours of a legend, between which a browser blends
@@ -48,6 +51,7 @@ def viewer_data(
     balance = balance if isinstance(balance, str) else tuple(balance)
     instant = shared_instant(motion, levels)
     spans = [len(span) for span in explained.residuals.spans]
+    background = capture_of(source).background
     return {
         "size": [panorama.canvas.width, panorama.canvas.height],
         "linear": linear_data(balanced(panorama.thumbnail.flux, balance), white),
@@ -56,8 +60,9 @@ def viewer_data(
         "path": path_data(motion, panorama),
         "rate": record["source"]["frame_rate_hz"],
         "glimpses": glimpses(source, int(np.median(spans)), white),
+        "tint": None if background is None else TINT,
         "instant": instant,
-        "views": views_of_instant(instant, motion, panorama, source, levels),
+        "views": views_of_instant(instant, motion, panorama, before(source, None), levels),
     }
 
 
@@ -167,8 +172,8 @@ def _rounded(points: FloatArray) -> Any:
 
 
 def glimpses(source: Source, n_frames: int, white: float) -> list[dict[str, Any]]:
-    """Return short sums of frames, all over the capture."""
-    total = source.info.n_frames
+    """Return short sums of frames, all over the capture, of all photons; and what hides the background, if anything does."""
+    total, background, source = source.info.n_frames, capture_of(source).background, before(source, None)
     n_frames = min(n_frames, total)
     most = COLOURED_GLIMPSES if channels_of(source) > 1 else GLIMPSES
     found = []
@@ -177,7 +182,19 @@ def glimpses(source: Source, n_frames: int, white: float) -> list[dict[str, Any]
         picture = shrunk(tone_mapped(still_exposure(source, span), white), GLIMPSE_PIXELS)
         frame = (span.start + span.stop - 1) // 2
         found.append({"frame": frame, "first": span.start, "last": span.stop - 1, "uri": jpeg_uri(picture, quality=75)})
+        if background is not None:
+            found[-1] |= _tint(background, frame, picture.shape[:2])
     return found
+
+
+def _tint(background: Background, frame: int, shape: tuple[int, int]) -> dict[str, Any]:
+    """Return a picture to lay over a frame, and the share of the frame that hides the background."""
+    shown = background.pixels(FrameSpan(frame, frame + 1))
+    hidden = 1 - (np.ones(background.frame_shape, np.uint8) if shown is None else shown)
+    inside = cv2.resize(hidden, shape[::-1], interpolation=cv2.INTER_NEAREST)
+    colours = np.full((*shape, 4), [*bytes.fromhex(TINT[1:]), 0], np.uint8)
+    colours[..., 3] = np.where(inside > cv2.erode(inside, np.ones((3, 3))), _OUTLINE, _OPACITY * inside)
+    return {"tint": png_uri(colours), "hidden": round(float(hidden.mean()), 4)}
 
 
 def shared_instant(motion: FrameMotion, levels: Sequence[LevelResult]) -> int:

@@ -1,8 +1,10 @@
 import base64
+import re
 import zlib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,11 +12,13 @@ import pytest
 
 import photonpano.report
 from photonpano import FrameSpan, Group, Panorama, StreamInfo, VirtualExposure
+from photonpano.capture import before
 from photonpano.geometry import Canvas, rescaling, translation
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.report import viewer
-from photonpano.testing import KnownMotion
+from photonpano.report import OpenCapture, render_report, viewer
+from photonpano.testing import KnownMotion, MemorySource
+from photonpano.values import CELL_PX, Background
 
 SCRIPT = Path(photonpano.report.__file__).parent / "templates" / "viewer.js"
 
@@ -138,6 +142,52 @@ def test_views_of_an_instant_show_one_place(instant):
     frame, _, level_view, panorama = (decoded_picture(view["uri"])[8:-8, 8:-8] for view in views)
     assert np.corrcoef(frame.ravel(), panorama.ravel())[0, 1] > 0.97
     assert np.corrcoef(level_view.ravel(), panorama.ravel())[0, 1] > 0.97
+
+
+def capture_of_a_person(hidden_cells: int) -> OpenCapture:
+    """Frames of noise as large as those of the fixtures, of which some cells at the left hide the background."""
+    shape, instant = (254, 496), 30.0
+    source = MemorySource(np.random.default_rng(0).random((60, *shape)) < 0.5)
+    shown = np.ones((1, *(-(-side // CELL_PX) for side in shape)), bool)
+    shown[..., :hidden_cells] = False
+    found = Background(np.array([instant]), shown, np.ones_like(shown), shape) if hidden_cells else None
+    flux = np.ones(shape, np.float32)
+    exposure = VirtualExposure(flux, flux, Group(source.info.span, instant), 1.0, source.response)
+    solution = SimpleNamespace(located=np.array([True]))
+    located = SimpleNamespace(instants=np.array([instant]), solution=solution)
+    exposures = SimpleNamespace(merged=lambda _: exposure)
+    level: Any = SimpleNamespace(level=SimpleNamespace(number=1), located=located, exposures=exposures)
+    return OpenCapture(before(source, found), [level])
+
+
+def test_pictures_of_frames_have_all_photons():
+    capture = capture_of_a_person(31)
+    found = viewer.glimpses(capture.source, 16, 1.0)
+    assert {each["hidden"] for each in found} == {0.5}
+    seen = decoded_picture(found[20]["uri"])
+    assert seen[:, :100].mean() == pytest.approx(seen[:, 140:].mean(), rel=0.05)
+
+
+@pytest.mark.parametrize(("hidden_cells", "width"), [(31, 1400), (31, 400), (0, 1400)])
+def test_hidden_parts_are_tinted_if_there_are_any(
+    browser_page: Any, record, explained, panorama, tmp_path: Path, hidden_cells: int, width: int
+):
+    path = tmp_path / "report.html"
+    path.write_text(render_report(record, explained, panorama, capture=capture_of_a_person(hidden_cells)), encoding="utf-8")
+    browser_page.open(path, width)
+    browser_page.wait_for('document.querySelector("#viewer.live")')
+    text = browser_page.run("document.querySelector('.scrubber').textContent")
+    assert re.findall(r"hidden parts: (\d+) % of this picture", text) == (["50"] if hidden_cells else [])
+    boxes = """[...document.querySelectorAll('.seen img')].map(
+      (each) => (({x, y, width, height}) => [x, y, width, height])(each.getBoundingClientRect()))"""
+    browser_page.wait_for("[...document.querySelectorAll('.seen img')].every((each) => each.complete)")
+    picture, *tints = browser_page.run(boxes)
+    assert tints == ([picture] if hidden_cells else [])
+    assert browser_page.run("document.documentElement.scrollWidth") == width
+    if hidden_cells:
+        browser_page.run("document.querySelector('.hidden-parts').click()")
+        assert browser_page.run(boxes)[1] == [0, 0, 0, 0]
+    assert (browser_page.messages, browser_page.requests) == ([], [])
 
 
 def test_script_can_stand_in_a_page():

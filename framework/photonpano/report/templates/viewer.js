@@ -266,6 +266,7 @@
   // A slider over frames: where the frame lies on the panorama, when, and what the camera saw.
   function scrubber(viewer) {
     const { frames, std } = data.path, image = element("img", { class: "glimpse", alt: "What the camera saw" });
+    const tint = element("img", { class: "tint", alt: "" }), share = element("span");
     const frame = slider("Frame", { min: 0, max: frames.length - 1, value: data.path.start, "aria-label": "Frame" }, (index) => {
       viewer.state.instant = index;
       viewer.redraw();
@@ -273,6 +274,10 @@
       const nearest = data.glimpses.reduce((best, each) => Math.abs(each.frame - now) < Math.abs(best.frame - now) ? each : best);
       if (image.getAttribute("src") !== nearest.uri) image.src = nearest.uri;
       image.title = `The sum of frames ${nearest.first} to ${nearest.last}`;
+      if (data.tint) {
+        tint.src = nearest.tint;
+        share.textContent = `${Math.round(100 * nearest.hidden)} % of this picture hides the background; left out of the motion`;
+      }
       const time = data.rate ? `, ${number(1000 * now / data.rate)} ms` : "";
       const error = std[index] === null ? "not located" : `expected error ${number(std[index])} px`;
       return `${now.toLocaleString("en")}${time}: ${error}`;
@@ -288,7 +293,15 @@
       play.textContent = playing ? "Stop" : "Play";
     });
     frame.row.prepend(play);
-    return element("div", { class: "scrubber" }, frame.row, image);
+    const side = element("div", {}, frame.row), seen = element("div", { class: "seen" }, image);
+    if (data.tint) {
+      const swatch = element("span", { class: "swatch", style: `background: ${data.tint}` });
+      const hidden = element("input", { type: "checkbox", checked: "" });
+      hidden.addEventListener("change", () => { tint.hidden = !hidden.checked; });
+      side.append(element("label", { class: "hidden-parts" }, hidden, " ", swatch, " hidden parts: ", share));
+      seen.append(tint);
+    }
+    return element("div", { class: "scrubber" }, side, seen);
   }
 
   // Two pictures of one instant, one over the other, with a divider to drag.
