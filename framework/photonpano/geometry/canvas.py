@@ -141,6 +141,12 @@ class Canvas:
         y = np.arange(self.height, dtype=np.float64)
         return self._projection.down(y if self.planar else (y - self.transform[1, 2]) / self.transform[1, 1])
 
+    def on_plane(self, pixels: FloatArray) -> FloatArray:
+        """Return the homogeneous pixels of the reference plane at (..., 2) pixels of the canvas: (..., 3)."""
+        transform = np.eye(3) if self.planar else self.transform
+        points = (pixels - transform[:2, 2]) / np.diag(transform)[:2]
+        return np.asarray(self._projection.rays(points) @ np.linalg.inv(self.plane_to_rays).T)
+
     def pixels(self, rays: FloatArray) -> FloatArray:
         """Return where (..., 3) rays lie on the canvas, or beside it: (..., 2); NaN behind a plane.
 

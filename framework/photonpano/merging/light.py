@@ -124,31 +124,28 @@ class LightTerms:
         return LitFrames(np.ascontiguousarray(by_class[:, 0]), np.maximum(gains, 0))
 
 
-def amplitudes(light: Light, to_plane: Homography, shape: tuple[int, int]) -> list[FluxImage]:
-    """Return the amplitudes of the lamps at the pixels of a grid, whose pixels `to_plane` maps: (H, W) for each of the maps."""
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    size = (shape[1], shape[0])
-    return [
-        np.asarray(cv2.warpPerspective(each, light.to_map @ to_plane, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
-        for each in light.maps
-    ]
-
-
 def amplitudes_on(light: Light, canvas: Canvas) -> list[FluxImage]:
-    """Return the amplitudes of the lamps at the pixels of a canvas; where the maps end, those of their borders."""
-    if canvas.planar:
-        return amplitudes(light, inverse(canvas.transform), canvas.shape)
-    (p, s), (q, r) = canvas.columns(), canvas.rows()
-    to_map = light.to_map @ np.linalg.inv(canvas.plane_to_rays)
-    u, v, depth = (a * np.outer(r, p) + b * q[:, None] + c * np.outer(r, s) for a, b, c in to_map)
-    x, y = (np.clip(each / np.maximum(depth, 1e-6), -1, _FAR).astype(np.float32) for each in (u, v))
+    """Return the amplitudes of the lamps at the pixels of a canvas, (H, W) for each map; beyond its end, those at the end."""
+    _, height, width = light.maps.shape
+    if light.camera_matrix is None and canvas.planar:
+        flags, onto = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, light.to_map @ inverse(canvas.transform)
+        size = canvas.width, canvas.height
+        return [
+            np.asarray(cv2.warpPerspective(each, onto, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
+            for each in light.maps
+        ]
+    projection = "planar" if light.camera_matrix is None else "spherical"
+    maps = Canvas(height, width, light.to_map, projection, light.camera_matrix)
+    grid = np.stack(np.meshgrid(np.arange(canvas.width, dtype=float), np.arange(canvas.height, dtype=float)), axis=-1)
+    places = np.nan_to_num(maps.pixels(canvas.on_plane(grid) @ maps.plane_to_rays.T), nan=_FAR)
+    x, y = np.moveaxis(np.clip(places, -1, _FAR).astype(np.float32), -1, 0)
     return [np.asarray(cv2.remap(each, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)) for each in light.maps]
 
 
 def gain_image(light: Light, span: FrameSpan, to_plane: Homography, shape: tuple[int, int]) -> FluxImage:
-    """Return the mean gain of the pixels of a frame over a span: (H, W); see `amplitudes`."""
+    """Return the mean gain of the pixels of a frame over a span: (H, W); see `amplitudes_on`."""
     gain, *waves = light.terms(span).mean(axis=1)
     image = np.full(shape, gain, np.float32)
-    for wave, amplitude in zip(waves, amplitudes(light, to_plane, shape), strict=True):
+    for wave, amplitude in zip(waves, amplitudes_on(light, Canvas(*shape, inverse(to_plane))), strict=True):
         image += np.float32(wave) * amplitude
     return np.maximum(image, np.float32(0))

@@ -110,8 +110,8 @@ def make_panorama(run: BegunRun) -> None:
         if (background := capture_of(state.source).background) is not None:
             journal.append(decision_of(background))
         source, context = state.view
-        verdict = judge(explained, state.results, journal)
         panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context)
+        verdict = judge(explained, state.results, [*journal, *chosen])
         run.observers.rendered(panorama.canvas, panorama.seconds)
         if plan.output.keep == "exposures":
             with folder.writing():

@@ -353,6 +353,16 @@ def _layers(run: _Run) -> _Found | None:
 
 
 @_doubtful_above(
+    1 / 3,
+    "the background of much of the panorama was never seen, as where one thing fills the middle of all frames",
+    "record so that each place is seen without what hides it; the motion may be that of what fills the frames",
+)
+def _never_seen(run: _Run) -> _Found | None:
+    shares = [float(each.value) for each in run.decisions if each.what == "background_never_seen"]
+    return _Found(shares[-1], "share of the panorama") if shares else None
+
+
+@_doubtful_above(
     0,
     "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
     "leave these frames out, or keep the light on",

@@ -24,10 +24,11 @@ class Light:
     Attributes:
         gain: (T,) float64, not negative: of all of the scene.
         waves: (K, T) float64, cosine and sine of the lamps, between -1 and 1; (0, T) if all of the scene has one gain.
-        maps: (K, h, w) float32, their amplitude at places of the reference plane.
-        to_map: (3, 3), pixels of the reference plane to pixels of `maps`.
+        maps: (K, h, w) float32, their amplitude at places of the scene.
+        to_map: (3, 3), pixels of the reference plane to pixels of `maps`; on a sphere (a, b, 1) to pixels, as that of a canvas.
         frequency: flickers in a frame period; 0 for light that does not flicker.
         std: (T,) standard deviation of `gain` by photon noise; infinite for frames that are left out, whose gain is 0.
+        camera_matrix: (3, 3) of the reference camera around which `maps` lie on a sphere; None if they lie on its plane.
     """
 
     gain: FloatArray
@@ -36,6 +37,7 @@ class Light:
     to_map: Homography
     frequency: float
     std: FloatArray
+    camera_matrix: FloatArray | None = None
 
     @classmethod
     def of_frames(cls, gain: FloatArray, frequency: float = 0.0, std: FloatArray | None = None) -> Light:

@@ -71,3 +71,16 @@ def test_gain_of_lamps_follows_the_place_of_the_frame() -> None:
     light = Light(np.ones(8), waves, maps, np.eye(3), 1 / (2 * np.pi), np.zeros(8))
     image = gain_image(light, FrameSpan(3, 4), translation(6, 0), (4, 10))
     np.testing.assert_allclose(image[2], 1 + np.cos(3) * 0.01 * (np.arange(10) + 6), atol=1e-5)
+
+
+def test_lamps_around_a_camera_are_where_it_looks() -> None:
+    """Amplitudes on a sphere, in steps of half a degree, are those of the directions of a frame turned by 70 degrees."""
+    camera_matrix, turned = np.array([[90.0, 0, 49.5], [0, 90, 24.5], [0, 0, 1]]), np.deg2rad(70)
+    maps = np.zeros((2, 80, 400), np.float32)
+    maps[0] = 0.002 * np.arange(400)
+    to_map = np.array([[360 / np.pi, 0, 100], [0, 360 / np.pi, 40], [0, 0, 1]])
+    light = Light(np.ones(1), np.ones((2, 1)), maps, to_map, 0.1, np.zeros(1), camera_matrix)
+    turn = np.array([[np.cos(turned), 0, np.sin(turned)], [0, 1, 0], [-np.sin(turned), 0, np.cos(turned)]])
+    image = gain_image(light, FrameSpan(0, 1), camera_matrix @ turn @ np.linalg.inv(camera_matrix), (50, 100))
+    directions = 70 + np.rad2deg(np.arctan2(np.arange(100) - 49.5, 90))
+    np.testing.assert_allclose(image[24], 1 + 0.002 * (100 + 2 * directions), atol=1e-4)

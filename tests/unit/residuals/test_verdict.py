@@ -259,6 +259,13 @@ def test_rotations_that_do_not_explain_the_pairs_are_doubtful(
     assert [(reason.what, reason.figure) for reason in reasons] == [(NO_TURN, np.sqrt(rotation))] * doubtful
 
 
+@pytest.mark.parametrize(("what", "most"), [("movers", 0.5), ("background_never_seen", 1 / 3)])
+def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained, what: str, most: float) -> None:
+    """A thing that fills the middle of all frames passes for the scene, and what is seen beside it for what hides that."""
+    found = [judge(explained, (), [Decision(what, share, "")]).reasons for share in (most - 0.02, most + 0.02)]
+    assert [[reason.figure for reason in reasons] for reasons in found] == [[], [most + 0.02]]
+
+
 @pytest.mark.parametrize(("along", "doubtful"), [(6.0, True), (1.5, False), (0.1, False)])
 @pytest.mark.parametrize("angle", [0, 37, 90])
 def test_motion_along_an_edge_is_doubtful(explained: Explained, angle: int, along: float, doubtful: bool) -> None:

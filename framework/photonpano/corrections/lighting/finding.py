@@ -19,7 +19,7 @@ from photonpano.corrections.lighting.gains import Gains, seen_cells, solve_gains
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
 from photonpano.geometry import corner_displacements, inverse
-from photonpano.values import Decision, FloatArray, FrameSpan, Homography, Light
+from photonpano.values import Decision, FloatArray, FrameSpan, Light
 
 LIGHT_DECISION = "light"  # what a record names the decision to divide by the gain of the light
 # Least root mean square of changes of the light, between instants that see the same places, that are divided out.
@@ -35,7 +35,7 @@ _LINE_SHARE = 0.6  # least share of the changes of the light, without a slow cur
 _SMALLEST = 0.01  # least root mean square of a flicker, relative to the light
 _DARKEST = 0.02  # least gain of spans from which slow changes are fitted
 LIGHT_FILE = "light.npz"
-_ARRAYS = ("gain", "waves", "maps", "to_map", "frequency", "std")
+_ARRAYS = ("gain", "waves", "maps", "to_map", "frequency", "std", "camera_matrix")  # the last one if there is one
 
 
 def find_light(source: Source, trajectory: Trajectory, context: Context) -> Light | None:
@@ -63,8 +63,8 @@ def _measured(source: Source, trajectory: Trajectory, context: Context) -> Light
     bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
     gains = _gains(source, trajectory, [FrameSpan(*pair) for pair in pairwise(bounds)], context)
     frequency = local_frequency(gains)
-    if frequency and gains.seen.to_cells is not None:
-        return _light_of(measure_local_flicker(gains, frequency), gains.seen.to_cells, gains, n_frames)
+    if frequency:
+        return _light_of(measure_local_flicker(gains, frequency), gains, n_frames)
     lengths = np.array([len(span) for span in gains.seen.spans], float)
     gain, std, frequency = gain_of_frames(gains.seen.instants, gains.gain, gains.std, lengths, n_frames)
     mean = float(gain.mean())
@@ -92,13 +92,15 @@ def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray
     return Light.of_frames(found / mean, frequency, noise / mean).leaving_out(light.shown)
 
 
-def _light_of(flicker: LocalFlicker, to_map: Homography, gains: Gains, n_frames: int) -> Light:
+def _light_of(flicker: LocalFlicker, gains: Gains, n_frames: int) -> Light:
     """Return the light of each frame, which flickers differently at each place."""
     frames = np.arange(n_frames)
     slow, std = (np.interp(frames, gains.seen.instants, each) for each in (flicker.slow, gains.std))
     phase = 2 * np.pi * flicker.frequency * frames
     maps = np.stack([flicker.cosine, flicker.sine])
-    return Light(slow / slow.mean(), np.stack([np.cos(phase), np.sin(phase)]), maps, to_map, flicker.frequency, std)
+    waves, canvas = np.stack([np.cos(phase), np.sin(phase)]), gains.seen.canvas
+    camera_matrix = None if canvas.planar else canvas.camera_matrix
+    return Light(slow / slow.mean(), waves, maps, canvas.transform, flicker.frequency, std, camera_matrix)
 
 
 def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:
@@ -219,7 +221,7 @@ def _smooth(instants: FloatArray, values: FloatArray, std: FloatArray) -> Callab
 
 def write_light(folder: Path, light: Light) -> None:
     """Write light.npz into a folder."""
-    arrays: dict[str, Any] = {name: np.asarray(getattr(light, name)) for name in _ARRAYS}
+    arrays: dict[str, Any] = {name: getattr(light, name) for name in _ARRAYS if getattr(light, name) is not None}
     np.savez(folder / LIGHT_FILE, **arrays)
 
 
@@ -234,7 +236,7 @@ def in_light_of(source: Source, folder: Path) -> Source:
         return source
     try:
         with np.load(path, allow_pickle=False) as archive:
-            arrays: dict[str, Any] = {name: archive[name] for name in _ARRAYS}
+            arrays: dict[str, Any] = {name: archive[name] for name in _ARRAYS if name in archive}
         light = Light(**{**arrays, "frequency": float(arrays["frequency"])})
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: cannot be read as the light of a run ({error}); run again") from error

@@ -13,8 +13,8 @@ from photonpano.corrections.lighting.finding import speed_px
 from photonpano.corrections.lighting.gains import SMOOTHING, STRUCTURE, SeenCells, seen_cells
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
-from photonpano.geometry import inverse, transform_points
-from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography
+from photonpano.geometry import inverse
+from photonpano.values import FloatArray, FluxImage, FrameSpan
 
 _SPANS, _SPAN_PX = 128, 4.0  # most spans of frames that are compared; the image moves by no more than this in each
 _KNOTS = 12  # knots of the gain along the shorter side of a frame; between them, its logarithm is bilinear
@@ -50,34 +50,30 @@ def measure_pixel_gain(source: Source, trajectory: Trajectory, context: Context)
     what the motion leaves open stays flat, as does the field of a sensor whose pixels are alike.
 
     Raises:
-        InputError: the motion cannot tell the gain from the scene, or the camera turns too far for a plane.
+        InputError: the motion cannot tell the gain from the scene.
     """
     n_frames, shape = source.info.n_frames, source.info.frame_shape
     length = max(1, min(int(_SPAN_PX / max(speed_px(source, trajectory), 1e-9)), n_frames // _SPANS))
     starts = np.linspace(0, n_frames - length, min(_SPANS, n_frames // length)).astype(int).tolist()
     spans = [FrameSpan(start, start + length) for start in starts]
     seen = seen_cells(source, trajectory, spans, context)
-    if seen.to_cells is None:
-        raise InputError(
-            "corrections: flat-field: the camera turns too far for a plane, on which the gain is measured; leave it out"
-        )
     knots = _Knots.of(shape)
-    places = _on_sensor(seen, inverse(trajectory.at(seen.instants)), seen.to_cells)
+    places = _on_sensor(seen, inverse(trajectory.at(seen.instants)))
     log_gain, variance = knots.image(*_solved(seen, knots.basis(places), knots.correlation()), source.valid)
     gain = np.exp(log_gain)
     gain /= gain[source.valid].mean()
     return PixelGain(gain.astype(np.float32), np.sqrt(variance).astype(np.float32), seen.spans)
 
 
-def _on_sensor(seen: SeenCells, to_frames: FloatArray, to_cells: Homography) -> FloatArray:
+def _on_sensor(seen: SeenCells, to_frames: FloatArray) -> FloatArray:
     """Return the pixel of the sensor that the middle of each observed square fell on: (N, 2)."""
-    rows, columns = np.divmod(seen.cells, seen.shape[1])
+    rows, columns = np.divmod(seen.cells, seen.canvas.width)
     places = np.empty((len(seen.cells), 2))
-    cells: FloatArray = np.stack([columns, rows], axis=-1).astype(float)
-    middles = transform_points(inverse(to_cells), cells)
+    middles = seen.canvas.on_plane(np.stack([columns, rows], axis=-1))
     for time, homography in enumerate(to_frames):
         of_time = seen.times == time
-        places[of_time] = transform_points(homography, middles[of_time])
+        x, y, depth = homography @ middles[of_time].T
+        places[of_time] = np.stack([x / depth, y / depth], axis=-1)
     return places
 
 

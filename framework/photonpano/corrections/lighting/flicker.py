@@ -6,14 +6,17 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize_scalar
 
-from photonpano.corrections.lighting.gains import STRUCTURE, Gains, SeenCells, equations_of_groups
+from photonpano.corrections.lighting.gains import SMOOTHING, STRUCTURE, Gains, SeenCells, equations_of_groups
 from photonpano.values import FloatArray, FluxImage
 
-_PERIODS = 2.5  # periods for which a place must be in view
+_PERIODS = 1.2  # periods for which a place must be in view
 _FINER = 3  # oversampling of frequency: steps per 1/T, where a place is in view for T
-_STANDS_OUT = 3.0  # least power of a flicker, relative to the median over frequencies
-_LINE = 10.0  # least power of a line in the spectrum of the light of all of the scene, relative to the median nearby
+_STANDS_OUT = 3.0  # what a flicker explains at least, relative to the median over frequencies
+_BETTER = 0.7  # of what one gain for all of the scene leaves, what a flicker of places leaves at most
+_ACCURACY = 1e-3  # of the frequency, relative to it
+_LEAST_INFORMATION = 0.05  # prior of the waves of a place, relative to its photons: it matters if a place is in view briefly
 _SMALLEST = 0.05  # least root mean square, over places and time, of a flicker that is divided out
 _SPREAD = 0.5  # prior standard deviation of the amplitudes
 _SMOOTH_CELLS = 1.0  # standard deviation of the Gaussian that smooths the amplitudes: lamps have no sharp borders
@@ -36,54 +39,49 @@ class LocalFlicker:
 def local_frequency(gains: Gains) -> float:
     """Return the frequency at which places flicker, each at its own phase, in cycles per frame; 0 if none stands out.
 
-    The power of all squares is added up, whatever their phase. A square is in view for a short time only, which limits the
-    resolution of the frequency.
+    What a wave explains is added up over all squares, whatever its phase there. A square is in view for a short time only, in
+    which few waves tell a flicker from a slow change: it has to explain more than its neighbours in frequency do, and together
+    with the phases more than one gain for all of the scene does.
     """
     seen = gains.seen
     instants = seen.instants
-    ratio, weight = _relative(gains)
-    known = seen.n_cells, len(seen.spans)
-    first, last = np.full(known[0], np.inf), np.full(known[0], -np.inf)
+    first, last = np.full(seen.n_cells, np.inf), np.full(seen.n_cells, -np.inf)
     np.minimum.at(first, seen.cells, instants[seen.times])
     np.maximum.at(last, seen.cells, instants[seen.times])
-    duration = float(np.median((last - first)[last >= first]))
+    duration = max(1.0, float(np.median((last - first)[seen.cells])))
     length = float(np.median([len(span) for span in seen.spans]))
     highest = 1 / max(4 * length, 2.0 * (instants[-1] - instants[0]) / (4 * len(instants)))
-    frequencies = np.arange(_PERIODS / max(duration, 1.0), highest, 1 / (_FINER * max(duration, 1.0)))
+    frequencies = np.arange(_PERIODS / duration, highest, 1 / (_FINER * duration))
     if len(frequencies) < 8 or duration < 8 * length:
         return 0.0
-    # A square whose mean is not subtracted would have power at all frequencies.
+    ratio, weight = _relative(gains)
     series, weights = _of_neighbours(seen, weight * ratio), _of_neighbours(seen, weight)
-    total = np.maximum(weights.sum(axis=1), 1e-12)
-    series -= weights * (series.sum(axis=1) / total)[:, None]
-
-    def power(each: FloatArray) -> FloatArray:
-        waves = np.exp(-2j * np.pi * np.outer(instants, each))
-        return np.asarray((np.abs(series @ waves) ** 2 / total[:, None]).sum(axis=0))
-
-    found = power(frequencies)
-    peak = int(found.argmax())
-    near = frequencies[peak] + np.linspace(-1, 1, 17) / (_FINER * duration)
-    best = float(near[int(power(near).argmax())])
-    excess = float(found[peak] - np.median(found))
-    # Of a wave of amplitude a, this power is a^2 / 4 for each unit of weight.
-    if found[peak] < _STANDS_OUT * float(np.median(found)) or 2 * excess / weight.sum() < _SMALLEST**2:
+    found = [_explained(series, weights, instants, each) for each in frequencies]
+    peak = int(np.argmax(found))
+    # Of a wave of amplitude a, this is a^2 / 2.
+    smallest = max(_STANDS_OUT * float(np.median(found)), _SMALLEST**2)
+    if peak in (0, len(found) - 1) or found[peak] < smallest:
         return 0.0
-    return best if _is_local(gains, _of_all(gains, best, 1 / duration)) else 0.0
+    near = float(frequencies[peak - 1]), float(frequencies[peak + 1])
+    best = minimize_scalar(lambda each: _left_of_places(gains, each)[0], bounds=near, options={"xatol": _ACCURACY * near[0]})
+    left, noise = _left_of_places(gains, float(best.x))
+    common, _ = _left(gains, gains.gain[seen.times])
+    # Of light that is the same everywhere, one gain leaves as little as places do.
+    is_local = common - left > max((1 - _BETTER) * (common - noise), (_SMALLEST / 2) ** 2)
+    return float(best.x) if is_local else 0.0
 
 
-def _of_all(gains: Gains, frequency: float, within: float) -> float:
-    """Return the frequency of the light of all of the scene near another one; that one, if no line stands out.
-
-    The resolution of the whole capture is higher than that of the time for which a square is in view. At a wrong frequency, the
-    phase of uniform light seems to differ from place to place.
-    """
-    instants = gains.seen.instants
-    step = 1 / (8 * (instants[-1] - instants[0]))
-    frequencies = np.arange(max(frequency - within, step), frequency + within, step)
-    power = np.abs(np.exp(-2j * np.pi * np.outer(frequencies, instants)) @ (gains.gain - gains.gain.mean())) ** 2
-    peak = int(power.argmax())
-    return float(frequencies[peak]) if power[peak] > _LINE * np.median(power) else frequency
+def _explained(series: FloatArray, weights: FloatArray, instants: FloatArray, frequency: float) -> float:
+    """Return the mean square that waves of a frequency explain in (C, S) weighted series, each with a mean of its own."""
+    turns = 2 * np.pi * frequency * instants
+    columns = np.stack([np.ones(len(turns)), np.cos(turns), np.sin(turns)])
+    right = series @ columns.T
+    normal = (weights @ (columns[:, None] * columns).reshape(9, -1).T).reshape(-1, 3, 3)
+    total = np.maximum(normal[:, 0, 0], 1e-12)
+    normal[:, [1, 2], [1, 2]] += _LEAST_INFORMATION * total[:, None]
+    normal[:, [0, 1, 2], [0, 1, 2]] += 1e-12
+    waves = np.linalg.solve(normal, right[..., None])[..., 0]
+    return float(((waves * right).sum(axis=1) - right[:, 0] ** 2 / total).sum() / total.sum())
 
 
 def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:
@@ -91,18 +89,30 @@ def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:
     found = np.zeros((len(seen.spans), seen.n_cells))
     found[seen.times, seen.cells] = values
     for row in found:
-        row[:] = cv2.GaussianBlur(row.reshape(seen.shape), (0, 0), _ALIKE_CELLS, borderType=cv2.BORDER_CONSTANT).ravel()
+        row[:] = cv2.GaussianBlur(row.reshape(seen.canvas.shape), (0, 0), _ALIKE_CELLS, borderType=cv2.BORDER_CONSTANT).ravel()
     return found.T
 
 
-def _is_local(gains: Gains, frequency: float) -> bool:
-    """Return whether amplitude or phase of the flicker at a frequency differ from place to place."""
-    flicker = measure_local_flicker(gains, frequency)
-    seen = np.bincount(gains.seen.cells, gains.seen.photons, gains.seen.n_cells).reshape(gains.seen.shape)
-    wave = flicker.cosine - 1j * flicker.sine
-    mean = (seen * wave).sum() / seen.sum()
-    scatter = float(np.sqrt((seen * np.abs(wave - mean) ** 2).sum() / seen.sum() / 2))
-    return scatter > _SMALLEST
+def _left_of_places(gains: Gains, frequency: float) -> tuple[float, float]:
+    """Return what a flicker of places leaves in the photons; see `_left`."""
+    seen, flicker = gains.seen, measure_local_flicker(gains, frequency)
+    turns = 2 * np.pi * frequency * seen.instants
+    waves = np.cos(turns)[seen.times], np.sin(turns)[seen.times]
+    of_place = 1 + sum(
+        each.ravel()[seen.cells] * wave for each, wave in zip((flicker.cosine, flicker.sine), waves, strict=True)
+    )
+    return _left(gains, of_place * flicker.slow[seen.times])
+
+
+def _left(gains: Gains, light: FloatArray) -> tuple[float, float]:
+    """Return the mean square that (N,) light leaves in the photons, relative to them, and that of their noise."""
+    seen = gains.seen
+    lit = seen.exposure * np.exp(gains.shifted) * np.maximum(light, 1e-3)
+    photons, exposure = (np.bincount(seen.cells, each, seen.n_cells) for each in (seen.photons, lit))
+    expected = np.maximum(lit * (photons / np.maximum(exposure, 1e-12))[seen.cells], 1e-12)
+    weight = 1 / (1 / expected + STRUCTURE**2)
+    left, noise = (seen.photons / expected - 1) ** 2, 1 / expected / SMOOTHING**2
+    return float((weight * left).sum() / weight.sum()), float((weight * noise).sum() / weight.sum())
 
 
 def measure_local_flicker(gains: Gains, frequency: float) -> LocalFlicker:
@@ -160,7 +170,7 @@ def _smoothed(seen: SeenCells, waves: FloatArray, slow: FloatArray, brightness: 
     cosine, sine = waves[1, seen.times], waves[2, seen.times]
 
     def shared(values: FloatArray) -> FloatArray:
-        image = np.bincount(seen.cells, weight * values, seen.n_cells).reshape(seen.shape)
+        image = np.bincount(seen.cells, weight * values, seen.n_cells).reshape(seen.canvas.shape)
         return np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTH_CELLS, borderType=cv2.BORDER_CONSTANT))
 
     cc, cs, ss = shared(cosine * cosine), shared(cosine * sine), shared(sine * sine)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -37,7 +37,7 @@ _OUTLIER = 3.0  # standard deviations from which a square is down-weighted (Hube
 _DARKEST = -7.0  # least logarithm of a gain
 # Weight of the prior of steady light, relative to that of the photons: it matters where frames share no place.
 _WEAK = 1e-6
-
+_TO_SQUARES = np.array([[0.5, 0, -0.5], [0, 0.5, -0.5], [0, 0, 1]])  # pixels of half the side of a square, to squares
 _WIDEST = np.pi / 2  # widest field of view, in radians, of which squares lie on a plane
 
 
@@ -50,14 +50,12 @@ class SeenCells:
     times: NDArray[np.intp]  # (N,) index of the span
     photons: FloatArray  # (N,) photons, those that a saturated pixel missed included
     exposure: FloatArray  # (N,) pixels times frames
-    shape: tuple[int, int]  # (h, w) rows and columns of squares, C in all
-    # (3, 3), pixels of the reference plane to squares: integers are their middles. None if they lie on a sphere.
-    to_cells: Homography | None
+    canvas: Canvas  # whose pixels are the squares: h rows and w columns, C in all
 
     @property
     def n_cells(self) -> int:
         """C."""
-        return self.shape[0] * self.shape[1]
+        return self.canvas.height * self.canvas.width
 
     @property
     def instants(self) -> FloatArray:
@@ -101,7 +99,6 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
     while canvas.height * canvas.width > 4 * _MOST_CELLS:
         half *= 2
         canvas = scene_canvas(camera, motions, shape, 1 / half)
-    n_rows, n_columns = canvas.height // 2, canvas.width // 2
     covered = _COVERED * _least_weight(source, 2 * half)
 
     seen = partial(_seen, source, canvas, half, covered)
@@ -114,8 +111,7 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
         times,
         np.concatenate([part[1] for part in parts]),
         np.concatenate([part[2] for part in parts]),
-        (n_rows, n_columns),
-        np.array([[0.5, 0, -0.5], [0, 0.5, -0.5], [0, 0, 1]]) @ canvas.transform if canvas.planar else None,
+        replace(canvas, height=canvas.height // 2, width=canvas.width // 2, transform=_TO_SQUARES @ canvas.transform),
     )
 
 
@@ -207,7 +203,7 @@ def solve_gains(seen: SeenCells) -> Gains:
 def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: FloatArray) -> FloatArray:
     """Return the part of residuals that a shift of each span explains: (N,)."""
     unseen = np.bincount(seen.cells, minlength=seen.n_cells) == 0
-    image = np.where(unseen, np.nan, brightness).reshape(seen.shape)
+    image = np.where(unseen, np.nan, brightness).reshape(seen.canvas.shape)
     gradient = np.stack([np.nan_to_num(each).ravel() for each in np.gradient(image)])[:, seen.cells]
     columns = np.concatenate([gradient, np.ones((1, len(left)))])
     normal, right = equations_of_groups(seen.times, len(seen.spans), columns, weight, left)

@@ -221,6 +221,6 @@ def test_phase_of_flicker_is_found_from_a_third_of_a_period() -> None:
     cells, times = np.repeat(np.arange(9), n_times), np.tile(np.arange(n_times), 9)
     photons = 1e6 * (1 + amplitudes[0] * waves[1, times] + amplitudes[1] * waves[2, times])
     spans = tuple(FrameSpan(each, each + 1) for each in range(n_times))
-    seen = SeenCells(spans, cells, times, photons, np.full(len(cells), 1e6), (3, 3), np.eye(3))
+    seen = SeenCells(spans, cells, times, photons, np.full(len(cells), 1e6), Canvas(3, 3, np.eye(3)))
     found = _smoothed(seen, waves, np.ones(n_times), np.ones(9))
     assert [float(each[1, 1]) for each in found] == pytest.approx(amplitudes, abs=0.02)
