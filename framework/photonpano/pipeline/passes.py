@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from photonpano.capture import before, capture_of
+from photonpano.capture import before, capture_of, leaving_out
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
 from photonpano.corrections.lighting import (
@@ -252,10 +252,20 @@ def _uncertain(state: State) -> bool:
 
 
 def again_without_movers(state: State) -> Proposal | None:
-    """Run the last level again, if what hides the background was looked for since."""
+    """Run the last level again, if what hides the background was looked for since, in the light of lamps on what is left."""
     if not state.outdated or capture_of(state.source).background is None:
         return None
-    return Proposal(lambda: state.located([state.results[-1].level], state.trajectory), worse=None)
+    return Proposal(lambda: _in_lamps(state).located([state.results[-1].level], state.trajectory), worse=None)
+
+
+def _in_lamps(state: State) -> State:
+    """Return the state in the light that lamps, if there are any, shed on the background that is known now."""
+    light = light_of(state.source)
+    if light is None or not light.has_lamps:
+        return state
+    unlit = leaving_out(replace(capture_of(state.view.source), light=None), light.shown)
+    found = measure_light(unlit, state.trajectory, state.context)
+    return replace(state, source=in_light(state.source, found), context=within(state.context, found))
 
 
 def cut_at_jumps(state: State) -> Proposal | None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from photonpano.corrections.lighting.gains import SMOOTHING, STRUCTURE, Gains, SeenCells, equations_of_groups
+from photonpano.corrections.lighting.gains import SMOOTHING, STRUCTURE, Gains, SeenCells
 from photonpano.values import FloatArray, FluxImage
 
 _PERIODS = 1.2  # periods for which a place must be in view
@@ -19,10 +19,12 @@ _ACCURACY = 1e-3  # of the frequency, relative to it
 _LEAST_INFORMATION = 0.05  # prior of the waves of a place, relative to its photons: it matters if a place is in view briefly
 _SMALLEST = 0.05  # least root mean square, over places and time, of a flicker that is divided out
 _SPREAD = 0.5  # prior standard deviation of the amplitudes
-_SMOOTH_CELLS = 1.0  # standard deviation of the Gaussian that smooths the amplitudes: lamps have no sharp borders
+_NEIGHBOURHOODS = (32.0, 16.0, 8.0, 4.0, 2.0)  # standard deviations of Gaussians, in squares: lamps have no sharp borders
+_DIFFERENCE = 0.2  # prior standard deviation of the amplitudes in a neighbourhood, relative to the next larger one
+_LEAST_GAIN = 0.05  # of a place: lamps hardly go out
 # Standard deviation of the Gaussian over which a flicker has one phase; brightness that a tremor changes has not.
 _ALIKE_CELLS = 3.0
-_ROUNDS = 2  # of fitting amplitudes and slow changes of the light in turn
+_ROUNDS = 3  # of fitting amplitudes and slow changes of the light in turn
 _MOST = 1.5  # largest amplitude, relative to the mean light of a place
 
 
@@ -65,7 +67,8 @@ def local_frequency(gains: Gains) -> float:
     near = float(frequencies[peak - 1]), float(frequencies[peak + 1])
     best = minimize_scalar(lambda each: _left_of_places(gains, each)[0], bounds=near, options={"xatol": _ACCURACY * near[0]})
     left, noise = _left_of_places(gains, float(best.x))
-    common, _ = _left(gains, gains.gain[seen.times])
+    nowhere = np.zeros((2, *seen.canvas.shape))
+    common, _ = _left(seen, _lit(gains, np.zeros((2, len(seen.cells))), nowhere, gains.gain)[0])
     # Of light that is the same everywhere, one gain leaves as little as places do.
     is_local = common - left > max((1 - _BETTER) * (common - noise), (_SMALLEST / 2) ** 2)
     return float(best.x) if is_local else 0.0
@@ -95,21 +98,14 @@ def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:
 
 def _left_of_places(gains: Gains, frequency: float) -> tuple[float, float]:
     """Return what a flicker of places leaves in the photons; see `_left`."""
-    seen, flicker = gains.seen, measure_local_flicker(gains, frequency)
-    turns = 2 * np.pi * frequency * seen.instants
-    waves = np.cos(turns)[seen.times], np.sin(turns)[seen.times]
-    of_place = 1 + sum(
-        each.ravel()[seen.cells] * wave for each, wave in zip((flicker.cosine, flicker.sine), waves, strict=True)
-    )
-    return _left(gains, of_place * flicker.slow[seen.times])
+    flicker, turns = measure_local_flicker(gains, frequency), 2 * np.pi * frequency * gains.seen.instants
+    waves = np.stack([np.cos(turns), np.sin(turns)])[:, gains.seen.times]
+    expected, _ = _lit(gains, waves, np.stack([flicker.cosine, flicker.sine]), flicker.slow)
+    return _left(gains.seen, expected)
 
 
-def _left(gains: Gains, light: FloatArray) -> tuple[float, float]:
-    """Return the mean square that (N,) light leaves in the photons, relative to them, and that of their noise."""
-    seen = gains.seen
-    lit = seen.exposure * np.exp(gains.shifted) * np.maximum(light, 1e-3)
-    photons, exposure = (np.bincount(seen.cells, each, seen.n_cells) for each in (seen.photons, lit))
-    expected = np.maximum(lit * (photons / np.maximum(exposure, 1e-12))[seen.cells], 1e-12)
+def _left(seen: SeenCells, expected: FloatArray) -> tuple[float, float]:
+    """Return the mean square that (N,) expected photons leave, relative to them, and that of their noise."""
     weight = 1 / (1 / expected + STRUCTURE**2)
     left, noise = (seen.photons / expected - 1) ** 2, 1 / expected / SMOOTHING**2
     return float((weight * left).sum() / weight.sum()), float((weight * noise).sum() / weight.sum())
@@ -119,22 +115,51 @@ def measure_local_flicker(gains: Gains, frequency: float) -> LocalFlicker:
     """Fit the amplitude and the phase of each square of the scene at a frequency; spans must be much shorter than a period."""
     seen = gains.seen
     lengths = np.array([len(span) for span in seen.spans], float)
-    phase = 2 * np.pi * frequency * seen.instants
-    averaged = np.sinc(frequency * lengths)
-    waves = np.stack([np.ones(len(phase)), averaged * np.cos(phase), averaged * np.sin(phase)])
+    turns = 2 * np.pi * frequency * seen.instants
+    cosines, sines = (np.sinc(frequency * lengths) * each(turns) for each in (np.cos, np.sin))
     period = max(1, round(1 / (frequency * float(np.median(np.diff(seen.instants))))))
-    slow = np.ones(len(seen.spans))
+    waves = np.stack([cosines, sines])[:, seen.times]
+    amplitudes, slow = np.zeros((2, *seen.canvas.shape)), np.ones(len(seen.spans))
     for _ in range(_ROUNDS):
-        coefficients = _fitted(seen, waves, slow)
-        expected = seen.exposure * (coefficients[seen.cells] * waves.T[seen.times]).sum(axis=1)
-        photons, sums = (
-            np.bincount(seen.times, each, len(slow)).astype(float) for each in (seen.photons, np.maximum(expected, 0))
-        )
-        slow = np.maximum(_running(photons, period) / np.maximum(_running(sums, period), 1e-12), 1e-3)
+        amplitudes = _amplitudes(seen, waves, *_lit(gains, waves, amplitudes, slow))
+        expected, _ = _lit(gains, waves, amplitudes, slow)
+        steady = expected / slow[seen.times]
+        photons, sums = (_running(np.bincount(seen.times, each, len(slow)), period) for each in (seen.photons, steady))
+        slow = np.maximum(photons / np.maximum(sums, 1e-12), 1e-3)
         slow = slow / slow.mean()
-    brightness = coefficients[:, 0]
-    cosine, sine = _smoothed(seen, waves, slow, brightness)
+    cosine, sine = np.clip(amplitudes, -_MOST, _MOST).astype(np.float32)
     return LocalFlicker(frequency, cosine, sine, slow)
+
+
+def _lit(gains: Gains, waves: FloatArray, amplitudes: FloatArray, slow: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how many photons each observation has in this light, and its gain in the light of its place: (N,) each."""
+    seen = gains.seen
+    gain = np.maximum(1 + (amplitudes.reshape(2, -1)[:, seen.cells] * waves).sum(axis=0), _LEAST_GAIN)
+    lit = seen.exposure * gain * slow[seen.times] * np.exp(gains.shifted)
+    photons, exposure = (np.bincount(seen.cells, each, seen.n_cells) for each in (seen.photons, lit))
+    return np.maximum(lit * (photons / np.maximum(exposure, 1e-12))[seen.cells], 1e-12), gain
+
+
+def _amplitudes(seen: SeenCells, waves: FloatArray, expected: FloatArray, gain: FloatArray) -> FloatArray:
+    """Return the amplitudes of cosine and sine of each square: (2, h, w).
+
+    The brightness of a square is not known beside its amplitudes: where it is in view for a part of a period, its photons tell
+    little, and its neighbours decide. Amplitudes are those of a wide neighbourhood, unless the photons of a smaller one differ.
+    """
+    ratio, weight = seen.photons * gain / expected, 1 / (gain**2 / expected + (STRUCTURE * gain) ** 2)
+    total = np.maximum(np.bincount(seen.cells, weight, seen.n_cells), 1e-12)
+    cosine, sine, left = (
+        each - (np.bincount(seen.cells, weight * each, seen.n_cells) / total)[seen.cells] for each in (*waves, ratio)
+    )
+    products = cosine * cosine, cosine * sine, sine * sine, cosine * left, sine * left
+    sums = [np.bincount(seen.cells, weight * each, seen.n_cells).reshape(seen.canvas.shape) for each in products]
+    found, prior = np.zeros((2, *seen.canvas.shape)), 1 / _SPREAD**2
+    for size in _NEIGHBOURHOODS:
+        cc, cs, ss, rc, rs = (cv2.GaussianBlur(each, (0, 0), size, borderType=cv2.BORDER_CONSTANT) for each in sums)
+        cc, ss, rc, rs = cc + prior, ss + prior, rc + prior * found[0], rs + prior * found[1]
+        found = np.stack([ss * rc - cs * rs, cc * rs - cs * rc]) / (cc * ss - cs**2)
+        prior = 1 / _DIFFERENCE**2
+    return found
 
 
 def _relative(gains: Gains) -> tuple[FloatArray, FloatArray]:
@@ -143,43 +168,6 @@ def _relative(gains: Gains) -> tuple[FloatArray, FloatArray]:
     expected = seen.exposure * np.exp(np.nan_to_num(gains.brightness)[seen.cells] + gains.shifted)
     ratio = np.clip(seen.photons / np.maximum(expected, 1e-12) - 1, -2, 2)
     return ratio, 1 / (1 / np.maximum(expected, 1e-12) + STRUCTURE**2)
-
-
-def _fitted(seen: SeenCells, waves: FloatArray, slow: FloatArray) -> FloatArray:
-    """Return mean, cosine and sine of the flux of each square: (C, 3)."""
-    flux = np.bincount(seen.cells, seen.photons, seen.n_cells) / np.maximum(
-        np.bincount(seen.cells, seen.exposure * slow[seen.times], seen.n_cells), 1e-12
-    )
-    flux = np.maximum(flux, 1e-9)
-    exposure = seen.exposure * slow[seen.times]
-    weight = 1 / (flux[seen.cells] / exposure + (STRUCTURE * flux[seen.cells]) ** 2)
-    columns = waves[:, seen.times]
-    normal, right = equations_of_groups(seen.cells, seen.n_cells, columns, weight, seen.photons / exposure)
-    normal[:, 0, 0] += 1e-12
-    for i in (1, 2):
-        normal[:, i, i] += 1 / (_SPREAD * flux) ** 2
-    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
-
-
-def _smoothed(seen: SeenCells, waves: FloatArray, slow: FloatArray, brightness: FloatArray) -> tuple[FluxImage, FluxImage]:
-    """Return the amplitudes of cosine and sine, relative to the brightness of each square: (h, w) each."""
-    flux = np.maximum(brightness[seen.cells], 1e-9)
-    exposure = seen.exposure * slow[seen.times]
-    ratio = seen.photons / (exposure * flux) - 1
-    weight = 1 / (1 / (exposure * flux) + STRUCTURE**2)
-    cosine, sine = waves[1, seen.times], waves[2, seen.times]
-
-    def shared(values: FloatArray) -> FloatArray:
-        image = np.bincount(seen.cells, weight * values, seen.n_cells).reshape(seen.canvas.shape)
-        return np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTH_CELLS, borderType=cv2.BORDER_CONSTANT))
-
-    cc, cs, ss = shared(cosine * cosine), shared(cosine * sine), shared(sine * sine)
-    rc, rs = shared(ratio * cosine), shared(ratio * sine)
-    cc, ss = cc + 1 / _SPREAD**2, ss + 1 / _SPREAD**2
-    determinant = cc * ss - cs**2
-    amplitudes = (ss * rc - cs * rs) / determinant, (cc * rs - cs * rc) / determinant
-    first, second = (np.clip(each, -_MOST, _MOST).astype(np.float32) for each in amplitudes)
-    return first, second
 
 
 def _running(values: FloatArray, length: int) -> FloatArray:

@@ -11,7 +11,7 @@ from photonpano.contracts.protocols import WeightedSource
 from photonpano.corrections import Vignette, divided_by
 from photonpano.corrections.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
 from photonpano.corrections.lighting.finding import flicker_frequency, gain_of_frames
-from photonpano.corrections.lighting.flicker import _smoothed
+from photonpano.corrections.lighting.flicker import _amplitudes
 from photonpano.corrections.lighting.gains import SeenCells
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, rotation_matrices, translation
@@ -215,12 +215,12 @@ def test_camera_that_stands_still_is_refused(recorded: Callable[..., MemorySourc
 
 def test_phase_of_flicker_is_found_from_a_third_of_a_period() -> None:
     """Where a place is in view for less than a period, the waves of cosine and sine are not orthogonal there."""
-    n_times, amplitudes = 20, (0.3, -0.2)
+    n_times, amplitudes = 20, np.array([0.3, -0.2])
     phase = 2 * np.arange(n_times) / n_times
-    waves = np.stack([np.ones(n_times), np.cos(phase), np.sin(phase)])
-    cells, times = np.repeat(np.arange(9), n_times), np.tile(np.arange(n_times), 9)
-    photons = 1e6 * (1 + amplitudes[0] * waves[1, times] + amplitudes[1] * waves[2, times])
+    cells, times = np.repeat(np.arange(81), n_times), np.tile(np.arange(n_times), 81)
+    waves = np.stack([np.cos(phase), np.sin(phase)])[:, times]
+    photons = 1e6 * (1 + amplitudes @ waves)
     spans = tuple(FrameSpan(each, each + 1) for each in range(n_times))
-    seen = SeenCells(spans, cells, times, photons, np.full(len(cells), 1e6), Canvas(3, 3, np.eye(3)))
-    found = _smoothed(seen, waves, np.ones(n_times), np.ones(9))
-    assert [float(each[1, 1]) for each in found] == pytest.approx(amplitudes, abs=0.02)
+    seen = SeenCells(spans, cells, times, photons, np.full(len(cells), 1e6), Canvas(9, 9, np.eye(3)))
+    found = _amplitudes(seen, waves, np.full(len(cells), 1e6), np.ones(len(cells)))
+    assert found[:, 4, 4] == pytest.approx(amplitudes, abs=0.02)
