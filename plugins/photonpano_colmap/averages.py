@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonpano import (
     BoolArray,
@@ -74,7 +73,9 @@ class AveragesEstimator:
         images = []
         with progress.stage("average frames", len(spans), "average") as advance:
             for span in spans:
-                images.append(_picture(_exposure(source, span)))
+                exposure = _exposure(source, span)
+                image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure, "auto"))
+                images.append((image, np.where(mask > 0, 255, 0).astype(np.uint8)))
                 advance(1)
         with progress.stage("COLMAP: features, matches, poses", 1, "model") as advance:
             found = reconstruct(images, camera, self._config, self._context.seed)
@@ -99,7 +100,12 @@ class AveragesEstimator:
 
     def _chosen(self, found: Reconstruction, spans: Sequence[FrameSpan]) -> Piece:
         """Return the piece of the poses to go on with."""
-        _require_texture(found)
+        texture = [float(np.median(each)) for each in (found.n_keypoints, found.n_matches)]
+        if texture[0] < _TEXTURE[0] or texture[1] < _TEXTURE[1]:
+            raise LocationError(
+                f"the averages show too little texture, or too much noise: of {texture[0]:.0f} keypoints in an average (the "
+                f"median) {texture[1]:.0f} match another average; {_ANOTHER_SIZE}"
+            )
         if not found.pieces or len(found.pieces[0].images) < MIN_AVERAGES:
             keypoints, matches = (int(np.median(each)) for each in (found.n_keypoints, found.n_matches))
             figures = f"of {keypoints} keypoints in an average (the median) {matches} match another average"
@@ -157,7 +163,8 @@ class _Assembly:
         centre = self.guess.centre_px or ((width - 1) / 2, (height - 1) / 2)
         camera = Camera(camera_matrix(piece.focal_px, centre), np.array(self.guess.distortion))
         ideal = [(indices, camera.ideal(xy)) for indices, xy in piece.observed]
-        noise = pose_noise(piece.poses, piece.points, ideal, camera.matrix, self.guess.focal_px is None)
+        finds_focal = self.guess.focal_px is None
+        noise = pose_noise(piece.poses, piece.points, ideal, camera.matrix, finds_focal)
         instants = np.array([self.spans[image].centre for image in piece.images])
         located = self._located(n_frames)
         frames = np.arange(n_frames, dtype=np.float64)
@@ -170,7 +177,7 @@ class _Assembly:
         return PoseEstimate(
             camera_matrix=camera.matrix,
             distortion=camera.distortion,
-            std_focal_px=self._std_focal(noise),
+            std_focal_px=math.hypot(noise.std_focal_px, FOCAL_BIAS * piece.focal_px) if finds_focal else 0.0,
             camera_from_world=poses,
             located=located,
             std_position=std_position,
@@ -236,10 +243,6 @@ class _Assembly:
             "residual_px": noise.residual_px,
             "std_position": relative_std(noise.std_position, self.piece.poses),
         }
-
-    def _std_focal(self, noise: PoseNoise) -> float:
-        """Return the expected error of the focal length, 0 if it was given."""
-        return math.hypot(noise.std_focal_px, FOCAL_BIAS * self.piece.focal_px) if self.guess.focal_px is None else 0.0
 
     def _doubts(self) -> list[str]:
         doubts = []
@@ -328,26 +331,12 @@ def _exposure(source: Source, span: FrameSpan) -> VirtualExposure:
     return VirtualExposure(flux, weight, Group(span, span.centre), 1.0, source.response)
 
 
-def _picture(exposure: VirtualExposure) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    image, mask = stabilised_8_bit(exposure, blur_against_noise(exposure, "auto"))
-    return image, np.where(mask > 0, 255, 0).astype(np.uint8)
-
-
 def _between(frames: FloatArray, instants: FloatArray, std: FloatArray, apart: FloatArray, located: BoolArray) -> FloatArray:
     """Return the expected error of each frame, from poses and interpolation between them; NaN if not located."""
     at_poses = np.interp(frames, instants, std)
     # Distances of poses from the spline through the others hold the noise of the poses as well.
     missed = max(0.0, float(np.mean(apart**2)) - 2 * float(np.mean(std**2))) if len(apart) else 0.0
     return np.where(located, np.sqrt(at_poses**2 + _MISSED_SHARE * missed), np.nan)
-
-
-def _require_texture(found: Reconstruction) -> None:
-    keypoints, matches = (float(np.median(each)) for each in (found.n_keypoints, found.n_matches))
-    if keypoints < _TEXTURE[0] or matches < _TEXTURE[1]:
-        raise LocationError(
-            f"the averages show too little texture, or too much noise: of {keypoints:.0f} keypoints in an average (the median) "
-            f"{matches:.0f} match another average; {_ANOTHER_SIZE}"
-        )
 
 
 def _described(piece: Piece, spans: Sequence[FrameSpan]) -> str:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from photonpano import (
     CameraGuess,
     FloatArray,
-    FluxImage,
     LostFrames,
     PosedView,
     PoseEstimate,
@@ -25,7 +25,6 @@ from photonpano.geometry import Camera, camera_matrix, corners
 from photonpano_colmap.averages import FOCAL_BIAS, AveragesEstimator, flux_of_points, relative_std, with_focal_judged
 from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
-from photonpano_colmap.posing.merging import PosedExposure
 from photonpano_colmap.posing.path import Path, PoseSpline, positions_of
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
@@ -57,7 +56,16 @@ class StratifiedEstimator:
                     advance(1)
                 camera = Camera(camera_matrix(level.adjusted.focal_px, camera.centre_px), camera.distortion)
                 scene = level.scene
-                levels.append(_record(level, scene))
+                levels.append(
+                    {
+                        "group_frames": len(level.groups[0].span),
+                        "averages": len(level.groups),
+                        "located": int(level.is_located.sum()),
+                        "points": len(scene.points),
+                        "residual_px": level.adjusted.residual_px,
+                        "std_position": relative_std(level.adjusted.std_position, level.adjusted.poses),
+                    }
+                )
         return with_focal_judged(_Assembly(source, camera, first, level, before, tuple(levels)).estimate(), self._context)
 
 
@@ -138,12 +146,8 @@ class _Assembly:
             # A point is sought from several key exposures, but is one point of one of them: it is seen once.
             points, pixels = level.observations.points[seen], self.camera.distorted(level.observations.pixels[seen])
             group = posed.exposure.group
-            views.append(PosedView(group.span, group.reference, pose, points, pixels, _flux_of(posed)))
+            views.append(PosedView(group.span, group.reference, pose, points, pixels, partial(getattr, posed.exposure, "flux")))
         return tuple(views)
-
-
-def _flux_of(posed: PosedExposure) -> Callable[[], FluxImage]:
-    return lambda: posed.exposure.flux
 
 
 def _frames(source: Source) -> FloatArray:
@@ -161,14 +165,3 @@ def _left(changes: FloatArray, frames: FloatArray, instants: FloatArray) -> floa
     at = changes[np.rint(instants).astype(int)]
     linear = np.stack([np.interp(frames, instants, at[:, axis]) for axis in range(3)], axis=1)
     return float(np.sqrt(np.mean(np.sum((changes - linear) ** 2, axis=1))))
-
-
-def _record(level: PosedLevel, scene: Scene) -> dict[str, float | int | str | None]:
-    return {
-        "group_frames": len(level.groups[0].span),
-        "averages": len(level.groups),
-        "located": int(level.is_located.sum()),
-        "points": len(scene.points),
-        "residual_px": level.adjusted.residual_px,
-        "std_position": relative_std(level.adjusted.std_position, level.adjusted.poses),
-    }

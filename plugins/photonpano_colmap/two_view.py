@@ -82,7 +82,8 @@ class TwoViewLocator(PointLocator):
     def _matches(self, moving: Features, fixed: Features, initial: Homography | None) -> Iterator[Matches]:
         if initial is not None:
             yield _matches_of(moving, fixed, self._matched_nearby(moving, fixed, initial), guided=True)
-        yield _matches_of(moving, fixed, self._matched_everywhere(moving, fixed), guided=False)
+        pairs = self._matcher().match(*moving.for_matcher(), *fixed.for_matcher())
+        yield _matches_of(moving, fixed, np.asarray(pairs, np.intp).reshape(-1, 2), guided=False)
 
     def _matcher(self) -> pycolmap.FeatureMatcher:
         options = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
@@ -91,11 +92,6 @@ class TwoViewLocator(PointLocator):
         # The approximate matcher is no faster for a few thousand keypoints.
         options.sift.cpu_brute_force_matcher = True
         return pycolmap.FeatureMatcher.create(options, pycolmap.Device.cpu)
-
-    def _matched_everywhere(self, moving: Features, fixed: Features) -> NDArray[np.intp]:
-        """Return the indices of matches: (K, 2)."""
-        pairs = self._matcher().match(*moving.for_matcher(), *fixed.for_matcher())
-        return np.asarray(pairs, np.intp).reshape(-1, 2)
 
     def _matched_nearby(self, moving: Features, fixed: Features, initial: Homography) -> NDArray[np.intp]:
         """Return the indices of matches near the positions that a motion predicts: (K, 2)."""

@@ -22,7 +22,6 @@ from photonpano.photometry import Similarity, hann_window
 from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.majority import JUDGED, masked, part_following, shifts_between
-from photonpano_direct.moments import Layer
 from photonpano_direct.pyramid import Pyramid, pyramid_of, similarity_under
 from photonpano_direct.small_matrices import rescaled
 
@@ -63,11 +62,22 @@ class DirectLocator:
         return pyramid_of(exposure, self._config.pyramid_levels, self._config.blur_px)
 
     def hypotheses(self, moving: Pyramid, fixed: Pyramid) -> Sequence[Homography]:
-        """Return shifts to start from, likeliest first; see `photonpano.KeepsHypotheses`."""
+        """Return shifts to start from, likeliest first; see `photonpano.KeepsHypotheses`.
+
+        The phase correlation of the coarsest layers peaks there.
+        """
         coarsest = moving.layers[-1], fixed.layers[-1]
         if not all(layer.weight.any() for layer in coarsest):
             return []
-        return _hypotheses(*coarsest, len(moving.layers))
+        height, width = coarsest[0].image.shape
+        window = hann_window((height, width))
+        flat = [np.where(layer.weight > 0, layer.image - layer.image[layer.weight > 0].mean(), 0) for layer in coarsest]
+        spectra = [np.fft.rfft2(window * image) for image in flat]
+        surface = correlation_surface(spectra[1] * spectra[0].conj(), (height, width), _PEAK_PX)
+        if surface is None:
+            return []
+        shifts, _ = correlation_peaks(surface, _RIVAL)
+        return [rescaled(translation(x, y), 2.0 ** (len(moving.layers) - 1)) for x, y in shifts]
 
     def register(self, moving: Pyramid, fixed: Pyramid, initial: Homography | None) -> Located | NotLocated:
         """Align; see `photonpano.Locator`."""
@@ -242,16 +252,3 @@ class _Alignment:
             patches = quality.patches and quality.patches.rescaled(1 / scale)
             return Located(homography, quality.information * np.outer(units, units), std_px, evidence, patches)
         return NotLocated(reason, evidence)
-
-
-def _hypotheses(moving: Layer, fixed: Layer, n_layers: int) -> list[Homography]:
-    """Return the shifts at which the phase correlation of the coarsest layers peaks, in pixels of the finest layer."""
-    height, width = moving.image.shape
-    window = hann_window((height, width))
-    flat = [np.where(layer.weight > 0, layer.image - layer.image[layer.weight > 0].mean(), 0) for layer in (moving, fixed)]
-    spectra = [np.fft.rfft2(window * image) for image in flat]
-    surface = correlation_surface(spectra[1] * spectra[0].conj(), (height, width), _PEAK_PX)
-    if surface is None:
-        return []
-    shifts, _ = correlation_peaks(surface, _RIVAL)
-    return [rescaled(translation(x, y), 2.0 ** (n_layers - 1)) for x, y in shifts]

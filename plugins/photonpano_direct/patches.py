@@ -32,7 +32,7 @@ def patches_of(sums: FloatArray, homography: Homography, shape: tuple[int, int],
         common: share of the curvature of the template that the scene has, not its noise.
         noise_ratio: mean squared residual relative to that of photon noise.
     """
-    own, scatter = (_symmetric(part) for part in (sums[:, :3], sums[:, 5:8]))
+    own, scatter = (sums[:, [xx, xx + 1, xx + 1, xx + 2]].reshape(-1, 2, 2) for xx in (0, 5))
     # Noise has the same curvature along all directions, and in all patches alike.
     seen, traces = sums[:, 8], np.trace(own, axis1=1, axis2=2)
     noise = (1 - common) * traces.sum() / max(seen.sum(), 1) * seen / 2
@@ -89,8 +89,3 @@ def add_up(template: Layer, buffers: Buffers, sums: FloatArray) -> None:
                     total += w
                     count += 1
     sums[:, :, 5:8] *= count / max(total, 1e-20)
-
-
-def _symmetric(parts: FloatArray) -> FloatArray:
-    """Return (N, 2, 2) matrices of their (N, 3) elements xx, xy and yy."""
-    return parts[:, [0, 1, 1, 2]].reshape(-1, 2, 2)

@@ -36,19 +36,6 @@ class Details(NamedTuple):
         return float(np.mean(np.square(self.image[seen]) * self.weight[seen])) / self.gain if seen.any() else 0.0
 
 
-def details_of(layer: Layer) -> Details:
-    """Return the details of a layer."""
-    seen = layer.weight > 0
-    image = without_local_mean(layer.image, seen)
-    # Near a border the mean is one-sided: a gradient looks like a structure there, in any two images.
-    inside = cv2.erode(seen.astype(np.uint8), np.ones((LOCAL_PX, LOCAL_PX), np.uint8), borderValue=0) > 0
-    if 2 * np.count_nonzero(inside) < np.count_nonzero(seen):
-        inside = seen  # a small image has hardly anything else
-    image = np.where(inside, image, np.float32(0))
-    weight = np.where(inside, layer.weight, np.float32(0))
-    return Details(image, weight, 1 / (4 * np.pi * layer.blur_px**2), autocorrelation(image))
-
-
 def similarity_under(homography: Homography, moving: Details, fixed: Details) -> Similarity:
     """Return the similarity of two images of one shape under a homography, from `moving` to `fixed`."""
     sums = np.empty(8)
@@ -106,7 +93,16 @@ class Pyramid(NamedTuple):
 def pyramid_of(exposure: VirtualExposure, levels: int, blur_px: float) -> Pyramid:
     """Return an exposure, blurred against photon noise, and its halves; small images have fewer than `levels` layers."""
     layers = tuple(_layer_of(view) for view in view_pyramid(exposure, blur_px, levels, SMALLEST_SIDE))
-    return Pyramid(layers, details_of(layers[_compared(layers)]))
+    layer = layers[_compared(layers)]
+    seen = layer.weight > 0
+    image = without_local_mean(layer.image, seen)
+    # Near a border the mean is one-sided: a gradient looks like a structure there, in any two images.
+    inside = cv2.erode(seen.astype(np.uint8), np.ones((LOCAL_PX, LOCAL_PX), np.uint8), borderValue=0) > 0
+    if 2 * np.count_nonzero(inside) < np.count_nonzero(seen):
+        inside = seen  # a small image has hardly anything else
+    image = np.where(inside, image, np.float32(0))
+    weight = np.where(inside, layer.weight, np.float32(0))
+    return Pyramid(layers, Details(image, weight, 1 / (4 * np.pi * layer.blur_px**2), autocorrelation(image)))
 
 
 def _compared(layers: Sequence[Layer]) -> int:

@@ -72,7 +72,12 @@ class RegistratorLocator:
         """Align; see `photonpano.Locator`."""
         if not (moving[-1].seen.any() and fixed[-1].seen.any()):
             return NotLocated(NOTHING_SEEN)
-        start = _shift_between(moving[-1], fixed[-1]) if initial is None else initial
+        start = initial
+        if start is None:  # the shift of the coarsest images by masked cross-correlation (Padfield 2012)
+            correlated: Callable[..., Any] = phase_cross_correlation
+            one, other = moving[-1], fixed[-1]
+            (down, right), *_ = correlated(other.image, one.image, reference_mask=other.seen, moving_mask=one.seen)
+            start = rescaled(translation(float(right), float(down)), one.pixel)
         evaluations: list[int] = []
         found, failure = coarse_to_fine(moving, fixed, start, partial(self._aligned, len(moving), evaluations))
         if failure is not None:
@@ -104,7 +109,12 @@ class _Descent:
         tolerance_px = config.converged_px * (_COARSE_TOLERANCE if coarse else 1)
         root: torch.Tensor | None = None
         for _ in range(_ROUNDS):
-            weights = self._weights(homography)
+            there = self._fixed.seen_from(homography)
+            both = self._moving.seen & there.seen
+            # The inverse variances of the differences between pixels, 0 where one of them is masked.
+            variances_inverse = np.zeros(both.shape, np.float32)
+            variances_inverse[both] = 1 / (1 / self._moving.weight[both] + 1 / there.weight[both])
+            weights = images_on(self._device, variances_inverse)
             root = self._root_of_curvature(weights) if root is None else root
             if root is None:
                 return NotLocated(NO_TEXTURE)
@@ -114,14 +124,6 @@ class _Descent:
             if corner_displacements(homography, previous, self._moving.shape).max() < tolerance_px:
                 break
         return homography
-
-    def _weights(self, homography: Homography) -> torch.Tensor:
-        """Return the inverse variances of the differences between pixels, 0 where one of them is masked."""
-        there = self._fixed.seen_from(homography)
-        both = self._moving.seen & there.seen
-        weight = np.zeros(both.shape, np.float32)
-        weight[both] = 1 / (1 / self._moving.weight[both] + 1 / there.weight[both])
-        return images_on(self._device, weight)
 
     def _round(
         self,
@@ -139,13 +141,17 @@ class _Descent:
         # In these parameters the Hessian is the identity and the initial loss is 1/2. The first step of L-BFGS, which is one of
         # gradient descent, is then about a Gauss-Newton step.
         basis = torch.linalg.inv(root).T * torch.sqrt(unit_loss)
+        # The largest displacement of a corner by a unit step of one of these parameters.
+        unit_corners = corners(self._moving.shape) @ self._unit[:2, :2].T + self._unit[:2, 2]
+        moved = jacobian(np.eye(3), unit_corners)[..., self._free] @ basis.cpu().numpy()
+        corner_px = float(np.linalg.norm(moved * (np.array(self._moving.shape[::-1]) / 2)[:, None], axis=1).max())
         q = torch.zeros(len(self._free), dtype=torch.float64, device=self._device, requires_grad=True)
         optimizer = torch.optim.LBFGS(
             [q],
             max_iter=max_iterations,
             tolerance_grad=0,
             # torch compares it with the expected decrease of the loss too, which is the square of the step length.
-            tolerance_change=(tolerance_px / self._corner_px(basis.cpu().numpy())) ** 2,
+            tolerance_change=(tolerance_px / corner_px) ** 2,
             line_search_fn="strong_wolfe",
         )
 
@@ -190,16 +196,3 @@ class _Descent:
         rows = [(slopes * (weights[0, 0] * slope)).sum(dim=(1, 2), dtype=torch.float64) for slope in slopes]
         root, failed = torch.linalg.cholesky_ex(torch.stack(rows))
         return None if failed else root
-
-    def _corner_px(self, basis: FloatArray) -> float:
-        """Return the largest displacement of a corner by a unit step of one of the whitened parameters, in px."""
-        unit_corners = corners(self._moving.shape) @ self._unit[:2, :2].T + self._unit[:2, 2]
-        moved = jacobian(np.eye(3), unit_corners)[..., self._free] @ basis
-        return float(np.linalg.norm(moved * (np.array(self._moving.shape[::-1]) / 2)[:, None], axis=1).max())
-
-
-def _shift_between(moving: View, fixed: View) -> Homography:
-    """Return the shift between two images by masked cross-correlation (Padfield 2012), in pixels of the finest layer."""
-    correlated: Callable[..., Any] = phase_cross_correlation
-    (down, right), *_ = correlated(fixed.image, moving.image, reference_mask=fixed.seen, moving_mask=moving.seen)
-    return rescaled(translation(float(right), float(down)), moving.pixel)

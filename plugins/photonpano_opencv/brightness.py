@@ -7,7 +7,7 @@ import re
 import cv2
 import numpy as np
 
-from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
+from photonpano import Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import normalised, rescaled, transform_points, translation, why_implausible
 from photonpano.locating import (
     NO_TEXTURE,
@@ -63,17 +63,13 @@ class EccLocator:
                 moving.image, fixed.image, here, there, start.astype(np.float32), cv2.MOTION_HOMOGRAPHY, criteria, 1
             )
         except cv2.error as error:
-            # OpenCV also raises where the iteration does not converge on valid images.
-            return NotLocated(f"the correlation cannot be maximised: {_sentence_of(error)}")
+            # OpenCV also raises where the iteration does not converge on valid images. Its message is told without files and
+            # functions, from its text: threads share the attributes of the error.
+            sentence = re.search(r"error: \([^)]*\) (.*?)\.? in function", str(error))
+            return NotLocated(f"the correlation cannot be maximised: {sentence[1] if sentence else error}")
         homography = np.asarray(found, np.float64)
         reason = why_implausible(homography, moving.shape, config.min_overlap)
         return NotLocated(f"the alignment diverges: {reason}") if reason else normalised(homography)
-
-
-def _sentence_of(error: cv2.error) -> str:
-    """Return OpenCV's message without files and functions, from its text: threads share the attributes of the error."""
-    found = re.search(r"error: \([^)]*\) (.*?)\.? in function", str(error))
-    return found[1] if found else str(error)
 
 
 class PhaseCorrelationLocator:
@@ -92,7 +88,10 @@ class PhaseCorrelationLocator:
     def register(self, moving: View, fixed: View, initial: Homography | None) -> Located | NotLocated:
         """Shift; see `photonpano.Locator`."""
         config = self._config
-        homography = np.eye(3) if initial is None else _shift_of(initial, moving.shape)
+        homography: Homography = np.eye(3)
+        if initial is not None:
+            centre = np.array([[(moving.shape[1] - 1) / 2, (moving.shape[0] - 1) / 2]])
+            homography = translation(*(transform_points(initial, centre) - centre)[0])
         for _ in range(config.max_rounds):
             shift = shift_between(moving, fixed.seen_from(homography), config.peak_px)
             if shift is None:
@@ -101,9 +100,3 @@ class PhaseCorrelationLocator:
             if max(abs(shift)) < config.converged_px:
                 break
         return motion_from_images(moving, fixed, homography, config, free=TRANSLATION, efficiency=_EFFICIENCY)
-
-
-def _shift_of(motion: Homography, shape: tuple[int, int]) -> FloatArray:
-    """Return the translation that moves the centre of an image as a motion does."""
-    centre = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
-    return translation(*(transform_points(motion, centre) - centre)[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -52,7 +52,13 @@ class MatPartsSource(BinarySource):
                     "capture have the same size"
                 )
         self._starts = list(accumulate((shape[0] for shape in shapes), initial=0))
-        _require_agreement(config.path, [shape[0] for shape in shapes])
+        info, n_frames = _info(config.path), [shape[0] for shape in shapes]
+        # Its no_frames is that of the capture, or that of each part but the last.
+        if info and info.no_frames != sum(n_frames) and {*n_frames[:-1], max(n_frames)} != {info.no_frames}:
+            raise InputError(
+                f"{config.path / _INFO} speaks of {info.no_frames} frames, and the parts hold {sum(n_frames)}; correct it, or "
+                "copy the parts again"
+            )
         _, height, width = shapes[0]
         super().__init__(self._starts[-1], FrameLayout((height, width), (height, -(-width // 8))), config.frame_rate_hz)
         self._lock = Lock()
@@ -95,24 +101,8 @@ def _info(folder: Path) -> _Info | None:
     return read_json(path, _Info) if path.exists() else None
 
 
-def _require_agreement(folder: Path, n_frames: Sequence[int]) -> None:
-    """Refuse an info.json whose no_frames is neither that of the capture nor that of each part but the last."""
-    info = _info(folder)
-    if info is None or info.no_frames == sum(n_frames):
-        return
-    if {*n_frames[:-1], max(n_frames)} != {info.no_frames}:
-        raise InputError(
-            f"{folder / _INFO} speaks of {info.no_frames} frames, and the parts hold {sum(n_frames)}; correct it, or copy the "
-            "parts again"
-        )
-
-
 def _size(shape: tuple[int, int, int]) -> str:
     return f"{shape[1]}x{shape[2]}"
-
-
-def _recognise(path: Path) -> Recognised | None:
-    return None if objections(_parts, path) else Recognised({"path": str(path)}, "a folder with part_1.mat")
 
 
 MAT_PARTS = SourceContribution(
@@ -121,6 +111,6 @@ MAT_PARTS = SourceContribution(
     config=MatPartsConfig,
     build=lambda config, _: MatPartsSource(config),
     check=lambda config: objections(_parts, config.path),  # the names alone: reading a part takes seconds
-    recognise=_recognise,
+    recognise=lambda path: None if objections(_parts, path) else Recognised({"path": str(path)}, "a folder with part_1.mat"),
     suffixes=(".mat",),
 )

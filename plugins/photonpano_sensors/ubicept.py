@@ -50,7 +50,12 @@ class UbiceptSource(SingleFrameSource):
             raise
 
     def _describe(self, config: UbiceptConfig) -> None:
-        self._group = self._find_group()
+        # That of the first dataset whose name is a number.
+        self._group: Any = self._file.visititems(lambda name, item: item.parent if _is_frame(name, item) else None)
+        if self._group is None:
+            raise InputError(
+                f"{self._path} has no group of frames, that is, datasets with numbers as names; choose another source"
+            )
         self._names = sorted((name for name in self._group if _is_number(name)), key=int)
         first = self._group[self._names[0]]
         if first.ndim < 2 or min(first.shape[:2]) < 1 or any(size != 1 for size in first.shape[2:]):
@@ -76,15 +81,6 @@ class UbiceptSource(SingleFrameSource):
         )
         self.response = BinarySumResponse(binary_frames)
         self.valid = np.ones(self.info.frame_shape, np.bool_)
-
-    def _find_group(self) -> Any:
-        """Return the group of the first dataset whose name is a number."""
-        found = self._file.visititems(lambda name, item: item.parent if _is_frame(name, item) else None)
-        if found is None:
-            raise InputError(
-                f"{self._path} has no group of frames, that is, datasets with numbers as names; choose another source"
-            )
-        return found
 
     def frame(self, index: int) -> NDArray[Any]:
         """Return a frame: (H, W), the sum of binary frames."""

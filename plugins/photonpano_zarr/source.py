@@ -128,7 +128,12 @@ class _Chunks(BinarySource):
 
     def _chunk(self, *place: int) -> NDArray[np.uint8]:
         path, shape = self._metadata.chunk(self._array, *place), self._metadata.chunk_shape
-        data: Any = _content(path)
+        data: Any
+        if isinstance(path, Url):
+            data = read_range(path, 0, _MOST_BYTES)
+        else:
+            with reading(path):
+                data = path.read_bytes()
         try:
             for decode in self._decoders:
                 data = decode(data)
@@ -139,13 +144,6 @@ class _Chunks(BinarySource):
     def close(self) -> None:
         super().close()
         self._pieces.close()
-
-
-def _content(path: Location) -> bytes:
-    if isinstance(path, Url):
-        return read_range(path, 0, _MOST_BYTES)
-    with reading(path):
-        return path.read_bytes()
 
 
 def _decoder(array: Location, name: str, configuration: dict[str, Any]) -> Any:

@@ -28,19 +28,17 @@ def write(folder: Path, info: StreamInfo, frames: Iterable[NDArray[np.uint8]], *
     n_frames = min(info.n_frames, max(1, _CHUNK_BYTES // math.prod(frame_shape)))
     codecs = [{"name": "zstd", "configuration": {"level": _LEVEL, "checksum": True}}] if compressed else []
     metadata = written(info, n_frames, codecs)
-    encode = _encoder(folder) if compressed else bytes
+    encode: Any = bytes
+    if compressed:
+        library("numcodecs", "photonpano[zarr]", f"compressing {folder.name}")
+        import numcodecs.zstd
+
+        encode = numcodecs.zstd.Zstd(level=_LEVEL, checksum=True).encode
     for index, chunk in enumerate(_chunks(frames, n_frames, frame_shape)):
         path = metadata.chunk(folder, index)
         assert isinstance(path, Path)
         path.write_bytes(encode(chunk))
     (folder / "zarr.json").write_text(metadata.model_dump_json(indent=2), encoding="utf-8")
-
-
-def _encoder(folder: Path) -> Any:
-    library("numcodecs", "photonpano[zarr]", f"compressing {folder.name}")
-    import numcodecs.zstd
-
-    return numcodecs.zstd.Zstd(level=_LEVEL, checksum=True).encode
 
 
 def _chunks(frames: Iterable[NDArray[np.uint8]], n_frames: int, frame_shape: tuple[int, int]) -> Iterator[NDArray[np.uint8]]:

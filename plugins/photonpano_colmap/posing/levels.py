@@ -186,15 +186,11 @@ def interpolate(
     units = camera.focal_px * np.array([1, 1, 1, depth, depth, depth])
     covariance = np.linalg.inv(adjusted.information / units[:, None] / units).astype(np.float64)
     means = exceeding_noise_of_poses(moves(poses, adjusted.poses) * units, covariance)
-    return PosedLevel(
-        groups, located, adjusted, observations, exposures, merged.path.corrected(_borders(kept), means / units), merged.tremor
-    )
-
-
-def _borders(groups: Sequence[Group]) -> FloatArray:
-    """Return where groups begin and end in time, in frames; where some are left out between them, halfway."""
-    between = [(before.span.stop + after.span.start - 1) / 2 for before, after in pairwise(groups)]
-    return np.array([groups[0].span.start - 0.5, *between, groups[-1].span.stop - 0.5])
+    # Where groups are left out between two, the border is halfway.
+    inner = [(before.span.stop + after.span.start - 1) / 2 for before, after in pairwise(kept)]
+    borders = np.array([kept[0].span.start - 0.5, *inner, kept[-1].span.stop - 0.5])
+    path = merged.path.corrected(borders, means / units)
+    return PosedLevel(groups, located, adjusted, observations, exposures, path, merged.tremor)
 
 
 def _overlap(here: PosedExposure, there: PosedExposure, camera: Camera) -> bool:

@@ -60,10 +60,15 @@ def find_tremor(
     """
     inverse_depth = float(np.median([np.median(each.inverse_depth) for each in exposures]))
     predicted = list(pool.map(lambda posed: _prediction(posed, camera, inverse_depth), exposures))
-    size = _span_frames(predicted)
+    # Frames of a span that shows a shift with little noise.
+    of_frame = np.mean([each.information[:2, :2] for each in predicted], axis=0)
+    variance = float(np.trace(np.linalg.pinv(of_frame))) / 2
+    size = int(np.clip(np.ceil(variance / _NOISE_PX**2), _SHORTEST, _LONGEST))
 
     def measured(posed: PosedExposure, prediction: _Prediction) -> list[_Equations]:
-        spans = _divided(posed.exposure.group.span, size)
+        group = posed.exposure.group.span
+        borders = np.linspace(group.start, group.stop, max(1, round(len(group) / size)) + 1).round().astype(int).tolist()
+        spans = [FrameSpan(*ends) for ends in pairwise(borders)]
         maps = between(posed.pose, path.at([span.centre for span in spans]), camera.matrix)
         return [_measured(source, *each, posed, prediction) for each in zip(spans, *maps, strict=True)]
 
@@ -152,19 +157,6 @@ def _prediction(posed: PosedExposure, camera: Camera, mean_depth: float) -> _Pre
 
 
 _DIFFERENCES = [np.array(kernel, np.float32) for kernel in ([[-0.5, 0, 0.5]], [[-0.5], [0], [0.5]])]
-
-
-def _span_frames(predicted: Sequence[_Prediction]) -> int:
-    """Return how many frames show a shift with little noise."""
-    mean = np.mean([each.information[:2, :2] for each in predicted], axis=0)
-    variance = float(np.trace(np.linalg.pinv(mean))) / 2
-    return int(np.clip(np.ceil(variance / _NOISE_PX**2), _SHORTEST, _LONGEST))
-
-
-def _divided(span: FrameSpan, size: int) -> list[FrameSpan]:
-    """Return parts of a span, side by side, of about a size."""
-    borders = np.linspace(span.start, span.stop, max(1, round(len(span) / size)) + 1).round().astype(int).tolist()
-    return [FrameSpan(*ends) for ends in pairwise(borders)]
 
 
 def _measured(

@@ -141,8 +141,13 @@ def linear_levels(config: ResponseConfig, encoding: Encoding) -> LinearLevels:
     read_noise = float(np.hypot(config.read_noise, photons_per_level / np.sqrt(12)))
     if config.curve == "linear" and config.curve_file is None:
         return LinearLevels(encoding.bits, None, IntensityResponse(photons_per_level, black, white, read_noise))
-    light = _light(config, (np.arange(top + 1) - black) / (white - black))
-    if config.curve_file is not None:
+    encoded = (np.arange(top + 1) - black) / (white - black)
+    light: NDArray[np.float64] = np.sign(encoded)
+    if config.curve_file is None:
+        size = np.abs(encoded)
+        light = light * (srgb_to_linear(size) if isinstance(config.curve, str) else size**config.curve)
+    else:
+        light = _measured(config.curve_file, len(encoded))
         at_black, at_white = np.interp([black, white], np.arange(top + 1), light)
         if not at_black < at_white:
             raise InputError(f"{config.curve_file}: the curve does not rise from the black level to the white level")
@@ -153,16 +158,6 @@ def linear_levels(config: ResponseConfig, encoding: Encoding) -> LinearLevels:
     # Integers, so that the flux of a black frame is exactly 0.
     zero, one = round(-lowest * scale), round((1 - lowest) * scale)
     return LinearLevels(16, table, IntensityResponse(config.saturation_photons / (one - zero), zero, one, read_noise))
-
-
-def _light(config: ResponseConfig, encoded: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the light of encoded levels that are 0 at black and 1 at white; in arbitrary units if it comes from a file."""
-    if config.curve_file is not None:
-        return _measured(config.curve_file, len(encoded))
-    size = np.abs(encoded)
-    if isinstance(config.curve, str):
-        return np.sign(encoded) * srgb_to_linear(size)
-    return np.asarray(np.sign(encoded) * size**config.curve)
 
 
 def _measured(path: Path, n_levels: int) -> NDArray[np.float64]:

@@ -51,10 +51,6 @@ class _Decoder:
         self.turn = Lock()
         self.users = 0
 
-    def comes_to(self, frame: int) -> bool:
-        """Return whether a frame is reached by decoding on, without seeking to the key frame before it."""
-        return self._index.key_before(frame) <= self.next <= frame
-
     def begin_before(self, frame: int) -> None:
         """Make the key frame before a frame the next one; the next call of `decode` seeks to it."""
         self.next, self._seeks = self._index.key_before(frame), True
@@ -141,7 +137,10 @@ class DecodedFrames:
             place, levels = decoder.decode()
             with self._lock:
                 self.n_decoded += 1
-                self._keep(place, levels)
+                self._frames[place] = levels
+                self._frames.move_to_end(place)
+                while len(self._frames) > self._kept:
+                    self._frames.popitem(last=False)
             if place == frame:
                 return levels
         with self._lock:
@@ -149,7 +148,8 @@ class DecodedFrames:
 
     def _decoder_for(self, frame: int) -> _Decoder:
         """Return the decoder that reaches a frame next, or one that seeks to the key frame before it."""
-        coming = [decoder for decoder in self._decoders if decoder.comes_to(frame)]
+        key = self._index.key_before(frame)
+        coming = [decoder for decoder in self._decoders if key <= decoder.next <= frame]
         idle = [decoder for decoder in self._decoders if not decoder.users]
         if coming:
             chosen = max(coming, key=lambda decoder: decoder.next)
@@ -168,12 +168,6 @@ class DecodedFrames:
         if known is not None:
             self._frames.move_to_end(frame)
         return known
-
-    def _keep(self, frame: int, levels: Levels) -> None:
-        self._frames[frame] = levels
-        self._frames.move_to_end(frame)
-        while len(self._frames) > self._kept:
-            self._frames.popitem(last=False)
 
 
 def _luma(frame: VideoFrame, index: VideoIndex) -> Levels:

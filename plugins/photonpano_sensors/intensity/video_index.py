@@ -76,6 +76,11 @@ def index_of(path: Path) -> VideoIndex:
         if context.format is None or not context.width * context.height:
             raise InputError(f"{path}: the size of its frames is missing; export it again")
         pixel_format = _pixel_format(context.format)
+        depth = re.search(r"(?:p|gray)(\d+)le", pixel_format)
+        bits = int(depth[1]) if depth else 8
+        encoding = Encoding(bits, 16.0 * 2 ** (bits - 8), 235.0 * 2 ** (bits - 8))
+        if context.color_range == _JPEG_RANGE or _FULL_RANGE.match(pixel_format):
+            encoding = Encoding.full(bits)
         rate = stream.average_rate
         return VideoIndex(
             path,
@@ -84,7 +89,7 @@ def index_of(path: Path) -> VideoIndex:
             context.height,
             context.width,
             pixel_format,
-            _encoding(pixel_format, context.color_range == _JPEG_RANGE),
+            encoding,
             float(rate) if rate else None,
         )
 
@@ -125,11 +130,3 @@ def _pixel_format(stored: VideoFormat) -> str:
         # Luma and colours alternate: converted to planes, the levels stay as they are.
         return "yuv422p"
     return "gray16le" if stored.components[0].bits > 8 else "gray"
-
-
-def _encoding(pixel_format: str, full_range: bool) -> Encoding:
-    depth = re.search(r"(?:p|gray)(\d+)le", pixel_format)
-    bits = int(depth[1]) if depth else 8
-    if full_range or _FULL_RANGE.match(pixel_format):
-        return Encoding.full(bits)
-    return Encoding(bits, 16.0 * 2 ** (bits - 8), 235.0 * 2 ** (bits - 8))
