@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photonpano.contracts.protocols import Closing, Trajectory
+from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 from photonpano.testing.scenes import Scene
 from photonpano.values import BoolArray, Counts, FloatArray, FrameSpan, Group, Homography, StreamInfo, VirtualExposure
@@ -63,6 +64,14 @@ class KnownMotion:
     def at(self, frame_indices: ArrayLike) -> FloatArray:
         """Return the homographies of N instants: (N, 3, 3)."""
         return np.array([self._at(frame) for frame in np.atleast_1d(frame_indices)]).reshape(-1, 3, 3)
+
+
+def rolled(degrees: float, shape: tuple[int, int]) -> Homography:
+    """Return a roll about the centre of an image of (height, width)."""
+    angle = np.deg2rad(degrees)
+    cos, sin = np.cos(angle), np.sin(angle)
+    centre = translation((shape[1] - 1) / 2, (shape[0] - 1) / 2)
+    return np.asarray(centre @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ np.linalg.inv(centre))
 
 
 def read_only(array: NDArray[Number]) -> NDArray[Number]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import weakref
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cache
 from typing import Any, ClassVar
 
@@ -15,7 +16,7 @@ from photonpano.contracts.loop import LOCATED, NOT_LOCATED, contract_for
 from photonpano.contracts.protocols import LocatesTurns
 from photonpano.geometry import Camera, apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
 from photonpano.plugins.contributions import LocatorContribution
-from photonpano.testing.captures import photographed, read_only
+from photonpano.testing.captures import photographed, read_only, rolled
 from photonpano.testing.conformance import must_not_raise, passing
 from photonpano.testing.sameness import copied, fingerprint, global_seed, in_threads
 from photonpano.testing.scenes import Scene
@@ -29,19 +30,11 @@ _PAIRS = 6  # pairs whose errors are compared with the information, eight number
 _BLANK = {"flat": 0.4, "dark": 0.0, "saturated": 50.0, "unseen": 0.4}  # flux of images without texture
 
 
-def _rolled(degrees: float) -> Homography:
-    angle = np.deg2rad(degrees)
-    cos, sin = np.cos(angle), np.sin(angle)
-    centre = translation((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
-    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    return np.asarray(centre @ turn @ np.linalg.inv(centre))
-
-
 # Maps from pixels of the moving image to pixels of the fixed one; the rotation is about the centre of 144x192 px.
 MOTIONS: Mapping[str, Homography] = {
     "sub-pixel shift": translation(0.3, -0.2),
     "shift": translation(13.25, -6.5),
-    "rotation": translation(4.0, -2.0) @ _rolled(3.0),
+    "rotation": translation(4.0, -2.0) @ rolled(3.0, SHAPE),
     "homography": from_parameters([0.02, 0.006, -0.01, 0.03, -6.0, 3.5, 4e-5, -6e-5]),
 }
 
@@ -319,8 +312,7 @@ def _blank(what: str, shape: tuple[int, int], seed: int) -> VirtualExposure:
 
 
 def _read_only(exposure: VirtualExposure) -> VirtualExposure:
-    flux, weight = read_only(exposure.flux), read_only(exposure.weight)
-    return VirtualExposure(flux, weight, exposure.group, exposure.scale, exposure.response)
+    return replace(exposure, flux=read_only(exposure.flux), weight=read_only(exposure.weight))
 
 
 def _started(initial: Homography | None) -> str:

@@ -15,7 +15,7 @@ from photonpano.contracts.protocols import Merger, Source, Trajectory
 from photonpano.errors import InputError
 from photonpano.geometry import translation
 from photonpano.plugins.contributions import MergerContribution
-from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded
+from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded, rolled
 from photonpano.testing.sameness import copied, fingerprint, in_threads
 from photonpano.testing.scenes import Scene
 from photonpano.testing.stages import Answer, AnswerConformance, accepts_read_only
@@ -254,11 +254,8 @@ def lit_probability(flux: FloatArray | np.float64) -> FloatArray:
 
 def _to_scene(frame: float) -> Homography:
     """Return the pose of the moving camera, which pans by 0.1 px and rolls by 0.02 degrees per frame."""
-    angle = np.deg2rad(0.02) * (frame - N_FRAMES / 2)
-    cos, sin = np.cos(angle), np.sin(angle)
-    centre = translation((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
-    roll = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    return np.asarray(translation(300 + 0.1 * frame, -80 + 0.04 * frame) @ centre @ roll @ np.linalg.inv(centre))
+    roll = rolled(0.02 * (frame - N_FRAMES / 2), SHAPE)
+    return np.asarray(translation(300 + 0.1 * frame, -80 + 0.04 * frame) @ roll)
 
 
 MOTION = KnownMotion(_to_scene)  # pixels of a frame of the moving camera to points of the scene

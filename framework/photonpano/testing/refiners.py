@@ -78,7 +78,9 @@ def case(tremor_px: float) -> Case:
     view = SeenScene(scene, pan)
     residuals = measured(source, view, tuple(LOCATED.blocks(SPAN_FRAMES)))
     std_px = np.full(FRAMES, np.inf)
-    std_px[LOCATED.start : LOCATED.stop] = SHARE_OF_NOISE * _noise_px(residuals)
+    variances = np.diagonal(np.linalg.inv(residuals.information), axis1=1, axis2=2)
+    noise_px = float(np.sqrt(variances[:, :2].sum(axis=1)).mean())  # that photons cause in the shift of a span
+    std_px[LOCATED.start : LOCATED.stop] = SHARE_OF_NOISE * noise_px
     return Case(source, motion, pan, read_only(std_px), residuals, view)
 
 
@@ -197,9 +199,3 @@ class RefinerConformance(AnswerConformance):
         """A run can be repeated."""
         same = fingerprint(self.refined(case(tremor_px))) == fingerprint(self.refined(case(tremor_px)))
         assert same, "refine() returns other results for the same residuals; seed random numbers with context.seed"
-
-
-def _noise_px(residuals: SpanResiduals) -> float:
-    """Return the mean error that photon noise causes in the shift of a span."""
-    variances = np.diagonal(np.linalg.inv(residuals.information), axis1=1, axis2=2)
-    return float(np.sqrt(variances[:, :2].sum(axis=1)).mean())
