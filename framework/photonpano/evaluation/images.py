@@ -112,14 +112,23 @@ def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography, aroun
     of the camera to whose pixels the alignment maps, if the scene is an equirectangular panorama, 360 degrees wide, whose
     middle that camera looks at.
     """
+    import cv2
     from scipy.ndimage import map_coordinates
 
     shape = scene.shape
-    side = _pixels_along(canvas, alignment, around, shape)
+    # The pixels of the scene along the side of a pixel in the middle of the canvas.
+    middle = canvas.part((canvas.width - 1) // 2, (canvas.height - 1) // 2, 2, 2)
+    (here, right), (below, _) = _scene_points(middle, alignment, around, shape)
+    (a, b), (c, d) = right - here, below - here
+    area = abs(a * d - b * c)
+    side = max(1, round(float(np.sqrt(area)))) if np.isfinite(area) else 1
     margin = side if around is not None else 0
     if margin:  # the scene goes on all around
         scene = np.concatenate([scene[:, -margin:], scene, scene[:, :margin]], axis=1)
-    scene, offset = _averaged(scene, side)
+    if side > 1:  # averages of squares, whose middles lie beyond their first pixels
+        averages = cv2.boxFilter(scene, cv2.CV_32F, (side, side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
+        scene = np.asarray(averages, np.float32)
+    offset = (side - 1) / 2
     image = np.empty((*canvas.shape, *shape[2:]), dtype=np.float32)
     for top in range(0, canvas.height, _ROWS):
         part = canvas.part(0, top, min(_ROWS, canvas.height - top), canvas.width)
@@ -144,25 +153,6 @@ def _scene_points(canvas: Canvas, alignment: Homography, around: FloatArray | No
     height, width = scene_shape[:2]
     angles = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
     return np.asarray(angles * (width / (2 * np.pi)) + [(width - 1) / 2, (height - 1) / 2])
-
-
-def _pixels_along(canvas: Canvas, alignment: Homography, around: FloatArray | None, scene_shape: tuple[int, ...]) -> int:
-    """Return the pixels of the scene along the side of a pixel in the middle of a canvas."""
-    middle = canvas.part((canvas.width - 1) // 2, (canvas.height - 1) // 2, 2, 2)
-    (here, right), (below, _) = _scene_points(middle, alignment, around, scene_shape)
-    (a, b), (c, d) = right - here, below - here
-    area = abs(a * d - b * c)
-    return max(1, round(float(np.sqrt(area)))) if np.isfinite(area) else 1
-
-
-def _averaged(scene: FluxImage, side: int) -> tuple[FluxImage, float]:
-    """Return the averages of squares of pixels, and how far their middles lie from their first pixels."""
-    import cv2
-
-    if side == 1:
-        return scene, 0.0
-    averages = cv2.boxFilter(scene, cv2.CV_32F, (side, side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(averages, np.float32), (side - 1) / 2
 
 
 def _colours(image: FluxImage) -> list[FluxImage]:

@@ -89,7 +89,8 @@ def replace_folder(staging: Path, directory: Path, replaced: Iterable[str]) -> N
         OutputError: the new files are complete, but could not all be put in place.
     """
     written = {path.relative_to(staging).as_posix() for path in _files(staging)}
-    flush_folder(staging)
+    for path in (*staging.rglob("*"), staging):
+        flush(path)
     if staging.parent == directory or not _exchanged(staging, directory, {*replaced, *written}):
         (staging / _REMOVED).write_text("\n".join({*replaced} - written), encoding="utf-8")
         flush(staging / _REMOVED)
@@ -164,7 +165,10 @@ def _exchanged(staging: Path, directory: Path, replaced: set[str]) -> bool:
     for path in others:
         target = staging / path.relative_to(directory)
         target.parent.mkdir(parents=True, exist_ok=True)
-        _link(path, target)
+        if path.is_dir() and not path.is_symlink():
+            shutil.copytree(path, target, symlinks=True, copy_function=link_or_copy)
+        else:
+            link_or_copy(path, target)
     if others:
         flush(staging)
     if not _exchange(staging, directory):
@@ -193,27 +197,12 @@ def _exchange(one: Path, other: Path) -> bool:
     return False
 
 
-def _link(path: Path, target: Path) -> None:
-    """Give a file a second name, or all files of a folder; where the file system cannot, copy them."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.copytree(path, target, symlinks=True, copy_function=link_or_copy)
-    else:
-        link_or_copy(path, target)
-
-
 def link_or_copy(path: str | Path, target: str | Path) -> None:
     """Give a file a second name; where the file system cannot, copy it."""
     try:
         os.link(path, target, follow_symlinks=False)
     except OSError:
         shutil.copy2(path, target, follow_symlinks=False)
-
-
-def flush_folder(folder: Path) -> None:
-    """Wait until the files of a folder and their names are on the disk."""
-    for path in folder.rglob("*"):
-        flush(path)
-    flush(folder)
 
 
 def _files(folder: Path) -> list[Path]:

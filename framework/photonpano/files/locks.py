@@ -59,7 +59,11 @@ def _acquired(path: Path, what: str) -> int:
             if mine is False or (mine is None and _may_live(_note(descriptor))):
                 raise OutputError(_refusal(path, what, _note_soon(descriptor)))
             if is_at(descriptor, path):  # the holder before may have removed it meanwhile
-                _write_note(descriptor)
+                pid, now = os.getpid(), datetime.now().astimezone().isoformat(timespec="seconds")
+                note: Holder = {"host": socket.gethostname(), "pid": pid, "process_start": _process_start(pid), "since": now}
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, json.dumps(note).encode(), 0)
+                os.fsync(descriptor)
                 return descriptor
         except BaseException:
             os.close(descriptor)
@@ -133,14 +137,6 @@ def _note_soon(descriptor: int) -> Holder | None:
     while (holder := _note(descriptor)) is None and time.monotonic() < end:
         time.sleep(0.01)
     return holder
-
-
-def _write_note(descriptor: int) -> None:
-    pid, now = os.getpid(), datetime.now().astimezone().isoformat(timespec="seconds")
-    holder: Holder = {"host": socket.gethostname(), "pid": pid, "process_start": _process_start(pid), "since": now}
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, json.dumps(holder).encode(), 0)
-    os.fsync(descriptor)
 
 
 def _may_live(holder: Holder | None) -> bool:

@@ -73,11 +73,12 @@ def plan_canvas(
     excess = canvas.height * canvas.width * bytes_per_pixel / memory
     if excess > MAX_EXCESS:
         fitting = scale * np.sqrt(MAX_EXCESS / excess)
+        digit = 10.0 ** (np.floor(np.log10(fitting)) - 1)  # two are significant; rounded down, the suggestion fits
         raise CanvasTooLargeError(
             f"the panorama would have {canvas.width} x {canvas.height} pixels, {excess:.0f} times what fits into the "
             f"{memory / 1024**3:.2g} GiB of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
             "More often means that the motion is wrong. Raise run.memory, "
-            f"lower render.scale from {scale:g} to {_rounded_down(fitting):g}, "
+            f"lower render.scale from {scale:g} to {np.floor(fitting / digit) * digit:g}, "
             "or choose a render.reference nearer to the middle of the motion"
         )
     return canvas
@@ -109,7 +110,12 @@ def _canvas(homographies: FloatArray, frame_shape: tuple[int, int], scale: float
     if view.level:
         horizon = level_horizon(rotations)
         covered = covered_by(horizon @ rotations, view.camera, frame_shape)
-    _require_cylinder(projection, covered, extent)
+    low, high = np.degrees(covered.b) if isinstance(extent, str) else (extent[1], extent[3])
+    if projection == "cylindrical" and max(-low, high) > _TALLEST_CYLINDER_DEGREES:  # far taller than what it shows
+        raise ProjectionError(
+            f"the frames reach {max(-low, high):.0f} degrees up or down, and a cylinder holds up to "
+            f"{_TALLEST_CYLINDER_DEGREES}; write render.projection: spherical"
+        )
     whole = canvas_around(covered, view.camera, scale, projection, horizon)
     if extent == "panorama":
         return whole
@@ -124,16 +130,6 @@ def _suitable(covered: Covered, extent: Extent) -> str:
     if extent == "reference" or np.degrees(covered.field_of_view) <= _PLANAR_DEGREES:
         return "planar"
     return "cylindrical" if np.degrees(max(-covered.b[0], covered.b[1])) < _CYLINDER_DEGREES else "spherical"
-
-
-def _require_cylinder(projection: str, covered: Covered, extent: Extent) -> None:
-    """Refuse a cylinder that would be far taller than what it shows."""
-    low, high = np.degrees(covered.b) if isinstance(extent, str) else (extent[1], extent[3])
-    if projection == "cylindrical" and max(-low, high) > _TALLEST_CYLINDER_DEGREES:
-        raise ProjectionError(
-            f"the frames reach {max(-low, high):.0f} degrees up or down, and a cylinder holds up to "
-            f"{_TALLEST_CYLINDER_DEGREES}; write render.projection: spherical"
-        )
 
 
 def _plane(
@@ -193,9 +189,3 @@ def _part_around(whole: Canvas, covered: Covered, box: tuple[int, int, int, int]
     (left, right), (top, bottom) = ((int(np.floor(start + 1e-6)), int(np.ceil(stop - 1e-6))) for start, stop in (across, down))
     origin = np.rint(whole.transform[:2, 2] + 0.5).astype(int)
     return whole.part(left + int(origin[0]), top + int(origin[1]), bottom - top, right - left)
-
-
-def _rounded_down(scale: float) -> float:
-    """Round down to two significant digits, so that the suggested scale fits."""
-    digit = 10.0 ** (np.floor(np.log10(scale)) - 1)
-    return float(np.floor(scale / digit) * digit)
