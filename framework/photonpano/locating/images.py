@@ -79,7 +79,10 @@ def motion_from_images(
     information = rows.T @ np.linalg.solve(curvature[np.ix_(estimated, estimated)], rows)
     held = [index for index in ALL_PARAMETERS if index not in estimated]
     information[held, held] += PRIOR_STD**-2.0
-    to_corners, to_step = _conversions(homography, moving.shape)
+    # Derivatives (8, 8) of mapped corners by a small step in unit coordinates, and of a step by p1..p8.
+    rows = np.concatenate([corners(moving.shape), np.ones((4, 1))], axis=1).T
+    to_corners = slopes(homography @ rows, homography @ generators(moving.shape) @ rows)
+    to_step = np.linalg.solve(to_corners, jacobian(homography, corners(moving.shape)).reshape(8, 8))
     covariance = np.linalg.inv(curvature[np.ix_(estimated, estimated)])
     std_px = float(np.sqrt(np.trace(to_corners[:, estimated] @ covariance @ to_corners[:, estimated].T) / 4))
     if not std_px <= limits.max_std_px:
@@ -115,18 +118,15 @@ def _derivatives(view: View, where: BoolArray) -> NDArray[np.float32]:
     rows, columns = np.nonzero(where)
     x, y = ((unit[axis, axis] * at + unit[axis, 2]).astype(np.float32) for axis, at in enumerate((columns, rows)))
     half = np.float32(max(height, width) / 2)
-    along_x, along_y = (half * each[where] for each in _gradients(view))
+    along = []
+    for kernel in (np.array([[-0.5, 0, 0.5]]), np.array([[-0.5], [0], [0.5]])):
+        # Central differences; 0 where a neighbour is masked.
+        neighbours = cv2.erode(view.seen.astype(np.uint8), np.ones(kernel.shape, np.uint8), borderValue=0)
+        difference = np.where(neighbours, cv2.filter2D(view.image, -1, kernel), np.float32(0)).astype(np.float32)
+        along.append(half * difference[where])
+    along_x, along_y = along
     inwards = along_x * x + along_y * y
     return np.stack([along_x * x, along_y * x, along_x * y, along_y * y, along_x, along_y, -inwards * x, -inwards * y], axis=1)
-
-
-def _gradients(view: View) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return central differences along x and y; 0 where a neighbour is masked."""
-    differences = []
-    for kernel in (np.array([[-0.5, 0, 0.5]]), np.array([[-0.5], [0], [0.5]])):
-        neighbours = cv2.erode(view.seen.astype(np.uint8), np.ones(kernel.shape, np.uint8), borderValue=0)
-        differences.append(np.where(neighbours, cv2.filter2D(view.image, -1, kernel), np.float32(0)).astype(np.float32))
-    return differences[0], differences[1]
 
 
 def _common_curvature(
@@ -145,10 +145,3 @@ def _common_curvature(
     values, vectors = np.linalg.eigh(whitening @ (between + between.T) @ whitening.T / 2)
     half = root @ vectors * np.sqrt(np.maximum(values, MIN_COMMON_CURVATURE))
     return np.asarray(half @ half.T)
-
-
-def _conversions(homography: Homography, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives (8, 8) of mapped corners by a small step in unit coordinates, and of a step by p1..p8."""
-    rows = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
-    to_corners = slopes(homography @ rows, homography @ generators(shape) @ rows)
-    return to_corners, np.asarray(np.linalg.solve(to_corners, jacobian(homography, corners(shape)).reshape(8, 8)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from photonpano.locating.viewing import View
-from photonpano.values import BoolArray, FloatArray
+from photonpano.values import FloatArray
 
 _TAPER = 0.25  # the window falls to 0 at masked pixels, over this fraction of the shorter side
 
@@ -26,8 +26,9 @@ def shift_between(moving: View, fixed: View, peak_px: float = 1.5) -> FloatArray
     both = moving.seen & fixed.seen
     if not both.any():
         return None
-    # Without a window, the borders, which do not move, would correlate.
-    window = _window(both)
+    # Without a window, which falls to 0 at the borders of what was seen, these would correlate: they do not move.
+    distance = cv2.distanceTransform(np.pad(both, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    window = np.sin(np.pi / 2 * np.minimum(distance / (_TAPER * min(both.shape)), 1)) ** 2
     first, second = (window * (view.image - view.image[both].mean()) for view in (moving, fixed))
     return shift_by_phase(first, second, peak_px)
 
@@ -105,13 +106,6 @@ def _blur(shape: tuple[int, ...], peak_px: float) -> FloatArray:
     height, width = shape
     down, across = np.meshgrid(fft.fftfreq(height), fft.rfftfreq(width), indexing="ij")
     return np.asarray(np.exp(-2 * (np.pi * peak_px) ** 2 * (down**2 + across**2)))
-
-
-def _window(seen: BoolArray) -> NDArray[np.float32]:
-    """Return 1 inside of what was seen, falling to 0 at its borders."""
-    distance = cv2.distanceTransform(np.pad(seen, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    within = np.minimum(distance / (_TAPER * min(seen.shape)), 1)
-    return np.asarray(np.sin(np.pi / 2 * within) ** 2, np.float32)
 
 
 def _vertex(values: FloatArray, gaussian: bool) -> float:

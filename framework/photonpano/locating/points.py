@@ -68,7 +68,11 @@ def consensus_of(
             # Keypoints of blurred and dark exposures scatter more, and in the whole image fewer matches agree by chance.
             agreeing = int(np.count_nonzero(distances < limits.threshold_px * (1 if matches.guided else 2)))
         found["agreeing"] = float(agreeing)
-        by_chance = _agreeing_by_chance(count, matches.guided)
+        # In the form of Brown and Lowe (2007, section 3.2). Near a predicted position keypoints of pure noise match as well: 10
+        # to 16 % of them agree, and 60 % and more do for a scene at 0.01 photons per pixel per frame. In the whole image next
+        # to none agree by chance, but of matches between blurred exposures few agree to a pixel or two even if the motion is
+        # right.
+        by_chance = 8.0 + (0.3 if matches.guided else 0.1) * count
         if homography is not None and agreeing > by_chance:
             return matches, normalised(homography), found
         failure = NotLocated(
@@ -83,16 +87,6 @@ def too_few_matches(count: int, limits: PointLimits, evidence: Mapping[str, floa
     if "keypoints_moving" in evidence:
         keypoints = f" ({evidence['keypoints_moving']:.0f} and {evidence['keypoints_fixed']:.0f} keypoints)"
     return NotLocated(f"{count} matches, fewer than min_inliers = {limits.min_inliers}{keypoints}", evidence)
-
-
-def _agreeing_by_chance(matches: int, guided: bool) -> float:
-    """Return the largest number of matches that may agree by chance, in the form of Brown and Lowe (2007, section 3.2).
-
-    Near a predicted position keypoints of pure noise match as well: 10 to 16 % of them agree, and 60 % and more do for a scene
-    at 0.01 photons per pixel per frame. In the whole image next to none agree by chance, but of matches between blurred
-    exposures few agree to a pixel or two even if the motion is right.
-    """
-    return 8.0 + (0.3 if guided else 0.1) * matches
 
 
 def motion_from_points(

@@ -63,11 +63,12 @@ def footprints_of(
 ) -> list[Footprint]:
     """Return the footprint of each frame on a canvas; (N, 3, 3) map (ideal) pixels to pixels of the reference plane."""
     if not by_homographies(canvas, camera, homographies, frame_shape):
-        return _Remap(canvas, camera if camera is not None and camera.distorts else None, frame_shape).footprints(homographies)
+        return _remapped(canvas, camera if camera is not None and camera.distorts else None, homographies, frame_shape)
     to_grid = canvas.transform @ homographies
     shrink = _shrink_factors(to_grid, canvas, frame_shape)
     to_grid = to_grid @ np.array([rescaling(factor) for factor in shrink]).reshape(-1, 3, 3)
-    outlines = np.array([corners(_shrunk(frame_shape, factor)) for factor in shrink]).reshape(-1, 4, 2)
+    shrunk = [(-(-frame_shape[0] // factor), -(-frame_shape[1] // factor)) for factor in shrink]
+    outlines = np.array([corners(shape) for shape in shrunk]).reshape(-1, 4, 2)
     low, high = _touched(transform_points(to_grid, outlines), canvas.shape)
     to_image = inverse(to_grid)
     return [
@@ -76,68 +77,55 @@ def footprints_of(
     ]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Remap:
-    """Frames that no homographies map to a canvas: `camera` is None without a lens."""
+def _remapped(canvas: Canvas, camera: Camera | None, homographies: FloatArray, frame_shape: tuple[int, int]) -> list[Footprint]:
+    """Return the footprints of frames that no homographies map to a canvas; `camera` is None without a lens."""
+    to_rays = _to_rays(canvas, homographies)
+    shrink = _shrink_factors(to_rays, canvas, frame_shape)
+    outline = outline_of(frame_shape, float(max(shrink, default=1)))
+    rows, columns = _touched_around(canvas, outline if camera is None else camera.ideal(outline), to_rays)
+    lenses = {each: NO_LENS if camera is None else _lens_of(camera, frame_shape, each) for each in set(shrink)}
+    # From pixels of the reference plane to what the lens takes.
+    to_ideal = {each: rescaling(1 / each) if camera is None else np.linalg.inv(camera.matrix) for each in lenses}
+    return [
+        Footprint(each, np.ascontiguousarray(to_ideal[each] @ from_rays), down, across, lenses[each])
+        for each, from_rays, down, across in zip(shrink, np.linalg.inv(to_rays), rows, columns, strict=True)
+    ]
 
-    canvas: Canvas
-    camera: Camera | None
-    frame_shape: tuple[int, int]
 
-    def footprints(self, homographies: FloatArray) -> list[Footprint]:
-        to_rays = _to_rays(self.canvas, homographies)
-        shrink = _shrink_factors(to_rays, self.canvas, self.frame_shape)
-        rows, columns = self._touched(to_rays, max(shrink, default=1))
-        lenses = {each: self._lens(each) for each in set(shrink)}
-        return [
-            Footprint(each, np.ascontiguousarray(self._to_ideal(each) @ from_rays), down, across, lenses[each])
-            for each, from_rays, down, across in zip(shrink, np.linalg.inv(to_rays), rows, columns, strict=True)
-        ]
+def _lens_of(camera: Camera, frame_shape: tuple[int, int], shrink: int) -> Lens:
+    matrix = rescaling(1 / shrink) @ camera.matrix
+    ideal = camera.ideal(outline_of(frame_shape, 2.0 * shrink))
+    radius = np.linalg.norm((ideal - camera.centre_px) / camera.focal_px, axis=-1)
+    limit = float(np.nanmax(radius)) if np.isfinite(radius).all() else _WIDEST
+    k1, k2, p1, p2 = camera.distortion.tolist()
+    return Lens(k1, k2, p1, p2, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], min(limit**2, _fold(k1, k2)))
 
-    def _to_ideal(self, shrink: int) -> Homography:
-        """Return the map from pixels of the reference plane to what the lens takes."""
-        return rescaling(1 / shrink) if self.camera is None else np.asarray(np.linalg.inv(self.camera.matrix), np.float64)
 
-    def _lens(self, shrink: int) -> Lens:
-        if self.camera is None:
-            return NO_LENS
-        matrix = rescaling(1 / shrink) @ self.camera.matrix
-        ideal = self.camera.ideal(outline_of(self.frame_shape, 2.0 * shrink))
-        radius = np.linalg.norm((ideal - self.camera.centre_px) / self.camera.focal_px, axis=-1)
-        limit = float(np.nanmax(radius)) if np.isfinite(radius).all() else _WIDEST
-        k1, k2, p1, p2 = self.camera.distortion.tolist()
-        return Lens(k1, k2, p1, p2, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], min(limit**2, _fold(k1, k2)))
-
-    def _touched(self, to_rays: FloatArray, margin: int) -> tuple[list[range], list[tuple[range, ...]]]:
-        """Return the rows and the columns of the grid that each frame may touch."""
-        height, width = self.canvas.shape
-        outline = outline_of(self.frame_shape, float(margin))
-        if self.camera is not None:
-            outline = self.camera.ideal(outline)
-        ends = np.concatenate([outline, np.ones((len(outline), 1))], axis=1)
-        rays = ends @ np.swapaxes(to_rays, -1, -2)
-        places = self.canvas.pixels(rays)
-        everywhere = ~np.isfinite(places).all(axis=(1, 2))
-        places = np.where(np.isfinite(places), places, 0)
-        low, high = places[..., 1].min(axis=1), places[..., 1].max(axis=1)
-        period = self.canvas.period_px
-        if period is None:
-            left, right = places[..., 0].min(axis=1), places[..., 0].max(axis=1)
-        else:
-            middle = places[:, :1, 0]
-            beside = np.remainder(places[..., 0] - middle + period / 2, period) - period / 2
-            left, right = middle[:, 0] + beside.min(axis=1), middle[:, 0] + beside.max(axis=1)
-            elevation = np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
-            up, down = elevation.min(axis=1) < -_NEAR_POLE, elevation.max(axis=1) > _NEAR_POLE
-            low, high = np.where(up, 0, low), np.where(down, height, high)
-            left, right = np.where(up | down, 0, left), np.where(up | down, period, right)
-        low, high = np.where(everywhere, 0, low), np.where(everywhere, height, high)
-        left, right = np.where(everywhere, 0, left), np.where(everywhere, width, right)
-        rows = [_clipped(first - 1, last + 2, height) for first, last in zip(low.tolist(), high.tolist(), strict=True)]
-        columns = [
-            _turned(first - 1, last + 2, width, period) for first, last in zip(left.tolist(), right.tolist(), strict=True)
-        ]
-        return rows, columns
+def _touched_around(canvas: Canvas, outline: FloatArray, to_rays: FloatArray) -> tuple[list[range], list[tuple[range, ...]]]:
+    """Return the rows and the columns of the grid that each frame may touch, from (P, 2) ideal pixels around a frame."""
+    height, width = canvas.shape
+    ends = np.concatenate([outline, np.ones((len(outline), 1))], axis=1)
+    rays = ends @ np.swapaxes(to_rays, -1, -2)
+    places = canvas.pixels(rays)
+    everywhere = ~np.isfinite(places).all(axis=(1, 2))
+    places = np.where(np.isfinite(places), places, 0)
+    low, high = places[..., 1].min(axis=1), places[..., 1].max(axis=1)
+    period = canvas.period_px
+    if period is None:
+        left, right = places[..., 0].min(axis=1), places[..., 0].max(axis=1)
+    else:
+        middle = places[:, :1, 0]
+        beside = np.remainder(places[..., 0] - middle + period / 2, period) - period / 2
+        left, right = middle[:, 0] + beside.min(axis=1), middle[:, 0] + beside.max(axis=1)
+        elevation = np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
+        up, down = elevation.min(axis=1) < -_NEAR_POLE, elevation.max(axis=1) > _NEAR_POLE
+        low, high = np.where(up, 0, low), np.where(down, height, high)
+        left, right = np.where(up | down, 0, left), np.where(up | down, period, right)
+    low, high = np.where(everywhere, 0, low), np.where(everywhere, height, high)
+    left, right = np.where(everywhere, 0, left), np.where(everywhere, width, right)
+    rows = [_clipped(first - 1, last + 2, height) for first, last in zip(low.tolist(), high.tolist(), strict=True)]
+    columns = [_turned(first - 1, last + 2, width, period) for first, last in zip(left.tolist(), right.tolist(), strict=True)]
+    return rows, columns
 
 
 def _to_rays(canvas: Canvas, homographies: FloatArray) -> FloatArray:
@@ -178,10 +166,6 @@ def _shrink_factors(to_rays: FloatArray, canvas: Canvas, frame_shape: tuple[int,
     points = rays[..., :2] / rays[..., 2:] if canvas.planar else rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     step = np.linalg.norm(points[:, 1:] - points[:, :1], axis=-1).max(axis=-1)
     return [max(1, int(factor)) for factor in 1 / (step * (1 if canvas.planar else canvas.transform[0, 0])) + 1e-6]
-
-
-def _shrunk(shape: tuple[int, int], factor: int) -> tuple[int, int]:
-    return -(-shape[0] // factor), -(-shape[1] // factor)
 
 
 def _touched(outline: FloatArray, grid_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

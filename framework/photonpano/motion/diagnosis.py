@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import InputError, LocationError, PhotonpanoError
+from photonpano.errors import InputError, LocationError
 from photonpano.geometry import corners
 from photonpano.motion.graph import GraphSolution
 from photonpano.photometry import signal_to_noise
@@ -119,12 +119,9 @@ def also_tried(error: LocationError, what: str) -> Iterator[None]:
     try:
         yield
     except (LocationError, InputError) as failure:
-        error.args = (f"{error}\n{what}: {_first_clause(failure)}",)
+        first_clause = str(failure).splitlines()[0].split("; ")[0].removeprefix("motion.start: ")
+        error.args = (f"{error}\n{what}: {first_clause}",)
         raise error from failure
-
-
-def _first_clause(error: PhotonpanoError) -> str:
-    return str(error).splitlines()[0].split("; ")[0].removeprefix("motion.start: ")
 
 
 @contextmanager

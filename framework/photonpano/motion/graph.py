@@ -197,13 +197,21 @@ def _costs(fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, Cost]:
 
 def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel, fits: Sequence[_Fit] = ()) -> _Fit:
     """Fit a model; rotations through a lens begin with those without, if these are among the `fits`."""
+    problem, shape = tied.problem, tied.frame_shape
+    given = None if start is None else inverse(start[tied.anchor]) @ start[tied.located]
     if model.kind != "rotation":
-        return _planar(tied, start, model.planar)
-    without = next((fit.state for fit in fits if isinstance(fit.state, Rotations)), None)
-    if without is None:
-        return _rotations(tied, start, model)
-    adjustment = RotationAdjustment(tied.problem, model.seen_by(tied.frame_shape), model.unknown)
-    return tied.fit(adjustment, without)
+        planar = model.planar
+        found = nearest(planar, problem.observed if given is None else normalised(given), shape)
+        return tied.fit(PlanarAdjustment(problem, planar), tied.composed(found) if given is None else found)
+    adjustment = RotationAdjustment(problem, model.seen_by(shape), model.unknown)
+    state = next((fit.state for fit in fits if isinstance(fit.state, Rotations)), None)
+    if state is None:
+        camera = model.camera(shape)
+        if model.focal_px is None and model.known is None:
+            camera = adjustment.likeliest_camera(camera)
+        rotations = likely_rotations(camera, problem.observed if given is None else given, shape)
+        state = Rotations(tied.composed(rotations) if given is None else rotations, camera)
+    return tied.fit(adjustment, state)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -297,27 +305,6 @@ class _Tied:
         rotations = None if model.kind != "rotation" else Rotations(np.eye(3)[None], model.camera(self.frame_shape))
         nothing = Assessment(np.full((1, 8, 8), np.nan), np.full(1, np.nan), np.zeros(0))
         return GraphSolution(homographies, self.located, (), 0.0, lambda: nothing, model, rotations)
-
-
-def _planar(tied: _Tied, start: FloatArray | None, model: PlanarName) -> _Fit:
-    problem, shape = tied.problem, tied.frame_shape
-    if start is None:
-        state = tied.composed(nearest(model, problem.observed, shape))
-    else:
-        state = nearest(model, normalised(inverse(start[tied.anchor]) @ start[tied.located]), shape)
-    return tied.fit(PlanarAdjustment(problem, model), state)
-
-
-def _rotations(tied: _Tied, start: FloatArray | None, model: MotionModel) -> _Fit:
-    problem, camera, shape = tied.problem, model.camera(tied.frame_shape), tied.frame_shape
-    adjustment = RotationAdjustment(problem, model.seen_by(shape), model.unknown)
-    if model.focal_px is None and model.known is None:
-        camera = adjustment.likeliest_camera(camera)
-    if start is None:
-        rotations = tied.composed(likely_rotations(camera, problem.observed, shape))
-    else:
-        rotations = likely_rotations(camera, inverse(start[tied.anchor]) @ start[tied.located], shape)
-    return tied.fit(adjustment, Rotations(rotations, camera))
 
 
 def _tree(n_nodes: int, pairs: NDArray[np.integer], anchor: int) -> tuple[NDArray[np.integer], NDArray[np.integer]]:

@@ -131,10 +131,6 @@ class VirtualExposures:
         """Height and width of a frame."""
         return self.source.info.frame_shape
 
-    def previous_homographies(self) -> FloatArray | None:
-        """Return the motion known so far at every frame of the capture: (T, 3, 3); None at the first level."""
-        return None if self.previous is None else self.previous.at(np.arange(self.source.info.n_frames))
-
     def merged(self, index: int, clock: Stopwatch | None = None) -> VirtualExposure:
         """Merge a group, given by its index, along the motion known so far; a second call merges it again.
 
@@ -147,16 +143,3 @@ class VirtualExposures:
         with (clock or self.clock)("merge"), level.attributing("merger"):
             exposure = level.merger.merge(self.source, self.groups[index], self.previous or self.start, level.scale)
             return EXPOSURE.require(exposure, Asked(self.groups[index], level.scale, self.frame_shape))
-
-
-def merge(
-    level: Level,
-    source: Source,
-    groups: Sequence[Group],
-    previous: Trajectory | None,
-    clock: Stopwatch,
-    timeline: Timeline | None = None,
-    start: Trajectory | None = None,
-) -> VirtualExposures:
-    """Plan the virtual exposures of a level: its groups, merged along the motion known so far (paper, section 4, "Merge")."""
-    return VirtualExposures(level, source, groups, previous, clock, timeline, start)

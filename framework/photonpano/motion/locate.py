@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,7 +18,7 @@ from photonpano.motion.closures import MIN_SIMILARITY, closure_candidates, expos
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.evidence import Evidence
 from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
-from photonpano.motion.level import FrameHomography, Level, VirtualExposures
+from photonpano.motion.level import FrameHomography, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import alike, instants_of, pairs_of
 from photonpano.motion.registration import Registrar
@@ -97,7 +97,8 @@ def locate(
     pairs, previous = pairs_of(groups, graph.skips), exposures.previous
     if previous is not None:
         pairs = alike(pairs, previous.at(instants_of(groups)), shape)
-    given = groups, pairs, exposures.previous_homographies(), exposures.timeline, camera_of(exposures.source)
+    known = None if previous is None else previous.at(np.arange(exposures.source.info.n_frames))
+    given = groups, pairs, known, exposures.timeline, camera_of(exposures.source)
     log = context.checkpoints.log(f"level-{level.number}", *given)
     with thread_pool(context.threads) as pool:
         registrar = Registrar(exposures, log, context, start)
@@ -105,7 +106,15 @@ def locate(
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
         edges = tuple(_alike_across_cuts(exposures, each) for each in edges)
-        _require_motion(level, edges, shape, partial(_seen_px, exposures.groups, edges, start))
+        # Locators must report their failures.
+        located = [(edge.locator, edge.motion.homography) for edge in edges if isinstance(edge.motion, Located)]
+        if problem := why_still([homography for _, homography in located], shape, partial(_seen_px, groups, edges, start)):
+            names = {name for name, _ in located}
+            origins = listed(locator.origin for locator in level.locators if locator.name in names)
+            raise PluginError(
+                f"{origins} broke {'its' if len(names) == 1 else 'their'} contract at level {level.number}: {problem}; "
+                "a failure is NotLocated"
+            )
         with exposures.clock("locate"), solving(level.number):
             edges = _checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
@@ -214,17 +223,14 @@ def _not_outvoting(
     solution without closures (`alone`) are wrong anyway.
     """
     outvoted = [edges[index] for index in set(together.outliers) - set(alone.outliers) if index < len(edges)]
-
-    def outvotes(closure: Edge) -> bool:
-        return any(closure.fixed <= edge.fixed and edge.moving <= closure.moving for edge in outvoted)
-
-    reason = "this loop closure contradicts pairs in between that are surer"
-    return tuple(
-        replace(each, motion=NotLocated(reason, each.motion.evidence), locator="")
-        if isinstance(each.motion, Located) and outvotes(each)
-        else each
-        for each in closures
-    )
+    found = []
+    for each in closures:
+        outvotes = any(each.fixed <= edge.fixed and edge.moving <= each.moving for edge in outvoted)
+        if isinstance(each.motion, Located) and outvotes:
+            reason = "this loop closure contradicts pairs in between that are surer"
+            each = replace(each, motion=NotLocated(reason, each.motion.evidence), locator="")
+        found.append(each)
+    return tuple(found)
 
 
 def _ambiguity(level: int, alternatives_px: Mapping[tuple[int, int], float], edges: Sequence[Edge]) -> Ambiguity | None:
@@ -234,15 +240,3 @@ def _ambiguity(level: int, alternatives_px: Mapping[tuple[int, int], float], edg
     if not pairs:
         return None
     return Ambiguity(level, pairs, float(np.median([alternatives_px[pair] for pair in pairs])))
-
-
-def _require_motion(level: Level, edges: Sequence[Edge], shape: tuple[int, int], seen_px: Callable[[], float]) -> None:
-    """Refuse a level whose locators do not report their failures: see `why_still`."""
-    located = [(edge.locator, edge.motion.homography) for edge in edges if isinstance(edge.motion, Located)]
-    if problem := why_still([homography for _, homography in located], shape, seen_px):
-        names = {name for name, _ in located}
-        origins = listed(locator.origin for locator in level.locators if locator.name in names)
-        raise PluginError(
-            f"{origins} broke {'its' if len(names) == 1 else 'their'} contract at level {level.number}: {problem}; "
-            "a failure is NotLocated"
-        )

@@ -13,13 +13,13 @@ from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
-from photonpano.motion.level import Level, VirtualExposures, merge
+from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.refined_motion import Knots, RefinedMotion
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
 from photonpano.motion.timeline import Timeline
-from photonpano.motion.tracking import StartingMotion, starting_motion
+from photonpano.motion.tracking import starting_motion
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.values import FloatArray, Group
 
@@ -92,8 +92,12 @@ def estimate_motion(
         groups = timeline.parts(resample(level, source.info.n_frames, clock))
         turning = level.turning(model.turning_camera(source.info.frame_shape))
         seen = through_lens(source, model)
-        start = None if previous is not None else _start(seen, groups, context, timeline, clock)
-        exposures = merge(turning, seen, groups, previous, clock, timeline, start)
+        start = None
+        if previous is None:
+            with clock("locate"):
+                start = context.checkpoints.once("level-1-start", partial(starting_motion, seen, groups, context), groups)
+            start = start and replace(start, timeline=timeline)
+        exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start)
         located = locate(exposures, graph, context, model, start)
         trajectory = interpolate(level, located, timeline, reference, clock, previous if corrects else None)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
@@ -105,15 +109,6 @@ def estimate_motion(
         if until_converged and level.scale == levels[-1].scale and not converges(results):
             break
     return results
-
-
-def _start(
-    source: Source, groups: Sequence[Group], context: Context, timeline: Timeline, clock: Stopwatch
-) -> StartingMotion | None:
-    """Measure the motion that short spans show before the first level, once; None if they show none."""
-    with clock("locate"):
-        found = context.checkpoints.once("level-1-start", partial(starting_motion, source, groups, context), groups)
-    return None if found is None else replace(found, timeline=timeline)
 
 
 def through_lens(source: Source, model: MotionModel) -> Source:

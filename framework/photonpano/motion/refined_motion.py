@@ -63,7 +63,10 @@ class RefinedMotion:
         if rotations is not None:
             return Knots(found, information, Rotations(nearest_rotations(rotations.camera.rotations(found)), rotations.camera))
         if information is not None:
-            to_corrections = np.linalg.inv(_slopes(back, homographies, found))
+            # The derivatives of p1..p8 of what was found by those of the homographies.
+            changes = (back[:, None] @ (from_parameters(np.eye(8)) - np.eye(3))) / (back @ homographies)[:, None, 2:, 2:]
+            slopes = parameters(np.eye(3) + changes - found[:, None] * changes[..., 2:, 2:])
+            to_corrections = np.linalg.inv(np.swapaxes(slopes, -1, -2))
             information = np.swapaxes(to_corrections, -1, -2) @ information @ to_corrections
         return Knots(found, information, None)
 
@@ -78,10 +81,3 @@ class _Corrected(NamedTuple):
 
     def at(self, frame_indices: ArrayLike) -> FloatArray:
         return np.asarray(self.known.at(frame_indices) @ self.corrections.at(frame_indices))
-
-
-def _slopes(back: FloatArray, homographies: FloatArray, found: FloatArray) -> FloatArray:
-    """Return the derivatives of p1..p8 of `found` = back @ homographies by those of the homographies: (N, 8, 8)."""
-    depth = (back @ homographies)[:, None, 2:, 2:]
-    changes = (back[:, None] @ (from_parameters(np.eye(8)) - np.eye(3))) / depth
-    return np.swapaxes(parameters(np.eye(3) + changes - found[:, None] * changes[..., 2:, 2:]), -1, -2)

@@ -81,8 +81,11 @@ class Registrar:
             partners[moving].append(fixed)
             needed_until[fixed] = max(needed_until[fixed], moving)
         known = len(self._log.found)
-        for moving, registered in enumerate(self._log.found):
-            self._restore(moving, registered)
+        for moving, registered in enumerate(self._log.found):  # before an interruption
+            self.contrasts[moving] = registered.contrast
+            if registered.place is not None:
+                self._places[moving] = registered.place
+            self.alternatives_px |= {(moving, fixed): px for fixed, px in registered.alternatives_px.items()}
             yield from registered.edges
             advance(1)
         needed = {index: partners[index] for index in partners if max(index, needed_until[index]) >= known}
@@ -93,7 +96,9 @@ class Registrar:
             found = [edge for edge in job.result() if edge.moving == moving]
             if found and not any(isinstance(edge.motion, Located) for edge in found):
                 found += self._bridge(moving, partners[moving])
-            self._log.add(self._registered(moving, tuple(found)))
+            second = {edge.fixed: self.alternatives_px.get((moving, edge.fixed)) for edge in found}
+            alternatives = {fixed: px for fixed, px in second.items() if px is not None}
+            self._log.add(Registered(tuple(found), self.contrasts[moving], self._places.get(moving), alternatives))
             yield from found
             for index in [index for index in self._kept if needed_until[index] <= moving]:
                 del self._kept[index]
@@ -123,18 +128,6 @@ class Registrar:
             yield closure
             for index in [index for index in self._kept if needed_until[index] <= position]:
                 del self._kept[index]
-
-    def _registered(self, moving: int, edges: tuple[Edge, ...]) -> Registered:
-        found = {edge.fixed: self.alternatives_px.get((moving, edge.fixed)) for edge in edges}
-        alternatives = {fixed: alternative for fixed, alternative in found.items() if alternative is not None}
-        return Registered(edges, self.contrasts[moving], self._places.get(moving), alternatives)
-
-    def _restore(self, moving: int, registered: Registered) -> None:
-        """Take over what was found before an interruption."""
-        self.contrasts[moving] = registered.contrast
-        if registered.place is not None:
-            self._places[moving] = registered.place
-        self.alternatives_px |= {(moving, fixed): px for fixed, px in registered.alternatives_px.items()}
 
     def _submitted(
         self, partners: Mapping[int, Sequence[int]], known: int, pool: ThreadPoolExecutor, threads: int

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from photonpano.contracts.protocols import Trajectory, camera_of_motion
-from photonpano.geometry import Camera, align_planes, align_rotations, corner_displacements, inverse
+from photonpano.geometry import align_planes, align_rotations, corner_displacements, inverse
 from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.rotations import RotationTrajectory
 from photonpano.motion.timeline import Timeline
@@ -31,7 +31,11 @@ class Uncertainty:
 
     def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, timeline: Timeline) -> None:
         """Compare a level with the one before, None at the first; beyond a cut, nothing is known from the other side."""
-        self.std_camera = _std_camera(located, camera_of_motion(previous))
+        turned, before = located.solution.rotations, camera_of_motion(previous)
+        self.std_camera = None if turned is None else located.std_camera
+        if turned is not None and before is not None:
+            change = turned.camera.numbers - before.numbers
+            self.std_camera = np.hypot(located.std_camera, _REMAINING_SHARE * change)
         self._instants = located.instants
         self._std_px = located.std_px
         self._timeline = timeline
@@ -44,9 +48,12 @@ class Uncertainty:
             self.change_px = None
             self._remaining_px = _BLUR_SHARE * corner_displacements(within_group, np.eye(3), shape).mean(axis=-1)
         else:
-            before = previous.at(self._frames)
-            change = inverse(before) @ _aligned(trajectory, previous, self._frames, shape) @ current
-            changes_px = corner_displacements(change, np.eye(3), shape).mean(axis=-1)
+            known, start = previous.at(self._frames), None
+            if isinstance(trajectory, RotationTrajectory) and isinstance(previous, RotationTrajectory):
+                rotations = trajectory.rotations(self._frames), previous.rotations(self._frames)
+                start = previous.camera.homographies(align_rotations(*rotations))
+            moved = inverse(known) @ align_planes(current, known, shape, start) @ current
+            changes_px = corner_displacements(moved, np.eye(3), shape).mean(axis=-1)
             self.change_px = float(changes_px.mean())
             self._remaining_px = _REMAINING_SHARE * changes_px
 
@@ -72,21 +79,3 @@ class Uncertainty:
             beyond = np.maximum((instants[0] - frames[here]) / first, (frames[here] - instants[-1]) / last)
             noise_px[here] = inside * (1 + 2 * np.maximum(beyond, 0))
         return np.asarray(np.hypot(noise_px, self._timeline.unknown_px(frames)))
-
-
-def _std_camera(located: LocatedLevel, before: Camera | None) -> FloatArray | None:
-    if located.solution.rotations is None:
-        return None
-    if before is None:
-        return located.std_camera
-    change = located.solution.rotations.camera.numbers - before.numbers
-    return np.asarray(np.hypot(located.std_camera, _REMAINING_SHARE * change))
-
-
-def _aligned(after: Trajectory, before: Trajectory, frames: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
-    """Return the best map from the reference plane of one trajectory to that of another: (3, 3)."""
-    if isinstance(after, RotationTrajectory) and isinstance(before, RotationTrajectory):
-        turned = align_rotations(after.rotations(frames), before.rotations(frames))
-        start = before.camera.homographies(turned)
-        return align_planes(after.at(frames), before.at(frames), frame_shape, start)
-    return align_planes(after.at(frames), before.at(frames), frame_shape)

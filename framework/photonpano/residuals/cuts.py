@@ -276,7 +276,8 @@ class _Sides:
         """
         covariance, best = np.zeros((2, 2)), 0.0
         for side in (~self.after, self.after):
-            first, second = (_gradient(self._mean(path, side & parity)) for parity in (self._even, ~self._even))
+            means = (self._mean(path, side & parity) for parity in (self._even, ~self._even))
+            first, second = (np.array(np.gradient(mean)[::-1]) for mean in means)  # along x and y: (2, h, w)
             seen = np.isfinite(first + second).all(axis=0)
             information = first[:, seen] @ second[:, seen].T
             values, directions = np.linalg.eigh((information + information.T) / 2)
@@ -294,11 +295,6 @@ class _Sides:
         mean = np.where(seen, moved, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
         smooth = cv2.GaussianBlur(mean.astype(np.float32), (0, 0), _BLUR_PX)
         return np.where(seen.any(axis=0), smooth, np.float32(np.nan))
-
-
-def _gradient(image: FluxImage) -> FloatArray:
-    """Return the derivatives along x and y: (2, h, w)."""
-    return np.array(np.gradient(image)[::-1])
 
 
 def _located(source: Source, between: FrameSpan, template: FluxImage, path: _Path) -> Cut | None:

@@ -60,7 +60,10 @@ class Prediction:
     ) -> Prediction:
         """Make the prediction of a panorama that was rendered along the trajectory, frame pixels to reference pixels."""
         margin = _MARGIN if canvas.is_full_turn else 0
-        panorama = _continued(panorama, margin)
+        if margin:  # some columns of each end stand at the other end, too
+            images = panorama.flux, panorama.weight
+            flux, weight = (np.pad(each, ((0, 0), (margin, margin)), mode="wrap") for each in images)
+            panorama = Panorama(flux, weight, panorama.canvas)
         seen = panorama.weight > 0
         share = _smoothed(seen.astype(np.float32))
         lit = _smoothed(np.where(seen, panorama.flux, np.float32(0)))
@@ -87,17 +90,14 @@ class Prediction:
         `homography` maps frame pixels to reference pixels; `span` is of the frames whose light is predicted, None for the mean.
         """
         self._sample(homography, into)
-        if self.light is not None and span is not None:
-            self._relight(into, gain_image(self.light, span, homography, self.frame_shape))
-
-    def _relight(self, images: NDArray[np.float32], gain: FluxImage) -> None:
-        """Replace mean and variance by those at `gain` times the flux."""
-        mean, variance = images
-        flux = self.response.flux(mean, _MANY_FRAMES)
-        lit = np.asarray(gain * flux, np.float32)
-        mean[:] = self.response.mean_count(lit)
-        before, after = (frame_variance(each, self.response, self.response.mean_count) for each in (flux, lit))
-        variance *= after / before
+        if self.light is not None and span is not None:  # of `gain` times the flux
+            gain = gain_image(self.light, span, homography, self.frame_shape)
+            mean, variance = into
+            flux = self.response.flux(mean, _MANY_FRAMES)
+            lit = np.asarray(gain * flux, np.float32)
+            mean[:] = self.response.mean_count(lit)
+            before, after = (frame_variance(each, self.response, self.response.mean_count) for each in (flux, lit))
+            variance *= after / before
 
     def _sample(self, homography: Homography, into: NDArray[np.float32]) -> None:
         step = min(NODES_PX)
@@ -201,14 +201,6 @@ class Predictions:
         for (source, _), (of_colour, its_variance) in zip(self.parts, images, strict=True):
             mean[source.valid], variance[source.valid] = of_colour[source.valid], its_variance[source.valid]
         return mean, variance
-
-
-def _continued(panorama: Panorama, margin: int) -> Panorama:
-    """Return a full turn with some columns of each end at the other end."""
-    if not margin:
-        return panorama
-    flux, weight = (np.pad(each, ((0, 0), (margin, margin)), mode="wrap") for each in (panorama.flux, panorama.weight))
-    return Panorama(flux, weight, panorama.canvas)
 
 
 def _smoothed(image: FluxImage) -> FluxImage:

@@ -77,7 +77,7 @@ class StartingMotion:
 
     def between(self, moving: float, fixed: float) -> FloatArray | None:
         """Return the homography from the frame at one instant to that at another: (3, 3); None where it is not known."""
-        points = self._points(moving, fixed)
+        points = np.linspace(fixed, moving, 9)
         if np.abs(points[:, None] - self.instants).min(axis=1).max() > self.reach:
             return None
         there, here = self._travelled(self.velocities, np.array([fixed, moving]))
@@ -98,9 +98,6 @@ class StartingMotion:
         differences = np.nan_to_num(self.alternatives - self.velocities)
         there, here = self._travelled(differences, np.array([fixed, moving]))
         return float(np.linalg.norm(here - there))
-
-    def _points(self, moving: float, fixed: float) -> FloatArray:
-        return np.linspace(fixed, moving, 9)
 
     def _travelled(self, velocities: FloatArray, instants: FloatArray) -> FloatArray:
         """Return the integral of (N, 2) velocities from the first of these instants to others: (M, 2)."""
