@@ -170,7 +170,11 @@ def run_batch(batch: Batch, jobs: int = 1, progress: Progress | None = None, *, 
     directory, rows, n_ended, progress = batch.directory, list(batch.rows), 0, usual(progress)
     n_workers = min(jobs, len(rows))
     threads = max(1, thread_count("auto") // n_workers)
-    todo = [Job(row, batch.spec, _overrides(batch, row), threads, overwrite) for row in rows]
+    todo = []
+    for row in rows:  # the capture is the last override, as a setting may name another source
+        settings = [override(key, value) for key, value in row.settings.items()]
+        overrides = (*batch.common, *settings, capture_override(row.capture))
+        todo.append(Job(row, batch.spec, overrides, threads, overwrite))
     _make(directory)
 
     def write() -> None:
@@ -252,12 +256,6 @@ def _batch(
     except InputError as error:
         raise WrongArgumentError(str(error)) from error
     return run_batch(prepared, jobs, progress, overwrite=overwrite)
-
-
-def _overrides(batch: Batch, row: BatchRow) -> tuple[str, ...]:
-    """Return all that a run changes in the spec; the capture is last, as a setting may name another source."""
-    settings = [override(key, value) for key, value in row.settings.items()]
-    return (*batch.common, *settings, capture_override(row.capture))
 
 
 def _require_right(

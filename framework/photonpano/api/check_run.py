@@ -11,7 +11,6 @@ from photonpano.api.opened_run import opened_run
 from photonpano.execution.context import Context, Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.plugins.registry import Catalog
-from photonpano.record.schema import RunRecord
 from photonpano.residuals.refinement import MotionFit
 from photonpano.residuals.verdict import NO_TURN, REPEATS, Reason, Verdict, contradictions, judge
 from photonpano.values import Decision
@@ -61,28 +60,18 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
         fit = MotionFit(opened.source, opened.motion, int(plan.run.memory), context)
         explained = fit.explained()
     verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
-    unknown = []
+    reasons, unknown = list(verdict.reasons), []
     if not opened.has_std_px:
         unknown.append("trajectory.npz has no std_px, as it is of an older version: the expected error is not judged")
-    pairs = _pairs(record)
-    if pairs is None:
-        unknown.append("run.json does not list contradicting pairs, as it is of an older version: they are not judged")
-    elif (reason := contradictions(*pairs)) is not None:
-        verdict = _with(verdict, reason)
-    for found in (record.get("verdict") or {"reasons": ()})["reasons"]:
-        if found["what"] in (REPEATS, NO_TURN):
-            verdict = _with(verdict, Reason(**found))
-    return RunCheck(verdict, tuple(unknown))
-
-
-def _pairs(record: RunRecord) -> tuple[int, int] | None:
-    """Return the numbers of contradicting pairs and of all pairs of the last level; None if the record does not list them."""
     try:
         last = record["levels"][-1]
-        return len(last["contradictions"]), int(last["pairs"])
+        pairs = len(last["contradictions"]), int(last["pairs"])
     except (KeyError, IndexError, TypeError, ValueError):
-        return None
-
-
-def _with(verdict: Verdict, reason: Reason) -> Verdict:
-    return Verdict("doubtful", (*verdict.reasons, reason), verdict.residual_ratio)
+        unknown.append("run.json does not list contradicting pairs, as it is of an older version: they are not judged")
+    else:
+        if (reason := contradictions(*pairs)) is not None:
+            reasons.append(reason)
+    recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
+    reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NO_TURN)]
+    judged = Verdict("doubtful" if reasons else "trusted", tuple(reasons), verdict.residual_ratio)
+    return RunCheck(judged, tuple(unknown))

@@ -81,7 +81,11 @@ def compare(runs: Sequence[Path | str], output: Path | str = "compare.html", tru
     runs_read = [_read(folder) for folder in folders]
     for other in runs_read[1:]:
         _require_same_capture(runs_read[0], other)
-    names = _names(folders)
+    parts = [folder.absolute().resolve().parts for folder in folders]
+    for length in range(1, max(map(len, parts)) + 1):  # the shortest path suffixes that differ from each other
+        names = ["/".join(each[-length:]) for each in parts]
+        if len(set(names)) == len(names):
+            break
     compared = _compared(runs_read, names, _truth(truth, runs_read[0]))
     with atomic_path(page) as temporary:
         temporary.write_text(render_comparison(compared, page), encoding="utf-8")
@@ -121,16 +125,6 @@ def _require_same_capture(first: _Run, other: _Run) -> None:
     if first.motion.frame_shape != other.motion.frame_shape:
         described = ["{} has frames of {}x{}".format(run.folder, *run.motion.frame_shape) for run in (first, other)]
         raise InputError(f"{' and '.join(described)}, after other corrections; compare runs with the same frames")
-
-
-def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the shortest path suffixes that differ from each other."""
-    parts = [folder.absolute().resolve().parts for folder in folders]
-    for length in range(1, max(map(len, parts)) + 1):
-        names = ["/".join(each[-length:]) for each in parts]
-        if len(set(names)) == len(names):
-            break
-    return names
 
 
 def _truth(given: Path | str | None, run: _Run) -> Path | None:

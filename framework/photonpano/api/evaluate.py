@@ -38,10 +38,13 @@ def _score(run_folder: Path, truth: Path, **how: Any) -> Evaluation | PoseScore:
 
 
 def _lines(score: Evaluation | PoseScore, *, as_json: bool = False) -> Iterator[str]:
-    if as_json:
-        yield from json_lines(_data(score) if isinstance(score, Evaluation) else _pose_data(score))
-    else:
+    if not as_json:
         yield columns(score.rows())
+    elif isinstance(score, Evaluation):
+        yield from json_lines(_data(score))
+    else:
+        named = {each.name: each.name for each in fields(score)} | {"honest_shares": "within_std_shares"}
+        yield from json_lines({named[name]: getattr(score, name) for name in named if name not in ("errors_m", "errors_deg")})
 
 
 @command(
@@ -88,11 +91,6 @@ def evaluate(
             return composed(images, source)
 
         return evaluate_folder(run_folder, truth, along_truth)
-
-
-def _pose_data(score: PoseScore) -> dict[str, Any]:
-    found = {each.name: getattr(score, each.name) for each in fields(score) if each.name not in ("errors_m", "errors_deg")}
-    return {("within_std_shares" if name == "honest_shares" else name): value for name, value in found.items()}
 
 
 def _data(evaluation: Evaluation) -> dict[str, Any]:

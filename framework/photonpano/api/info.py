@@ -13,7 +13,7 @@ from photonpano.corrections import HotPixels, without_still_pixels
 from photonpano.errors import InputError
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.files.paths import Url
-from photonpano.notebooks import facts
+from photonpano.notebooks import facts, from_here
 from photonpano.pipeline.components import build_source, foreseen_decisions
 from photonpano.pipeline.obstacles import order_warning
 from photonpano.pipeline.summary import require_photons, saturated_share, summarise
@@ -138,6 +138,10 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
             hot = read.valid & ~other.valid
         still = read.valid & ~marked.valid
         decided = {each.what: each for each in marked.decisions}
+        keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
+        spec: dict[str, Any] = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
+        if not plan.corrects_itself:
+            spec["corrections"] = plan.document["corrections"]
         found = CaptureInfo(
             source=plan.source.contribution.name,
             reason=next((decision.reason for decision in plan.decisions if decision.what == "source"), None),
@@ -160,7 +164,7 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
             group_size=size,
             group_size_reason=reason,
             warnings=(),
-            spec=_spec(plan),
+            spec=spec,
         )
         return replace(found, warnings=tuple(_warnings(source, found, float(hot[source.valid].mean()))))
 
@@ -201,12 +205,6 @@ def _warnings(source: Source, found: CaptureInfo, hot_left: float) -> Iterator[s
         yield found.group_size_reason
 
 
-def _spec(plan: Plan) -> dict[str, Any]:
-    keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
-    spec = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
-    return spec | ({} if plan.corrects_itself else {"corrections": plan.document["corrections"]})
-
-
 def _relative(value: Any) -> Any:
     """Return plain data with its paths relative to the current folder, where they lie in it."""
     if isinstance(value, dict):
@@ -214,7 +212,7 @@ def _relative(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_relative(item) for item in value]
     if isinstance(value, Path):
-        return str(value.relative_to(Path.cwd()) if value.is_relative_to(Path.cwd()) else value)
+        return str(from_here(value))
     if isinstance(value, Url):
         return str(value)
     return value

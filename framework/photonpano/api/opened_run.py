@@ -27,7 +27,7 @@ from photonpano.record.contents import require_one_run, require_same_frames
 from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
 from photonpano.specs import Plan, parse_spec
-from photonpano.values import FrameSpan, Panorama, StreamInfo
+from photonpano.values import FrameSpan, Panorama
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,14 @@ def opened_run(
     run = load_run_trajectory(folder, needs_std_px=False)
     record = read_record(folder)
     with _capture(folder, record, catalog, changes, output) as (plan, capture):
-        _require_same_capture(folder, run, capture.info)
+        stream, n_frames, (height, width) = capture.info, len(run.homographies), run.frame_shape
+        if (stream.n_frames, *stream.frame_shape) != (n_frames, height, width):
+            raise InputError(
+                f"{folder} is a run of {n_frames:,} frames of {height}x{width}, but its capture now has {stream.n_frames:,} "
+                f"frames of {stream.height}x{stream.width}; it is another capture"
+            )
+        if not run.located.any():
+            raise InputError(f"{folder}: the run located no frame, so that it has no panorama")
         require_same_frames(folder, record, capture)
         vignette = read_vignette(folder, capture)
         lit = in_light_of(capture if vignette is None else divided_by(capture, vignette), folder)
@@ -91,17 +98,6 @@ def _capture(
             problems = "; ".join(f"{problem.where}: {problem.message}" for problem in error.problems)
             raise InputError(f"{folder}: the capture of this run cannot be opened by its recorded spec ({problems})") from error
         yield plan, source
-
-
-def _require_same_capture(folder: Path, run: RunTrajectory, stream: StreamInfo) -> None:
-    n_frames, (height, width) = len(run.homographies), run.frame_shape
-    if (stream.n_frames, *stream.frame_shape) != (n_frames, height, width):
-        raise InputError(
-            f"{folder} is a run of {n_frames:,} frames of {height}x{width}, but its capture now has {stream.n_frames:,} frames "
-            f"of {stream.height}x{stream.width}; it is another capture"
-        )
-    if not run.located.any():
-        raise InputError(f"{folder}: the run located no frame, so that it has no panorama")
 
 
 def _motion(run: RunTrajectory) -> FrameMotion:

@@ -23,7 +23,7 @@ from photonpano.execution.context import Progress
 from photonpano.motion.timeline import CUT, DARK_FRAMES, DARK_JUMP, REPEATED, SHOTS
 from photonpano.pipeline.estimate import START
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
-from photonpano.record.schema import PanoramaRecord, RunRecord
+from photonpano.record.schema import PanoramaRecord
 from photonpano.report import LiveFigures
 from photonpano.specs import load_spec
 from photonpano.text import byte_size, counted, duration
@@ -32,7 +32,11 @@ from photonpano.text import byte_size, counted, duration
 def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
     """Yield what a run has found, and where its files are."""
     record, directory = result.record, result.directory.resolve()
-    _log(record)
+    for each in record["decisions"]:
+        logger.info("%s %s: %s", each["what"], each["value"], each["reason"])
+    if logger.isEnabledFor(logging.INFO):
+        memory = record["peak_memory_bytes"]
+        logger.info("took %s%s", duration(record["seconds"]), f" and at most {byte_size(memory)} of memory" if memory else "")
     if result.was_finished:
         yield "finished  this run was finished before; nothing was left to do"
     if result.followed is not None:
@@ -125,15 +129,6 @@ def _run(
         follow=follow,
         end_after=END_AFTER_S if end_after is None else end_after,
     )
-
-
-def _log(record: RunRecord) -> None:
-    """Log each decision of a run with its reason, and what the run took."""
-    for each in record["decisions"]:
-        logger.info("%s %s: %s", each["what"], each["value"], each["reason"])
-    if logger.isEnabledFor(logging.INFO):
-        memory = record["peak_memory_bytes"]
-        logger.info("took %s%s", duration(record["seconds"]), f" and at most {byte_size(memory)} of memory" if memory else "")
 
 
 def _delays(figures: LiveFigures) -> str:

@@ -19,7 +19,7 @@ from photonpano.corrections.moments import showing
 from photonpano.errors import InputError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
-from photonpano.geometry import Canvas, canvas_of_box
+from photonpano.geometry import canvas_of_box
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
@@ -115,12 +115,21 @@ def video(
     """
     for change in changes:
         require_harmless(change)
-    _require_arguments(view, fps, speed, trail)
+    if view not in ("panorama", "smooth"):
+        raise InputError(f"view: expected panorama or smooth, got {view}")
+    for name, value in (("fps", fps), ("speed", speed)):
+        if value is not None and not 0 < value < np.inf:
+            raise InputError(f"{name}: expected a number above 0, got {value:g}")
+    if trail and view == "smooth":
+        raise InputError("the trail is drawn over the panorama; choose the view panorama, or no trail")
     output, progress = Path(output), usual(progress)
     with opened_run(Path(run_folder), catalog, changes) as opened, one_thread_inside():
         require_same_plane(opened)
         n_frames, step = _timing(opened, exposure, fps, speed)
-        spans = _exposures(opened.motion.span, n_frames, step)
+        located = opened.motion.span
+        number = int((len(located) - n_frames) / step + 1e-9) + 1
+        starts = [located.start + round(place * step) for place in range(number)]
+        spans = [FrameSpan(start, start + n_frames) for start in starts if start + n_frames <= located.stop]
         require_writable(output, len(spans))
         film = _film(opened, view, trail, _SMOOTH_S * fps * step)
         threads = thread_count(opened.plan.run.threads)
@@ -129,16 +138,6 @@ def video(
             write_pictures(output, counted(film.pictures(spans, threads, 8 if output.suffix else 16), advance), names, fps)
         rate = opened.source.info.frame_rate_hz
         return Video(output, len(spans), film.canvas.shape, n_frames, step, None if rate is None else step * fps / rate)
-
-
-def _require_arguments(view: View, fps: float, speed: float | None, trail: bool) -> None:
-    if view not in ("panorama", "smooth"):
-        raise InputError(f"view: expected panorama or smooth, got {view}")
-    for name, value in (("fps", fps), ("speed", speed)):
-        if value is not None and not 0 < value < np.inf:
-            raise InputError(f"{name}: expected a number above 0, got {value:g}")
-    if trail and view == "smooth":
-        raise InputError("the trail is drawn over the panorama; choose the view panorama, or no trail")
 
 
 def _timing(opened: OpenedRun, exposure: int | str | None, fps: float, speed: float | None) -> tuple[int, float]:
@@ -172,23 +171,21 @@ def _frames(exposure: str, rate: float | None) -> int:
     return n_frames
 
 
-def _exposures(span: FrameSpan, n_frames: int, step: float) -> list[FrameSpan]:
-    number = int((len(span) - n_frames) / step + 1e-9) + 1
-    starts = [span.start + round(place * step) for place in range(number)]
-    return [FrameSpan(start, start + n_frames) for start in starts if start + n_frames <= span.stop]
-
-
 def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> Film:
     plan, motion, recorded = opened.plan, opened.motion, opened.record["panorama"]
+    memory = int(plan.run.memory)
     source = before(opened.source, None)  # what moves is shown, wherever it is
     if recorded is None:
         raise InputError(f"{opened.folder}: the run made no panorama, and a video is as bright as that")
     if view == "panorama":
-        canvas = _canvas(opened)
+        shown = motion.trajectory, motion.span, motion.frame_shape
+        seen = view_of(motion, opened.source, plan.render.projection, level=plan.render.horizon == "level")
+        with naming_key_of_canvas(plan):
+            canvas = plan_canvas(*shown, plan.render.scale, memory, extent=plan.render.extent, view=seen)
     else:  # as large as a frame, or as a part of it
         extent = "reference" if plan.render.extent == "panorama" else plan.render.extent
         canvas = canvas_of_box(box_of(extent, motion.frame_shape), plan.render.scale)
-    memory, bytes_per_pixel = int(plan.run.memory), (BYTES_PER_PIXEL + bytes_of_light(source)) * channels_of(source)
+    bytes_per_pixel = (BYTES_PER_PIXEL + bytes_of_light(source)) * channels_of(source)
     if (needed := canvas.height * canvas.width * bytes_per_pixel) > memory:
         raise InputError(
             f"{opened.folder}: a picture of {canvas.width} x {canvas.height} pixels takes {byte_size(needed)}, more than the "
@@ -207,11 +204,3 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
         plan.render.white_balance,
         merged(still, motion, motion.span, canvas, tolerance_px, thread_count(plan.run.threads)) if trail else None,
     )
-
-
-def _canvas(opened: OpenedRun) -> Canvas:
-    render, motion = opened.plan.render, opened.motion
-    shown = motion.trajectory, motion.span, motion.frame_shape
-    view = view_of(motion, opened.source, render.projection, level=render.horizon == "level")
-    with naming_key_of_canvas(opened.plan):
-        return plan_canvas(*shown, render.scale, int(opened.plan.run.memory), extent=render.extent, view=view)

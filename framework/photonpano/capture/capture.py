@@ -16,10 +16,9 @@ from photonpano.photometry import MAX_FRAMES, packed_counts
 from photonpano.values import Background, BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, StreamInfo
 
 if TYPE_CHECKING:
-    from photonpano.capture.plugin_source import PluginSource
     from photonpano.contracts.protocols import Source
     from photonpano.geometry import Camera
-    from photonpano.values import FloatArray, FrameSpan, Light, Response
+    from photonpano.values import FloatArray, Response
 
 _PER_FRAME = ("homographies", "rotations", "camera_from_world", "light", "taken")  # arrays of a truth, one entry a frame
 

@@ -42,7 +42,7 @@ def write_folder(
         OutputError: there is something under that name, or the folder cannot be written, or does not fit on the disk.
     """
     _require_bits(source, path)
-    packed, truth = PackedFrames(source), _truth_of(source)
+    packed, truth = PackedFrames(source), capture_of(source).truth() or {}
     with atomic_folder(path) as folder:
         require_space(path, packed.n_bytes + sum(array.nbytes for array in truth.values()))
         write(folder, source.info, _counted(in_order(packed.of, packed.blocks(0), threads), progress))
@@ -54,10 +54,6 @@ def _counted(blocks: Iterator[NDArray[np.uint8]], progress: Callable[[int], obje
         yield frames
         if progress is not None:
             progress(len(frames))
-
-
-def _truth_of(source: Source) -> Mapping[str, NDArray[Any]]:
-    return capture_of(source).truth() or {}
 
 
 def _write_truth(path: Path, truth: Mapping[str, NDArray[Any]]) -> tuple[Path, ...]:
@@ -102,7 +98,7 @@ def write_packed(
     _require_bits(source, path)
     if path.suffix != ".npy":
         raise OutputError(f"cannot write {path}: a packed capture is a .npy file; name it {path.name}.npy")
-    packed, truth = PackedFrames(source), _truth_of(source)
+    packed, truth = PackedFrames(source), capture_of(source).truth() or {}
     with (atomic_path if resumed is None else resumable_path)(path) as temporary, temporary.open("r+b") as file:
         there = temporary.stat().st_size
         require_space(path, packed.n_bytes + sum(array.nbytes for array in truth.values()) - there)

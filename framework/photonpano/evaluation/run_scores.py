@@ -97,7 +97,20 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
     require_one_run(folder, ["trajectory.npz", "panorama.tiff", "coverage.tiff"])
     run = load_run_trajectory(folder)
     truth = load_truth(truth_path)
-    _check_same_capture(folder, run, truth_path, truth)
+    frames, true_frames = len(run.homographies), len(truth.homographies)
+    if frames != true_frames:
+        raise InputError(
+            f"{truth_path} is the truth of {true_frames} frames, but the run in {folder} has {frames}; "
+            "they belong to different captures"
+        )
+    if run.frame_shape != truth.frame_shape:
+        (height, width), (true_height, true_width) = run.frame_shape, truth.frame_shape
+        raise InputError(
+            f"{truth_path} is the truth of frames of {true_height}x{true_width}, but the run in {folder} has frames of "
+            f"{height}x{width}; they belong to different captures"
+        )
+    if not run.located.any():
+        raise InputError(f"{folder}: the run located no frame, so that it has no score")
     motion, rotation = _motion_scores(run, truth)
     honest_share = float((motion.errors_px <= 3 * run.std_px)[run.located].mean())
     if truth.scene is None:
@@ -145,20 +158,3 @@ def _motion_scores(run: RunTrajectory, truth: Truth) -> tuple[TrajectoryScore, R
     plane = truth.homographies[places[len(places) // 2]]
     motion = corner_errors(run.homographies, scaled_ahead(np.linalg.inv(plane) @ truth.homographies), shape, located)
     return replace(motion, alignment=plane @ motion.alignment), None
-
-
-def _check_same_capture(folder: Path, run: RunTrajectory, truth_path: Path, truth: Truth) -> None:
-    frames, true_frames = len(run.homographies), len(truth.homographies)
-    if frames != true_frames:
-        raise InputError(
-            f"{truth_path} is the truth of {true_frames} frames, but the run in {folder} has {frames}; "
-            "they belong to different captures"
-        )
-    if run.frame_shape != truth.frame_shape:
-        (height, width), (true_height, true_width) = run.frame_shape, truth.frame_shape
-        raise InputError(
-            f"{truth_path} is the truth of frames of {true_height}x{true_width}, but the run in {folder} has frames of "
-            f"{height}x{width}; they belong to different captures"
-        )
-    if not run.located.any():
-        raise InputError(f"{folder}: the run located no frame, so that it has no score")

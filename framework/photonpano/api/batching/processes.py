@@ -54,7 +54,13 @@ def rows_of(jobs: Sequence[Job], n_workers: int) -> Generator[list[tuple[int, Ba
                 ended = [index for index, run in going_on.items() if run.answers in ready or run.process.sentinel in ready]
                 changed = [(index, going_on.pop(index).row()) for index in ended]
         finally:
-            _end(list(going_on.values()))
+            for run in going_on.values():
+                run.lifeline.close()
+            last = time.monotonic() + _END_S
+            for run in going_on.values():  # C code may hold the interpreter of one that goes on
+                run.process.join(max(0.0, last - time.monotonic()))
+                run.process.kill()
+                run.process.join()
 
 
 @dataclass(frozen=True)
@@ -122,7 +128,12 @@ def _work(job: Job, answer: Connection, life: Connection, printed: Path) -> None
     """Do a job, answer with its row, and end."""
     code = 1
     try:
-        _end_with_batch()
+        # The system kills this process when that of the batch is killed: C code may hold the interpreter.
+        parent = multiprocessing.parent_process()
+        if parent is not None and hasattr(fcntl, "F_SETSIG"):
+            fcntl.fcntl(parent.sentinel, fcntl.F_SETOWN, os.getpid())
+            fcntl.fcntl(parent.sentinel, fcntl.F_SETSIG, signal.SIGKILL)
+            fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, os.O_ASYNC)
         with printed.open("wb") as file:
             os.dup2(file.fileno(), 1)
             os.dup2(file.fileno(), 2)
@@ -143,26 +154,6 @@ def _end_with(life: Connection) -> None:
         life.recv_bytes()
     discard_unfinished()
     os._exit(1)
-
-
-def _end_with_batch() -> None:
-    """Let the system kill this process when that of the batch is killed: C code may hold the interpreter."""
-    parent = multiprocessing.parent_process()
-    if parent is not None and hasattr(fcntl, "F_SETSIG"):
-        fcntl.fcntl(parent.sentinel, fcntl.F_SETOWN, os.getpid())
-        fcntl.fcntl(parent.sentinel, fcntl.F_SETSIG, signal.SIGKILL)
-        fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, os.O_ASYNC)
-
-
-def _end(runs: Sequence[_Run]) -> None:
-    """End runs, and kill those that go on: C code may hold their interpreter."""
-    for run in runs:
-        run.lifeline.close()
-    last = time.monotonic() + _END_S
-    for run in runs:
-        run.process.join(max(0.0, last - time.monotonic()))
-        run.process.kill()
-        run.process.join()
 
 
 def _how_it_ended(code: int, printed: Path) -> str:

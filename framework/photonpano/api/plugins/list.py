@@ -31,7 +31,14 @@ def kind_option(help_text: str) -> Any:
 def _lines(catalog: Catalog, *, kind: str | None = None, broken: bool = False, as_json: bool = False) -> Iterator[str]:
     rows = [] if broken else [entry for entry in catalog.rows if kind in (None, entry.kind)]
     if as_json:
-        yield from json_lines(_data(rows, catalog))
+        yield from json_lines(
+            {
+                "components": [facts(entry) for entry in rows],
+                "broken": [asdict(each.origin) | {"error": each.error} for each in catalog.broken],
+                "disabled": [asdict(each.origin) | {"by": each.by} for each in catalog.disabled],
+                "observers": [asdict(each.origin) | {"hooks": each.watches} for each in catalog.observers],
+            }
+        )
     elif broken:
         yield from map(str, catalog.broken or ["no plugin is broken"])
     else:
@@ -79,15 +86,6 @@ def _summary(entry: Entry, catalog: Catalog) -> str:
         return f"[not installed: {' '.join(each.install for each in entry.missing)}] {entry.contribution.summary}"
     taken_twice = len(catalog.entries(entry.kind, entry.name)) > 1
     return f"{'[name taken twice] ' if taken_twice else ''}{entry.contribution.summary}"
-
-
-def _data(rows: list[Entry], catalog: Catalog) -> dict[str, Any]:
-    return {
-        "components": [facts(entry) for entry in rows],
-        "broken": [asdict(each.origin) | {"error": each.error} for each in catalog.broken],
-        "disabled": [asdict(each.origin) | {"by": each.by} for each in catalog.disabled],
-        "observers": [asdict(each.origin) | {"hooks": each.watches} for each in catalog.observers],
-    }
 
 
 def facts(entry: Entry) -> dict[str, Any]:
