@@ -104,15 +104,12 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     `opencv-orb` to `orb`.
     """
     by_shape = {_shape(each): each for each in sorted(known)}
-    near = difflib.get_close_matches(_shape(name), by_shape, _MOST) or _with_word(_shape(name), by_shape)
+    near = difflib.get_close_matches(_shape(name), by_shape, _MOST)
+    if not near:
+        near = [each for each in by_shape if difflib.get_close_matches(_shape(name), each.split("-"), 1, _SAME_WORD)][:_MOST]
     if near:
         return f"did you mean {listed((repr(by_shape[shape]) for shape in near), 'or')}?"
     return f"known: {listed(by_shape.values())}" if by_shape else ""
-
-
-def _with_word(word: str, shapes: Iterable[str]) -> list[str]:
-    """Return the names that have a word which this one may be a misspelling of."""
-    return [each for each in shapes if difflib.get_close_matches(word, each.split("-"), 1, _SAME_WORD)][:_MOST]
 
 
 def _shape(name: str) -> str:

@@ -92,7 +92,17 @@ def read_filter_array(path: Path) -> NDArray[np.int8]:
     Raises:
         InputError: the file is missing, holds something else, or has other colours.
     """
-    pattern = _read_pattern(path) if path.suffix.lower() == ".png" else _read_colours(path)
+    if path.suffix.lower() == ".png":
+        import cv2
+
+        look_first(path, "cv2:imread")
+        picture = read_picture(path, f"is not {_WHAT}: it is no picture that can be read", cv2.IMREAD_COLOR)
+        pattern = np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
+    else:
+        pattern = read_array(path, _WHAT)
+        if pattern.dtype != np.uint8 or pattern.ndim != 3 or pattern.shape[2] != 3:
+            found = f"{pattern.dtype} values of shape {pattern.shape}"
+            raise InputError(f"{path} holds {found}; a pattern is a .npy file of uint8 (height, width, 3)")
     places = np.full(pattern.shape[:2], -1, np.int8)
     for place, colour in enumerate(COLOURS.values()):
         places[np.all(pattern == colour, axis=-1)] = place
@@ -103,20 +113,3 @@ def read_filter_array(path: Path) -> NDArray[np.int8]:
             "pattern has white for clear pixels, and pure red, green and blue"
         )
     return places
-
-
-def _read_colours(path: Path) -> NDArray[np.uint8]:
-    pattern = read_array(path, _WHAT)
-    if pattern.dtype != np.uint8 or pattern.ndim != 3 or pattern.shape[2] != 3:
-        found = f"{pattern.dtype} values of shape {pattern.shape}"
-        raise InputError(f"{path} holds {found}; a pattern is a .npy file of uint8 (height, width, 3)")
-    return pattern
-
-
-def _read_pattern(path: Path) -> NDArray[np.uint8]:
-    """Read a picture: (H, W, 3) uint8, red first."""
-    import cv2
-
-    look_first(path, "cv2:imread")
-    picture = read_picture(path, f"is not {_WHAT}: it is no picture that can be read", cv2.IMREAD_COLOR)
-    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)

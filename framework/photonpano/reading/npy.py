@@ -181,7 +181,7 @@ def unpacked(path: Location) -> Path:
     """
     path = local(path)
     promised = gzipped_npy_header(path).file_bytes
-    target = unpacked_path(path)
+    target = path.with_name(f"{path.name}.unpacked.npy")
     if not _is_content(target, path, promised):
         require_space(target, promised)
         logger.warning("%s is unpacked to %s, once", path, target.name)
@@ -189,11 +189,6 @@ def unpacked(path: Location) -> Path:
             _unpack(path, temporary, promised)
     hold(target)
     return target
-
-
-def unpacked_path(path: Path) -> Path:
-    """Return where a .npy.gz file is unpacked to."""
-    return path.with_name(f"{path.name}.unpacked.npy")
 
 
 def _is_content(target: Path, path: Path, promised: int) -> bool:

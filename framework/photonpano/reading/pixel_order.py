@@ -111,7 +111,11 @@ def _products_of(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float3
     """Return the sums of the products of neighbours in sums of 16 and 128 frames, as far as samples are that long."""
     found: dict[int, NDArray[np.float32]] = {}
     for frames in samples:
-        sums = _sums_of_pairs(frames)
+        n_sums = len(frames) // _LENGTHS[0]
+        # The counts of the four pairs of pixels of a byte lie in the four bytes of a word.
+        words = _PAIRS[frames[: n_sums * _LENGTHS[0]]].reshape(n_sums, _LENGTHS[0], *frames.shape[1:])
+        summed: NDArray[np.uint32] = words.sum(axis=1, dtype=np.uint32)
+        sums = summed[..., None].view(np.uint8).astype(np.float32)
         for length in _LENGTHS:
             step = length // _LENGTHS[0]
             if step > len(sums):
@@ -121,15 +125,6 @@ def _products_of(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float3
                 products = _products(image)
                 found[length] = found[length] + products if length in found else products
     return list(found.values())
-
-
-def _sums_of_pairs(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Sum pairs of pixels over 16 frames each: (n, rows, bytes) becomes (n // 16, rows, bytes, 4)."""
-    n_sums = len(frames) // _LENGTHS[0]
-    # The counts of the four pairs of a byte lie in the four bytes of a word.
-    words = _PAIRS[frames[: n_sums * _LENGTHS[0]]].reshape(n_sums, _LENGTHS[0], *frames.shape[1:])
-    sums: NDArray[np.uint32] = words.sum(axis=1, dtype=np.uint32)
-    return sums[..., None].view(np.uint8).astype(np.float32)
 
 
 _PAIRS = np.unpackbits(np.arange(256, dtype=np.uint8)).reshape(256, 4, 2).sum(axis=2, dtype=np.uint8).view(np.uint32)[:, 0]

@@ -74,7 +74,14 @@ def size_of(url: Url) -> int:
     if size is None:
         raise InputError(f"{url} is of unknown size: its server does not give it; download the file")
     if size > 1 and url.scheme in ("http", "https"):
-        _require_ranges(url)
+        with _asking(url):
+            system, path = _file_system(url)
+            try:
+                with system.open(path, "rb", cache_type="none") as file:
+                    file.seek(1)
+                    file.read(1)
+            except ValueError:  # fsspec refuses to read a whole file for one byte of it
+                raise _without_ranges(url) from None
     return size
 
 
@@ -145,18 +152,6 @@ def _message(url: Url, error: Exception) -> str:
     if isinstance(error, MemoryError):
         return f"{url} needs more memory than there is"
     return f"cannot read {url}: {status or type(error).__name__}; check the address, or download the file"
-
-
-def _require_ranges(url: Url) -> None:
-    """Refuse a server that sends whole files, by asking it for the second byte."""
-    with _asking(url):
-        system, path = _file_system(url)
-        try:
-            with system.open(path, "rb", cache_type="none") as file:
-                file.seek(1)
-                file.read(1)
-        except ValueError:  # fsspec refuses to read a whole file for one byte of it
-            raise _without_ranges(url) from None
 
 
 def _without_ranges(url: Url) -> InputError:

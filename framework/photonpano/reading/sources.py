@@ -58,10 +58,6 @@ class FrameLayout:
         """Return the packed rows (n, rows, bytes of a row) of stored frames (n, *stored_shape)."""
         return stored if self.to_rows is None else self.to_rows(stored)
 
-    def add_counts(self, rows: NDArray[np.uint8], sums: Counts | None) -> Counts:
-        """Add packed rows to their sums, which `image` turns into sums of the image."""
-        return packed_counts(rows, 8 * rows.shape[-1], sums, self.bit_order)
-
     def unpacked(self, rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Unpack packed rows to frames (n, H, W)."""
         return self.image(np.unpackbits(rows, axis=-1, bitorder=self.bit_order))
@@ -111,9 +107,9 @@ class BinarySource(Closing, ABC):
     def counts(self, span: FrameSpan) -> Counts:
         """Sum the frames of a span: (H, W) uint32."""
         self.info.require(span)
-        sums = None
+        sums: Counts | None = None
         for _, rows in self.pieces(span):
-            sums = self.layout.add_counts(rows, sums)
+            sums = packed_counts(rows, 8 * rows.shape[-1], sums, self.layout.bit_order)
         assert sums is not None, "a span is never empty"
         return self.layout.image(sums)
 

@@ -53,9 +53,10 @@ def recorded_json(folder: Path) -> Mapping[str, Any] | None:
 def recorded_contents(folder: Path) -> Mapping[str, FileContent] | None:
     """Return size and SHA-256 of each file as run.json lists them; None if it lists none, or files outside of the folder."""
     listed = (recorded_json(folder) or {}).get("files")
-    if not isinstance(listed, dict) or not all(isinstance(each, dict) and _lies_inside(name) for name, each in listed.items()):
+    if not isinstance(listed, dict) or not all(isinstance(each, dict) for each in listed.values()):
         return None
-    return listed
+    outside = any(PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts for name in listed)
+    return None if outside else listed
 
 
 def names_of_results(folder: Path) -> set[str]:
@@ -110,10 +111,6 @@ def require_same_frames(folder: Path, record: Mapping[str, Any], source: Source)
     recorded = record.get("capture")
     if isinstance(recorded, dict) and frames_sha256(source) != recorded.get("frames_sha256"):
         raise InputError(f"{folder}: the capture has other frames than when it was run; it is another capture")
-
-
-def _lies_inside(name: str) -> bool:
-    return not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts
 
 
 def _differs(path: Path, recorded: FileContent) -> bool:

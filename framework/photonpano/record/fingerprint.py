@@ -50,10 +50,14 @@ class CaptureRecord(TypedDict):
 def fingerprint(plan: Plan, source: Source) -> CaptureRecord:
     """Return the fingerprint of the open capture of a plan, which names its files."""
     suffixes = tuple(plan.source.contribution.suffixes)  # type: ignore[attr-defined]  # those of a source
+    capture, pixels = capture_of(source), hashlib.sha256(np.packbits(source.valid).data)
+    if capture.corrects_sums:
+        (first, *_) = source.info.spread(_PLACES, _FRAMES)
+        pixels.update(np.ascontiguousarray(capture.corrected_counts(first)).data)
     return {
         "files": [_remote(path) if isinstance(path, Url) else _file(path, suffixes) for path in _locations(plan)],
         "frames_sha256": frames_sha256(source),
-        "pixels_sha256": _pixels_sha256(source),
+        "pixels_sha256": pixels.hexdigest(),
     }
 
 
@@ -94,14 +98,6 @@ def changes(old: CaptureRecord, new: CaptureRecord) -> list[str]:
     if old["pixels_sha256"] != new["pixels_sha256"]:
         found.append("the mask or another correction gives other pixels")
     return found
-
-
-def _pixels_sha256(source: Source) -> str:
-    capture, digest = capture_of(source), hashlib.sha256(np.packbits(source.valid).data)
-    if capture.corrects_sums:
-        (first, *_) = source.info.spread(_PLACES, _FRAMES)
-        digest.update(np.ascontiguousarray(capture.corrected_counts(first)).data)
-    return digest.hexdigest()
 
 
 def _paths(value: Any) -> Iterator[Location]:

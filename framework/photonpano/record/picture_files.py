@@ -61,7 +61,10 @@ def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str]
 def write_pngs(folder: Path, pictures: Iterable[Picture], names: Sequence[str]) -> None:
     """Write pictures, (H, W) or (H, W, 3) with red first, into a folder under these names, without suffix."""
     for name, picture in zip(names, pictures, strict=True):
-        (folder / f"{name}.png").write_bytes(_png(picture))
+        encoded, png = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
+        if not encoded:
+            raise OutputError(f"OpenCV could not encode a picture of {picture.shape} as PNG")
+        (folder / f"{name}.png").write_bytes(png.tobytes())
 
 
 def counted(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
@@ -69,13 +72,6 @@ def counted(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator
     for picture in made:
         yield picture
         advance(1)
-
-
-def _png(picture: Picture) -> bytes:
-    encoded, png = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
-    if not encoded:
-        raise OutputError(f"OpenCV could not encode a picture of {picture.shape} as PNG")
-    return png.tobytes()
 
 
 def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
@@ -91,19 +87,15 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
         stream.pix_fmt = "yuv420p"
         for number, frame in enumerate(frames):
             if number == 0:
-                _require_mp4(*frame.shape[:2])
-                stream.height, stream.width = frame.shape[:2]
+                stream.height, stream.width = height, width = frame.shape[:2]
+                if max(height, width) > _MOST_H264_PX:
+                    raise OutputError(
+                        f"cannot write an MP4 of {width} x {height} pixels: its sides hold up to {_MOST_H264_PX:,}; make them "
+                        "smaller, or write PNGs to a folder"
+                    )
             layout = "gray" if frame.ndim == 2 else "rgb24"
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format=layout)))
         container.mux(stream.encode())
-
-
-def _require_mp4(height: int, width: int) -> None:
-    if max(height, width) > _MOST_H264_PX:
-        raise OutputError(
-            f"cannot write an MP4 of {width} x {height} pixels: its sides hold up to {_MOST_H264_PX:,}; make them smaller, or "
-            "write PNGs to a folder"
-        )
 
 
 def _write_animated(path: Path, pictures: Iterable[Picture], fps: float) -> None:

@@ -51,6 +51,7 @@ def record_of(
     """Return the record of a finished run; `rendered` are the decisions of renderer and exporters."""
     motion, timeline = explained.motion, levels[-1].exposures.timeline
     decisions = [levels_decision(levels), *rendered] if plan.until_converged else rendered
+    judged: VerdictRecord = _fields(verdict) | {"reasons": [_fields(reason) for reason in verdict.reasons]}
     return {
         **started,
         "decisions": [*started["decisions"], *decision_records(decisions)],
@@ -58,7 +59,7 @@ def record_of(
         "panorama": panorama_record(plan, panorama, rendered),
         "motion": motion_record(motion.std_px),
         "refinements": [refinement_record(each) for each in explained.refinements],
-        "verdict": verdict_record(verdict),
+        "verdict": judged,
         "warnings": [
             *left_out_warnings(timeline),
             *level_warnings(levels),
@@ -219,12 +220,6 @@ def motion_record(std_px: FloatArray) -> MotionRecord | None:
         return None
     worst = int(known[np.argmax(std_px[known])])
     return {"std_px": float(std_px[known].mean()), "worst_std_px": float(std_px[worst]), "worst_frame": worst}
-
-
-def verdict_record(verdict: Verdict) -> VerdictRecord:
-    """Describe a verdict."""
-    found: VerdictRecord = _fields(verdict) | {"reasons": [_fields(reason) for reason in verdict.reasons]}
-    return found
 
 
 def verdict_of(found: VerdictRecord) -> Verdict:

@@ -43,7 +43,12 @@ def json_schema(catalog: Catalog) -> Schema:
     entries = [entry for entry in catalog.rows if offered[entry.kind, entry.name] == 1]
     models: list[type[BaseModel]] = [*(entry.contribution.config for entry in entries), LevelSettings, *SETTINGS.values()]
     models += CORRECTIONS.values()
-    schemas, definitions = _schemas(models)
+    unique = dict.fromkeys(models)
+    references, schema = models_json_schema([(model, "validation") for model in unique], schema_generator=TolerantJsonSchema)
+    definitions: dict[str, Schema] = schema["$defs"]
+    schemas: dict[type[BaseModel], Schema] = {model: references[model, "validation"] for model in unique}
+    for reference in schemas.values():
+        definitions[_definition(reference)]["type"] = SECTION
     definitions[OutputSettings.__name__].pop("required")  # the run folder has a default that depends on the spec's name
     sections, overrides = {}, {}
     for kind in KINDS.values():
@@ -95,17 +100,6 @@ def json_schema(catalog: Catalog) -> Schema:
         },
         "$defs": definitions,
     }
-
-
-def _schemas(models: list[type[BaseModel]]) -> tuple[dict[type[BaseModel], Schema], dict[str, Schema]]:
-    """Return a reference for each model, and the definitions that they point to."""
-    unique = dict.fromkeys(models)
-    references, schema = models_json_schema([(model, "validation") for model in unique], schema_generator=TolerantJsonSchema)
-    definitions: dict[str, Schema] = schema["$defs"]
-    schemas = {model: references[model, "validation"] for model in unique}
-    for reference in schemas.values():
-        definitions[_definition(reference)]["type"] = SECTION
-    return schemas, definitions
 
 
 def _definition(reference: Schema) -> str:

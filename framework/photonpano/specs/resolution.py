@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from photonpano.errors import Problem, SpecError
+from photonpano.errors import SpecError
 from photonpano.plugins.contributions import KINDS
 from photonpano.specs.checks import check_flat_field, check_settings, complaints
 from photonpano.specs.components import CHOICE, ComponentResolver, Stage
@@ -35,13 +35,10 @@ def resolve(spec: Spec) -> Plan:
     root = spec.mapping(spec.root)
     plan = None if root is None else _Resolver(root, spec).plan()
     if plan is None or spec.problems:
-        raise SpecError(sorted(dict.fromkeys(spec.problems), key=_order))
+        # Those of the whole file come first, those of overrides last.
+        places = {each: (each.file is None and each.line is None, each.line or 0, each.column or 0) for each in spec.problems}
+        raise SpecError(sorted(places, key=lambda each: places[each]))
     return plan
-
-
-def _order(problem: Problem) -> tuple[bool, int, int]:
-    """Order problems by line; those of the whole file come first, those of overrides last."""
-    return problem.file is None and problem.line is None, problem.line or 0, problem.column or 0
 
 
 class _Resolver:
@@ -57,7 +54,11 @@ class _Resolver:
         """Resolve every section; None if there are problems."""
         spec, root, components = self.spec, self.root, self.components
         spec.check_keys(root, SECTIONS)
-        self.check_version()
+        version = root.at("version")
+        if "version" not in root.data:
+            spec.wrong_key(version, f"required: {VERSION}, the version of the format")
+        elif type(version.data) is not int or version.data != VERSION:
+            spec.wrong(version, f"expected {VERSION}, the version of the format, got {given(version.data)}")
         source = components.stage(KINDS["source"], root.at("source"))
         for complaint in complaints(source.choice) if source.choice and not spec.arriving else ():
             spec.wrong_key(root.at("source"), complaint)
@@ -110,14 +111,6 @@ class _Resolver:
             pose=poser,
         )
         return replace(plan, document=document_of(plan, stages))
-
-    def check_version(self) -> None:
-        """Refuse a spec of another format."""
-        version = self.root.at("version")
-        if "version" not in self.root.data:
-            self.spec.wrong_key(version, f"required: {VERSION}, the version of the format")
-        elif type(version.data) is not int or version.data != VERSION:
-            self.spec.wrong(version, f"expected {VERSION}, the version of the format, got {given(version.data)}")
 
     def renderer(self) -> Choice | None:
         """Resolve the component that `render` chooses, whose keys `use` and `with` stand beside the framework's."""

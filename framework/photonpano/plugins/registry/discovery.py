@@ -60,7 +60,10 @@ def discover() -> Catalog:
                 raise
             message = str(error) if isinstance(error, PluginError) else described(error)
             broken.append(BrokenPlugin(origin, " ".join(message.split())))
-    _warn_of_unknown([word for key, word in disabling.items() if key not in set(map(_canonical, names))], names)
+    if unknown := [word for key, word in disabling.items() if key not in set(map(_canonical, names))]:
+        hint = suggestion(unknown[0], names) if len(unknown) == 1 else f"known: {listed(sorted(names))}"
+        are = "is no installed plugin" if len(unknown) == 1 else "are no installed plugins"
+        logger.warning("%s names %s, which %s; %s", DISABLE, listed(map(repr, unknown)), are, hint)
     return Catalog(
         ordered(rows),
         tuple(sorted(broken, key=str)),
@@ -72,15 +75,6 @@ def discover() -> Catalog:
 def _canonical(name: str) -> str:
     """Return a name as those of packages are compared: without regard to case, and to the choice of `-`, `_` and `.`."""
     return re.sub(r"[-_.]+", "-", name).lower()
-
-
-def _warn_of_unknown(words: list[str], names: set[str]) -> None:
-    """Log the words that should disable a plugin and are no plugin's name."""
-    if not words:
-        return
-    hint = suggestion(words[0], names) if len(words) == 1 else f"known: {listed(sorted(names))}"
-    are = "is no installed plugin" if len(words) == 1 else "are no installed plugins"
-    logger.warning("%s names %s, which %s; %s", DISABLE, listed(map(repr, words)), are, hint)
 
 
 def _origin(entry_point: EntryPoint) -> Origin:

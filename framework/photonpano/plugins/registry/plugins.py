@@ -55,24 +55,19 @@ def _registered(plugin: object) -> pluggy.PluginManager:
     """Register a plugin with a manager of its own, so that its mistakes affect no other plugin."""
     manager = pluggy.PluginManager(hookspecs.PROJECT)
     manager.add_hookspecs(hookspecs)
-    _check_names(plugin, manager)
+    for name in dir(plugin):
+        if not name.startswith(PREFIX) or not callable(getattr(plugin, name)):
+            continue
+        if name not in HOOKS:  # which pluggy would ignore
+            raise PluginError(f"there is no hook {name!r}; known: {listed(HOOKS)}")
+        if manager.parse_hookimpl_opts(plugin, name) is None:
+            raise PluginError(f"{name} is not marked with @photonpano.hookimpl")
     try:
         manager.register(plugin)
         manager.check_pending()
     except pluggy.PluginValidationError as error:
         raise PluginError(" ".join(str(error).split())) from error
     return manager
-
-
-def _check_names(plugin: object, manager: pluggy.PluginManager) -> None:
-    """Refuse functions with the name of a hook that are none, which pluggy would ignore."""
-    for name in dir(plugin):
-        if not name.startswith(PREFIX) or not callable(getattr(plugin, name)):
-            continue
-        if name not in HOOKS:
-            raise PluginError(f"there is no hook {name!r}; known: {listed(HOOKS)}")
-        if manager.parse_hookimpl_opts(plugin, name) is None:
-            raise PluginError(f"{name} is not marked with @photonpano.hookimpl")
 
 
 def _offered(manager: pluggy.PluginManager, kind: Kind) -> list[Contribution]:

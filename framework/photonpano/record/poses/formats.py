@@ -169,19 +169,14 @@ def centres(camera_from_world: FloatArray) -> FloatArray:
     return np.asarray(-np.einsum("...ji,...j->...i", camera_from_world[..., :3], camera_from_world[..., 3]))
 
 
-def path_length(camera_from_world: FloatArray) -> float:
-    """Return the length of the path of (T, 3, 4) poses, without those that are NaN."""
-    known = centres(camera_from_world[np.isfinite(camera_from_world).all(axis=(1, 2))])
-    return float(np.linalg.norm(np.diff(known, axis=0), axis=1).sum())
-
-
 def in_standard_world(estimate: PoseEstimate) -> PoseEstimate:
     """Move the world so that the first located camera is its origin and looks along z, and the path has the length 1.
 
     Raises:
         LocationError: the camera does not travel, so that there is no scale.
     """
-    length = path_length(estimate.camera_from_world)
+    known = estimate.camera_from_world[np.isfinite(estimate.camera_from_world).all(axis=(1, 2))]
+    length = float(np.linalg.norm(np.diff(centres(known), axis=0), axis=1).sum())
     if not length > 0:
         raise LocationError(
             "the camera does not travel: all located frames have one position; if it turns, leave out `pose` and set "
