@@ -42,7 +42,9 @@ class ExrExporter:
         channels: dict[str, NDArray[np.float32]] = {"A": seen}
         for layer_name, layer in layers.items():
             for name, image in zip(names, layer, strict=True):
-                channels[_channel(layer_name, name)] = image
+                # `Y` is the flux of a grey panorama, `std` its standard deviation, `std.R` that of red.
+                of_layer = layer_name if name == "Y" else f"{layer_name}.{name}"
+                channels[name if layer_name == "flux" else of_layer] = image
         header = {
             "compression": self._compression,
             "type": self._library.scanlineimage,
@@ -50,13 +52,6 @@ class ExrExporter:
         }
         with self._library.File(header, channels) as file:
             file.write(str(path))
-
-
-def _channel(layer: str, name: str) -> str:
-    """Return the name of a channel: `Y` is the flux of a grey panorama, `std` its standard deviation, `std.R` that of red."""
-    if layer == "flux":
-        return name
-    return layer if name == "Y" else f"{layer}.{name}"
 
 
 class RadianceExporter:

@@ -48,7 +48,8 @@ class ShortSpansRefiner:
         variances = _variances(residuals.information) * to_px**2
         steps = residuals.steps * to_px
         instants = np.array([span.centre for span in residuals.spans])
-        if _goes_dark(variances):
+        noise = variances[:, 0]
+        if np.mean(noise > _DARK * np.median(noise)) > _DARK_SHARE:  # many steps are uncertain, as between two flickers
             wiggles = _wiggles(trajectory, instants, self._shape) * to_px
             modes = [_through_the_dark(*columns) for columns in zip(steps.T, wiggles.T, variances.T, strict=True)]
         else:
@@ -58,10 +59,10 @@ class ShortSpansRefiner:
             return None
         corrections = CubicSpline(instants, np.stack([mode.signal for mode in modes], axis=1) / to_px)
         shifts = np.stack([mode.signal for mode in modes[:2]], axis=1)
-        noise = np.interp(np.arange(len(std_px)), instants, np.sqrt(sum(mode.std**2 for mode in modes)))
+        noise_px = np.interp(np.arange(len(std_px)), instants, np.sqrt(sum(mode.std**2 for mode in modes)))
         return Refined(
             self._corrected(trajectory, len(std_px), corrections, instants),
-            np.hypot(std_px, noise),
+            np.hypot(std_px, noise_px),
             f"motion of {shift_px:.2g} px within groups was corrected{self._frequencies(shifts, instants)}",
         )
 
@@ -105,12 +106,6 @@ def _variances(information: FloatArray) -> FloatArray:
     inverted = np.linalg.pinv(unit, hermitian=True)
     variances = np.diagonal(inverted, axis1=1, axis2=2) / np.where(known, scale, 1) ** 2
     return np.where(known & (variances > 0), variances, np.inf)
-
-
-def _goes_dark(variances: FloatArray) -> bool:
-    """Return whether many steps are far less certain than the others, as between two flickers: variances are (S, 4)."""
-    noise = variances[:, 0]
-    return bool(np.mean(noise > _DARK * np.median(noise)) > _DARK_SHARE)
 
 
 def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> Filtered:

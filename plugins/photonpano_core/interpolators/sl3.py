@@ -23,7 +23,10 @@ def unimodular(matrices: FloatArray) -> FloatArray:
 
 def exponential(matrices: FloatArray) -> FloatArray:
     """Return the matrix exponentials of (N, 3, 3) matrices."""
-    trace, minors, determinant = _invariants(matrices)
+    # Coefficients of the characteristic polynomials x^3 - trace x^2 + minors x - determinant.
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrices, 0, -1)
+    trace, determinant = a + e + i, np.linalg.det(matrices)
+    minors = (a * e - b * d) + (a * i - c * g) + (e * i - f * h)
     # Bound of the eigenvalues (Fujiwara): halve the matrix until it is below 1, and square the result as often.
     largest = 2 * np.maximum(np.maximum(np.abs(trace), np.sqrt(np.abs(minors))), np.cbrt(np.abs(determinant)))
     halvings = np.ceil(np.log2(np.maximum(largest, 1)))
@@ -57,7 +60,9 @@ def logarithm(matrices: FloatArray) -> FloatArray:
     target = np.where(exists[:, None, None], matrices, np.eye(3))
     roots = int(np.ceil(np.log2(max(_SMALL, *size[exists]) / _SMALL)))
     for _ in range(roots):
-        target = _square_root(target)
+        other = np.broadcast_to(np.eye(3), target.shape)  # Denman and Beavers
+        for _ in range(_ITERATIONS):
+            target, other = (target + np.linalg.inv(other)) / 2, (other + np.linalg.inv(target)) / 2
     eye = np.eye(3)
     z = (target - eye) @ np.linalg.inv(target + eye)
     square = z @ z
@@ -65,18 +70,3 @@ def logarithm(matrices: FloatArray) -> FloatArray:
     for odd in range(15, 0, -2):
         series = series @ square + eye / odd
     return np.where(exists[:, None, None], 2 ** (roots + 1) * z @ series, np.nan)
-
-
-def _square_root(matrices: FloatArray) -> FloatArray:
-    """Return the principal square roots of (N, 3, 3) matrices (Denman and Beavers)."""
-    root, inverse = matrices, np.broadcast_to(np.eye(3), matrices.shape)
-    for _ in range(_ITERATIONS):
-        root, inverse = (root + np.linalg.inv(inverse)) / 2, (inverse + np.linalg.inv(root)) / 2
-    return root
-
-
-def _invariants(matrices: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the coefficients of the characteristic polynomials x^3 - a x^2 + b x - c: three arrays (N,)."""
-    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrices, 0, -1)
-    minors = (a * e - b * d) + (a * i - c * g) + (e * i - f * h)
-    return a + e + i, minors, np.linalg.det(matrices)

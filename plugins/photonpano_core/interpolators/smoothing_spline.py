@@ -71,10 +71,13 @@ class SmoothingSplineInterpolator:
 
     def _smoothed(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> FloatArray:
         """Return the smoothed (N, 3, 3) homographies of the knots."""
-        covariances = np.broadcast_to(np.eye(8), (len(instants), 8, 8))
-        if information is not None:
+        covariances: FloatArray = np.broadcast_to(np.eye(8), (len(instants), 8, 8))
+        if information is not None:  # it may be singular
             derivatives = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
-            covariances = _covariances(information, _TO_MODES @ derivatives)
+            back = np.linalg.inv(_TO_MODES @ derivatives)
+            values, vectors = np.linalg.eigh(back.transpose(0, 2, 1) @ information @ back)
+            values = np.maximum(values, _MIN_INFORMATION * values.max())
+            covariances = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
         paths = transform_points(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
         # Without perspective, twists are rounding errors, which tell nothing of the noise.
         noise = 1.0 if np.ptp(paths[:, _QUIET], axis=0).max() < _STILL_PX else None
@@ -151,14 +154,6 @@ def _from_corners(here: FloatArray, there: FloatArray) -> FloatArray:
     ]
     equations = np.stack(rows, axis=2).reshape(-1, 8, 8)
     return from_parameters(np.linalg.solve(equations, (there - here).reshape(-1, 8, 1))[..., 0])
-
-
-def _covariances(information: FloatArray, derivatives: FloatArray) -> FloatArray:
-    """Return the (N, 8, 8) covariances of functions with these derivatives by p1..p8; the information may be singular."""
-    back = np.linalg.inv(derivatives)
-    values, vectors = np.linalg.eigh(back.transpose(0, 2, 1) @ information @ back)
-    values = np.maximum(values, _MIN_INFORMATION * values.max())
-    return np.asarray((vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1))
 
 
 def _third_differences(times: FloatArray) -> sparse.csr_array:

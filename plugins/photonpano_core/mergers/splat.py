@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import BoolArray, FloatArray, FrameSpan, Group, InputError, Source, Trajectory, VirtualExposure, capture_of
+from photonpano import BoolArray, FloatArray, Group, InputError, Source, Trajectory, VirtualExposure, capture_of
 from photonpano.compiling import compiled
 from photonpano.geometry import corners, inverse, transform_points, visible_columns
 from photonpano.merging import PhotonSum, gain_image
@@ -46,50 +46,37 @@ class SplatMerger:
             frames = np.arange(group.span.start, group.span.stop)
             to_grid = to_exposure(group, trajectory, scale) @ trajectory.at(frames)
             to_grid /= np.cbrt(np.linalg.det(to_grid))[:, None, None]
-            photons = _splatted(source, group.span, to_grid, exposure_shape(source, scale))
+            shape = exposure_shape(source, scale)
+            counts = np.zeros((shape[0] + 2, shape[1] + 2), np.float32)  # with a margin
+            height, width = source.info.frame_shape
+            for part in group.span.blocks(max(1, _READ_BYTES // (height * width))):
+                maps = to_grid[part.start - group.span.start : part.stop - group.span.start]
+                splat(source.frames(part), source.valid, maps, counts)
+            photons = PhotonSum(_without_margin(counts), _weight(source.valid, to_grid, shape))
             if capture.light is not None:
-                to_plane = inverse(to_exposure(group, trajectory, scale))
-                gain = gain_image(capture.light, group.span, to_plane, exposure_shape(source, scale))
+                gain = gain_image(capture.light, group.span, inverse(to_exposure(group, trajectory, scale)), shape)
                 photons = PhotonSum(photons.counts, photons.weight * gain)
         return exposure_of(photons, source, group, scale)
-
-
-def _splatted(source: Source, span: FrameSpan, to_grid: FloatArray, shape: tuple[int, int]) -> PhotonSum:
-    """Sum frames on a grid, each warped by its own (3, 3) map of determinant 1."""
-    counts = _with_margin(shape)
-    height, width = source.info.frame_shape
-    for part in span.blocks(max(1, _READ_BYTES // (height * width))):
-        maps = to_grid[part.start - span.start : part.stop - span.start]
-        splat(source.frames(part), source.valid, maps, counts)
-    return PhotonSum(_without_margin(counts), _weight(source.valid, to_grid, shape))
 
 
 def _weight(valid: BoolArray, to_grid: FloatArray, shape: tuple[int, int]) -> Image:
     """Return the sum of splats of the valid pixels of frames of ones: (H, W)."""
     weight = np.zeros(shape, np.float32)
-    rigid = _rigid(to_grid, valid.shape)
+    # Where the pixels of all frames stay 1 px apart, weights need not be splatted.
+    neighbours = corners(valid.shape)[:, None] + np.array([[0, 0], [1, 0], [0, 1]])
+    placed = transform_points(to_grid, neighbours.reshape(-1, 2)).reshape(len(to_grid), 4, 3, 2)
+    rigid = bool(np.abs(placed[:, :, 1:] - placed[:, :, :1] - np.eye(2)).max() < _RIGID)
     if rigid:
         steps = np.zeros((shape[0], shape[1] + 1), np.float32)
         add_coverage(valid.shape, inverse(to_grid), weight, steps)
         weight += np.cumsum(steps, axis=1)[:, :-1]
-    each = _with_margin(shape)
+    each = np.zeros((shape[0] + 2, shape[1] + 2), np.float32)  # with a margin
     counted = ~valid if rigid else valid
     if counted.any():
         ones = np.ones((1, *valid.shape), np.uint8)
         for one in to_grid[:, None]:
             splat(ones, counted, one, each)
     return np.maximum(weight - _without_margin(each), 0) if rigid else _without_margin(each)
-
-
-def _rigid(to_grid: FloatArray, frame_shape: tuple[int, int]) -> bool:
-    """Return whether the pixels of all frames stay 1 px apart, so that weights need not be splatted."""
-    neighbours = corners(frame_shape)[:, None] + np.array([[0, 0], [1, 0], [0, 1]])
-    placed = transform_points(to_grid, neighbours.reshape(-1, 2)).reshape(len(to_grid), 4, 3, 2)
-    return bool(np.abs(placed[:, :, 1:] - placed[:, :, :1] - np.eye(2)).max() < _RIGID)
-
-
-def _with_margin(shape: tuple[int, int]) -> Image:
-    return np.zeros((shape[0] + 2, shape[1] + 2), np.float32)
 
 
 def _without_margin(grid: Image) -> Image:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 from pydantic import Field
@@ -73,15 +72,11 @@ def _source(config: PackedRawConfig, path: Location, n_frames: int) -> PackedFil
     return PackedFileSource([FrameFile(path, n_frames, config.header_bytes)], config.layout, config.frame_rate_hz)
 
 
-def _check(config: PackedRawConfig) -> Sequence[str]:
-    return () if config.path == STANDARD_INPUT else objections(_open, config)
-
-
 PACKED_RAW = SourceContribution(
     name="packed-raw",
     summary="Binary frames in a file without any description, or on standard input, eight pixels to a byte",
     config=PackedRawConfig,
     build=lambda config, _: _open(config),
-    check=_check,
+    check=lambda config: () if config.path == STANDARD_INPUT else objections(_open, config),
     arrived=_arrived,
 )

@@ -39,7 +39,9 @@ class Observations:
 
     def weight(self) -> FluxImage:
         """Return the frames of a cell, on average over the area of a pixel: (H, W)."""
-        return _averaged(self.seen, self)
+        found = np.empty_like(self.seen)
+        expected(self.seen, self.kernel, np.empty_like(found), found)
+        return found
 
     def log_likelihood(self, flux: FluxImage) -> FluxImage:
         """Return the log-likelihood of the counts of each cell, but for a constant: (H, W)."""
@@ -98,35 +100,27 @@ def rounds_of(observed: Observations, n_rounds: int) -> list[FluxImage]:
     noise = 0.5 / np.sqrt(np.maximum(cv2.blur(seen, (PATCH, PATCH)), _FEWEST_FRAMES))
     flux = _initial_flux(observed)
     floor = np.float32(_DARKEST * max(float(flux.mean()), 1e-9))
+    known = seen > 1e-3 * max(float(seen.max()), 1e-9)
+    per_frame = np.divide(1, seen, out=np.zeros_like(seen), where=known)
+    mean, ratio, scratch = np.empty_like(flux), np.empty_like(flux), np.empty_like(flux)
     patches, results = Patches.over(flux.shape), []
     for number, strength in enumerate(STRENGTHS[:n_rounds]):
-        flux = _em_steps(flux, seen, floor, observed)
+        for _ in range(_STEPS):
+            expected(flux, observed.kernel, scratch, mean)
+            observed.photon_ratio(mean, ratio)
+            expected(ratio, observed.kernel, scratch, mean)
+            flux = np.maximum(np.where(known, flux * mean * per_frame, flux), floor)
         stabilised = _stabilised(flux, observed.binary)
         if number % _MATCHED_ROUNDS == 0:
             find_similar(stabilised, patches)
         total, weights = np.zeros_like(flux), np.zeros_like(flux)
         filter_groups(stabilised, np.asarray(strength * noise, np.float32), patches, total, weights)
-        flux = _mean_preserved(np.maximum(_flux_of(total / weights, observed.binary), floor), flux)
+        denoised = np.maximum(_flux_of(total / weights, observed.binary), floor)
+        # Denoising on the stabilised scale lowers the mean, which is kept around each pixel.
+        wanted, found = (cv2.GaussianBlur(each, (0, 0), _KEPT_PX) for each in (flux, denoised))
+        flux = np.asarray(denoised * (wanted / found), np.float32)
         results.append(flux)
     return results
-
-
-def _averaged(image: FluxImage, observed: Observations) -> FluxImage:
-    found = np.empty_like(image)
-    expected(image, observed.kernel, np.empty_like(image), found)
-    return found
-
-
-def _em_steps(flux: FluxImage, seen: FluxImage, floor: np.float32, observed: Observations) -> FluxImage:
-    mean, ratio, scratch = np.empty_like(flux), np.empty_like(flux), np.empty_like(flux)
-    known = seen > 1e-3 * max(float(seen.max()), 1e-9)
-    per_frame = np.divide(1, seen, out=np.zeros_like(seen), where=known)
-    for _ in range(_STEPS):
-        expected(flux, observed.kernel, scratch, mean)
-        observed.photon_ratio(mean, ratio)
-        expected(ratio, observed.kernel, scratch, mean)
-        flux = np.maximum(np.where(known, flux * mean * per_frame, flux), floor)
-    return flux
 
 
 def _initial_flux(observed: Observations) -> FluxImage:
@@ -143,12 +137,6 @@ def _initial_flux(observed: Observations) -> FluxImage:
     return np.asarray(-np.log1p(-lit_share) / gain, np.float32)
 
 
-def _mean_preserved(flux: FluxImage, before: FluxImage) -> FluxImage:
-    """Return flux as bright as before, on average around each pixel: denoising on the stabilised scale lowers the mean."""
-    wanted, found = (cv2.GaussianBlur(each, (0, 0), _KEPT_PX) for each in (before, flux))
-    return np.asarray(flux * (wanted / found), np.float32)
-
-
 def _stabilised(flux: FluxImage, binary: bool) -> FluxImage:
     """Map flux to a scale on which the noise of n frames is 0.5 / sqrt(n) (Anscombe 1948)."""
     return np.asarray(np.arcsin(np.sqrt(-np.expm1(-flux))) if binary else np.sqrt(flux), np.float32)
@@ -160,10 +148,10 @@ def _flux_of(stabilised: FluxImage, binary: bool) -> FluxImage:
     return np.asarray(np.maximum(stabilised, 0) ** 2, np.float32)
 
 
-def coarser(flux: FluxImage, factor: int = 2) -> FluxImage:
-    """Return an image with the detail of a grid that is coarser by a factor: averaged, and interpolated again."""
+def coarser(flux: FluxImage) -> FluxImage:
+    """Return an image with the detail of a grid half as fine: averaged, and interpolated again."""
     height, width = flux.shape
-    small = cv2.resize(flux, (max(1, width // factor), max(1, height // factor)), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(flux, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
     return np.asarray(np.maximum(cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC), 1e-9), np.float32)
 
 

@@ -99,7 +99,8 @@ class SuperResolutionRenderer:
             sums = sums_on(source, seen, wide, partial(progress.add, 1 / (n_frames * _GATHERING)), pool)
             blank = np.full(wide.shape, np.nan, np.float32)
             whole = Panorama(blank, np.zeros(wide.shape, np.float32), wide.transform)
-            blocks = _blocks(wide)
+            tops, lefts = (range(_HALO_PX, side - _HALO_PX, _BLOCK_PX) for side in wide.shape)
+            blocks = [(slice(y, y + _BLOCK_PX), slice(x, x + _BLOCK_PX)) for y in tops for x in lefts]
             work = partial(self._fill, whole, sums, scan, chosen[2])
             for _ in pool.map(work, blocks):
                 progress.add((1 - 1 / _GATHERING) / len(blocks), 1)
@@ -117,11 +118,13 @@ class SuperResolutionRenderer:
         middle = np.array([(columns.start + columns.stop - 1) / 2, (rows.start + rows.stop - 1) / 2])
         zoom = _zoom_at(middle, panorama.canvas, scan.chunks, scan.source.info.frame_shape)
         observed = self._observations(scan.source, sums.part(around), zoom)
-        weight = observed.weight()[inner] * np.float32(zoom**2 / _trials(scan.source))
+        response = scan.source.response
+        trials = response.n if isinstance(response, BinarySumResponse) else 1  # binary frames that a frame is the sum of
+        weight = observed.weight()[inner] * np.float32(zoom**2 / trials)
         known = weight >= _FEWEST_FRAMES
         if not known.any():
             return
-        flux = rounds_of(observed, n_rounds)[-1][inner] * np.float32(_trials(scan.source))
+        flux = rounds_of(observed, n_rounds)[-1][inner] * np.float32(trials)
         panorama.flux[block] = np.where(known, flux, np.float32(np.nan))
         panorama.weight[block] = np.where(known, weight, 0)
 
@@ -212,11 +215,6 @@ def _scale_of(canvas: Canvas) -> float:
     return float(np.sqrt(abs(np.linalg.det(canvas.transform[:2, :2]))))
 
 
-def _trials(source: Source) -> int:
-    """Return the binary frames that a frame is the sum of."""
-    return source.response.n if isinstance(source.response, BinarySumResponse) else 1
-
-
 def _widened(canvas: Canvas) -> tuple[Canvas, int, int]:
     """Return a canvas of whole blocks with a margin on all sides, and how far to the left and to the top it is wider.
 
@@ -229,14 +227,6 @@ def _widened(canvas: Canvas) -> tuple[Canvas, int, int]:
         for before, side in ((top, canvas.height), (left, canvas.width))
     )
     return Canvas(height, width, translation(left, top) @ canvas.transform), left, top
-
-
-def _blocks(wide: Canvas) -> list[Box]:
-    return [
-        (slice(top, top + _BLOCK_PX), slice(left, left + _BLOCK_PX))
-        for top in range(_HALO_PX, wide.height - _HALO_PX, _BLOCK_PX)
-        for left in range(_HALO_PX, wide.width - _HALO_PX, _BLOCK_PX)
-    ]
 
 
 def _seen_part(seen: FluxImage, block: Box) -> tuple[Box, Box, Box] | None:

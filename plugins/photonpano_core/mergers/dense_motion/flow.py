@@ -48,7 +48,10 @@ def _refined(parts: SubExposures, sums: Sequence[PhotonSum], field: MotionField,
     """Return the field after a round of `n` sub-exposures, whose `sums` are merged along the field so far."""
     joined = parts.joined(sums, n)
     images = [parts.smoothed(each, _DETAIL_PX) for each in joined.sums]
-    shades = _in_8_bits([each.values for each in images])
+    # Stretched to grey levels, all alike: their noise is uniform.
+    low, high = np.percentile(np.concatenate([each.values.ravel() for each in images]), _CLIPPED)
+    grey = (np.clip((each.values - low) * (255 / max(high - low, 1e-6)), 0, 255) for each in images)
+    shades = [each.astype(np.uint8) for each in grey]
     fixed = joined.reference
     times, flows, trusts = [], [], []
     for place, elapsed in enumerate(joined.times):
@@ -58,12 +61,6 @@ def _refined(parts: SubExposures, sums: Sequence[PhotonSum], field: MotionField,
             flows.append(flow + _displaced(field.at(elapsed), flow))
             trusts.append(_agreement(images[fixed], images[place], flow, parts))
     return MotionField(_fitted(times, flows, trusts, min(_DEGREE, n // 2), moving))
-
-
-def _in_8_bits(images: Sequence[Image]) -> list[NDArray[np.uint8]]:
-    """Stretch images of noise that is uniform to grey levels, all alike."""
-    low, high = np.percentile(np.concatenate([each.ravel() for each in images]), _CLIPPED)
-    return [np.clip((each - low) * (255 / max(high - low, 1e-6)), 0, 255).astype(np.uint8) for each in images]
 
 
 def _dense_flow(fixed: NDArray[np.uint8], moving: NDArray[np.uint8], finest: int) -> Image:

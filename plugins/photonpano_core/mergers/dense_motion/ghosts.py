@@ -74,21 +74,17 @@ def _moving(significance: Image, threshold: float) -> BoolArray:
     """Return the pixels that move: see `GhostMap`."""
     likely = (significance > _WEAKER * threshold).astype(np.uint8)
     _, labels, _, _ = cv2.connectedComponentsWithStats(likely, connectivity=8)
-    certain = _without_specks(significance > threshold, _SMALLEST_PX * SCALE**2)
+    above = (significance > threshold).astype(np.uint8)
+    _, certain_labels, statistics, _ = cv2.connectedComponentsWithStats(above, connectivity=8)
+    large = statistics[:, cv2.CC_STAT_AREA] >= _SMALLEST_PX * SCALE**2
+    large[0] = False  # the label of what is not above
+    certain = large[certain_labels]
     found = np.isin(labels, np.unique(labels[certain])) & (likely > 0)
     gap = round(_GAP_PX * SCALE)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * gap + 1, 2 * gap + 1))
     # Gaps at the border of the image are closed as well.
     padded = cv2.copyMakeBorder(found.astype(np.uint8), gap, gap, gap, gap, cv2.BORDER_REPLICATE)
     return np.asarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[gap:-gap, gap:-gap] > 0)
-
-
-def _without_specks(found: BoolArray, smallest: float) -> BoolArray:
-    """Drop connected pixels that are fewer than `smallest`."""
-    _, labels, statistics, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
-    large = statistics[:, cv2.CC_STAT_AREA] >= smallest
-    large[0] = False
-    return np.asarray(large[labels])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

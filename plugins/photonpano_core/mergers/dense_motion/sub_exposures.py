@@ -79,7 +79,10 @@ class SubExposures:
         self._trusted = np.ones(self.shape, np.float32)
         self._divide(n)
         to_image = self._to_image(np.array([chunk.homography for chunk in self._chunks]))
-        self.spread = _spread(to_image, self.shape)
+        places = np.stack(np.meshgrid(*(np.arange(0, side, max(1, side // _PLACES)) for side in self.shape[::-1])), axis=-1)
+        found = transform_points(to_image, places.reshape(-1, 2))
+        fraction = found - np.floor(found)
+        self.spread = float(np.mean(fraction * (1 - fraction)))
 
     def _divide(self, n: int) -> None:
         """Merge `n` sub-exposures along the global motion."""
@@ -171,14 +174,6 @@ def halved(image: Image) -> Image:
     """Average two by two pixels; a last odd row or column is left out."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _spread(to_image: FloatArray, shape: tuple[int, int]) -> float:
-    """Return the mean of `f (1 - f)` over the fractions f of a pixel at which (N, 3, 3) maps interpolate a grid."""
-    places = np.stack(np.meshgrid(*(np.arange(0, side, max(1, side // _PLACES)) for side in shape[::-1])), axis=-1)
-    found = transform_points(to_image, places.reshape(-1, 2))
-    fraction = found - np.floor(found)
-    return float(np.mean(fraction * (1 - fraction)))
 
 
 def total_of(sums: Sequence[PhotonSum]) -> PhotonSum:
