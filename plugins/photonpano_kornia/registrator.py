@@ -112,9 +112,9 @@ class _Descent:
             there = self._fixed.seen_from(homography)
             both = self._moving.seen & there.seen
             # The inverse variances of the differences between pixels, 0 where one of them is masked.
-            variances_inverse = np.zeros(both.shape, np.float32)
-            variances_inverse[both] = 1 / (1 / self._moving.weight[both] + 1 / there.weight[both])
-            weights = images_on(self._device, variances_inverse)
+            certainty = np.zeros(both.shape, np.float32)
+            certainty[both] = 1 / (1 / self._moving.weight[both] + 1 / there.weight[both])
+            weights = images_on(self._device, certainty)
             root = self._root_of_curvature(weights) if root is None else root
             if root is None:
                 return NotLocated(NO_TEXTURE)

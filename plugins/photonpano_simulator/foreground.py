@@ -118,7 +118,13 @@ class Foreground:
             self._positions = camera_positions(config.path, config.n_frames)
             self._matrix, self._rotations = camera(config).matrix, rotations
             self._grid = _Grid(np.moveaxis(undistorted(config, pixel_grid(config.frame_shape)), -1, 0))
-            covers = [*_placed(config, flux)]
+            for board in config.boards:
+                texel = max(board.distance_m / config.focal_length_px, max(board.size_m) / _FINEST)
+                size = max(1, round(board.size_m[0] / texel)), max(1, round(board.size_m[1] / texel))
+                azimuth, elevation, slant = np.deg2rad((*board.at_deg, board.slant_deg)).tolist()
+                ahead = np.full(config.n_frames, azimuth)
+                texture = texture_of(np.array(size), board.seed) * np.float32(flux * board.flux)
+                covers.append(Cover("board", size, ahead, elevation, board.distance_m, board.size_m, slant, None, texture))
             if config.clutter is not None:
                 clutter = _clutter(config, config.clutter, rotations)
                 covers += self._sized(clutter, config.clutter.share, "clutter", "boards", flux)
@@ -198,18 +204,6 @@ class Foreground:
             middle = (low * high) ** 0.5
             low, high = (middle, high) if covered(middle) < share else (low, middle)
         return make(high, flux)
-
-
-def _placed(config: SimulationConfig, flux: float) -> list[Cover]:
-    covers = []
-    for board in config.boards:
-        texel = max(board.distance_m / config.focal_length_px, max(board.size_m) / _FINEST)
-        size = max(1, round(board.size_m[0] / texel)), max(1, round(board.size_m[1] / texel))
-        azimuth, elevation = np.deg2rad(board.at_deg)
-        ahead, slant = np.full(config.n_frames, azimuth), float(np.deg2rad(board.slant_deg))
-        texture = texture_of(np.array(size), board.seed) * np.float32(flux * board.flux)
-        covers.append(Cover("board", size, ahead, float(elevation), board.distance_m, board.size_m, slant, None, texture))
-    return covers
 
 
 def _clutter(config: SimulationConfig, clutter: Clutter, rotations: FloatArray) -> Callable[[float, float], list[Cover]]:

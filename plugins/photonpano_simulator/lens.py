@@ -21,7 +21,10 @@ def undistorted(config: SimulationConfig, points: ArrayLike) -> FloatArray:
     """Return where a lens without distortion images what this lens images at (..., 2) points: see `Lens` and `Distortion`."""
     points = np.asarray(points, dtype=np.float64)
     if not any(config.distortion.coefficients):
-        return _undivided(config.lens, points, config.frame_shape)
+        middle = middle_of(config.frame_shape)
+        offsets = points - middle
+        squared = _squared_distance(offsets, middle)[..., None]
+        return np.asarray(middle + offsets / (1 + squared * (config.lens.k1 + squared * config.lens.k2)))
     ideal = camera(config).ideal(points)
     if np.isnan(ideal).any():
         raise InputError(
@@ -61,14 +64,6 @@ def transmission(lens: Lens, frame_shape: tuple[int, int]) -> NDArray[np.float32
     middle = middle_of(frame_shape)
     squared = _squared_distance(pixel_grid(frame_shape) - middle, middle)
     return (1 - lens.vignette * squared).astype(np.float32)
-
-
-def _undivided(lens: Lens, points: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
-    """Undo the division model."""
-    middle = middle_of(frame_shape)
-    offsets = points - middle
-    squared = _squared_distance(offsets, middle)[..., None]
-    return np.asarray(middle + offsets / (1 + squared * (lens.k1 + squared * lens.k2)))
 
 
 def middle_of(shape: tuple[float, float]) -> FloatArray:

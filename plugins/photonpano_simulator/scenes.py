@@ -34,7 +34,12 @@ def scene_flux(
         linear = photograph(scene.file, scene.width, in_colour)
     else:
         overlap = max(2, scene.width // _OVERLAP) if is_round else 0
-        linear = _drawing(scene, (scene.height, scene.width + overlap), in_colour)
+        shape = scene.height, scene.width + overlap
+        linear = srgb_to_linear(street(shape, scene.seed))
+        if isinstance(scene, NightScene):
+            linear = _at_night(linear, scene.seed, scene.range_db)
+        if in_colour:
+            linear = linear[..., None] * _paint(shape, scene.seed)
         if is_round:
             linear = _joined(linear, overlap)
     mean = float(linear.mean(dtype=np.float64)) * (3 if in_colour else 1)
@@ -42,13 +47,6 @@ def scene_flux(
         raise InputError(f"{scene.file} is black: no flux can be made of it; take another photograph")
     linear *= np.float32(flux / mean)
     return linear
-
-
-def _drawing(scene: StreetScene | NightScene, shape: tuple[int, int], in_colour: bool) -> NDArray[np.float32]:
-    linear = srgb_to_linear(street(shape, scene.seed))
-    if isinstance(scene, NightScene):
-        linear = _at_night(linear, scene.seed, scene.range_db)
-    return linear[..., None] * _paint(shape, scene.seed) if in_colour else linear
 
 
 def street(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:

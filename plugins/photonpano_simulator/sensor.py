@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from photonpano import Bayer, InputError
 from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano.reading import COLOURS, bayer_array, read_array, read_filter_array
-from photonpano_simulator.config import Dirt, IntensitySensor, Sensor
+from photonpano_simulator.config import IntensitySensor, Sensor
 
 _KEPT = 16  # frames that are remembered for those that follow them, read by several threads
 Incident: TypeAlias = Callable[[int], NDArray[np.float32]]
@@ -72,16 +72,35 @@ class SpadSensor:
         rng = generator(seed, Draw.HOT_PIXELS)
         self.hot: NDArray[np.bool_] = rng.random(frame_shape) < config.hot_fraction
         if config.hot_pixels is not None:
-            self.hot |= _read_mask(config.hot_pixels, frame_shape)
+            mask = read_array(config.hot_pixels, "a mask")
+            if mask.shape != frame_shape or mask.dtype != np.bool_:
+                found = f"{mask.dtype} of shape {mask.shape}"
+                raise InputError(f"{config.hot_pixels} holds {found}; a mask is bool of the frame's shape {frame_shape}")
+            self.hot |= mask
         self.dark_rates: NDArray[np.float32] = np.full(frame_shape, config.dark_rate, np.float32)
         if config.dark_rates is not None:
-            self.dark_rates += _read_rates(config.dark_rates, frame_shape)
+            rates = read_array(config.dark_rates, "a file of rates")
+            if rates.shape != frame_shape or rates.dtype.kind not in "fiu":
+                found = f"{rates.dtype} of shape {rates.shape}"
+                raise InputError(f"{config.dark_rates} holds {found}; rates are numbers of the frame's shape {frame_shape}")
+            if not (np.all(np.isfinite(rates)) and np.all(rates >= 0)):
+                raise InputError(f"{config.dark_rates} holds rates that are negative or not finite")
+            self.dark_rates += rates.astype(np.float32)
         low, high = np.log(config.hot_rate)
         hot_rates = np.exp(rng.uniform(float(low), float(high), frame_shape)).astype(np.float32)
         self.dark_rates[self.hot] += hot_rates[self.hot]
         self._minus_dark_rates = -self.dark_rates
         self.valid: NDArray[np.bool_] = ~self.hot if config.mask_hot_pixels else np.ones(frame_shape, np.bool_)
-        self.gains = _gains(config, frame_shape, seed)
+        gains = np.maximum(1 + config.gain_std * generator(seed, Draw.GAINS).standard_normal(frame_shape), 0)
+        if config.dirt is not None:
+            dirt, (height, width) = config.dirt, frame_shape
+            through = np.ones(frame_shape)  # the share of the light that passes the specks
+            for x, y in generator(seed, Draw.DIRT).uniform((0, 0), (width, height), (dirt.specks, 2)):
+                across = np.exp(-((np.arange(width) - x) ** 2) / (2 * dirt.radius_px**2))
+                down = np.exp(-((np.arange(height) - y) ** 2) / (2 * dirt.radius_px**2))
+                through *= 1 - dirt.loss * np.outer(down, across)
+            gains *= through
+        self.gains: NDArray[np.float32] = gains.astype(np.float32)
 
     def truth(self) -> dict[str, NDArray[np.generic]]:
         """Return the ground truth of the sensor: `dark_rates` and `hot_pixels`."""
@@ -193,42 +212,3 @@ def filter_array(config: Sensor, frame_shape: tuple[int, int]) -> NDArray[np.flo
     else:
         places = bayer_array(config.filters, frame_shape)
     return (np.array(list(COLOURS.values())) / 255).astype(np.float32)[places]
-
-
-def _gains(config: Sensor, frame_shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
-    """Return the sensitivity of each pixel: (H, W)."""
-    deviations = generator(seed, Draw.GAINS).standard_normal(frame_shape)
-    gains = np.maximum(1 + config.gain_std * deviations, 0)
-    if config.dirt is not None:
-        gains *= _light_through(config.dirt, frame_shape, generator(seed, Draw.DIRT))
-    return gains.astype(np.float32)
-
-
-def _light_through(dirt: Dirt, frame_shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return the share of the light that passes the specks: (H, W)."""
-    height, width = frame_shape
-    through = np.ones(frame_shape)
-    for x, y in rng.uniform((0, 0), (width, height), (dirt.specks, 2)):
-        across = np.exp(-((np.arange(width) - x) ** 2) / (2 * dirt.radius_px**2))
-        down = np.exp(-((np.arange(height) - y) ** 2) / (2 * dirt.radius_px**2))
-        through *= 1 - dirt.loss * np.outer(down, across)
-    return through
-
-
-def _read_rates(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Read (H, W) rates per frame period, finite and not negative."""
-    rates = read_array(path, "a file of rates")
-    if rates.shape != frame_shape or rates.dtype.kind not in "fiu":
-        raise InputError(
-            f"{path} holds {rates.dtype} of shape {rates.shape}; rates are numbers of the frame's shape {frame_shape}"
-        )
-    if not (np.all(np.isfinite(rates)) and np.all(rates >= 0)):
-        raise InputError(f"{path} holds rates that are negative or not finite")
-    return rates.astype(np.float32)
-
-
-def _read_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    mask = read_array(path, "a mask")
-    if mask.shape != frame_shape or mask.dtype != np.bool_:
-        raise InputError(f"{path} holds {mask.dtype} of shape {mask.shape}; a mask is bool of the frame's shape {frame_shape}")
-    return mask

@@ -58,7 +58,10 @@ class Views:
         number, where R turns directions of the frame to those of the panorama.
         """
         if self._points is not None and self._is_round:
-            return self._around(averages, self._points, homography)
+            columns, rows = np.empty(self._shape, np.float32), np.empty(self._shape, np.float32)
+            size = averages.shape[1], averages.shape[0]
+            _look_around(self._points, self._to_rays @ homography, *size, self._offset, columns, rows)
+            return np.asarray(cv2.remap(averages, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
         height, width = self._shape
         homography = translation(-self._offset, -self._offset) @ homography
         # The path lies inside the scene, up to rounding errors.
@@ -68,12 +71,6 @@ class Views:
             return np.asarray(cv2.warpPerspective(averages, homography, (width, height), flags=flags, borderMode=border))
         x, y = transform_points(homography, self._points.reshape(2, -1).T).T.reshape(2, height, width).astype(np.float32)
         return np.asarray(cv2.remap(averages, x, y, cv2.INTER_LINEAR, borderMode=border))
-
-    def _around(self, averages: NDArray[np.float32], points: FloatArray, homography: FloatArray) -> NDArray[np.float32]:
-        height, width = averages.shape[:2]
-        columns, rows = np.empty(self._shape, np.float32), np.empty(self._shape, np.float32)
-        _look_around(points, self._to_rays @ homography, width, height, self._offset, columns, rows)
-        return np.asarray(cv2.remap(averages, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
 @compiled
@@ -153,8 +150,10 @@ class DrawnObject:
         if frame not in self._frames:
             return np.zeros(shape)
         left, top = self._corners[frame]
-        if self._is_disc:
-            return _disc(left, top, self._size, shape)
+        if self._is_disc:  # its edge is a ramp of one pixel
+            y, x = np.ogrid[: shape[0], : shape[1]]
+            from_middle = np.hypot(x - (left + self._size[0] / 2), y - (top + self._size[1] / 2))
+            return np.asarray(np.clip(self._size.min() / 2 - from_middle + 0.5, 0, 1))
         return np.outer(_covered(top, self._size[1], shape[0]), _covered(left, self._size[0], shape[1]))
 
 
@@ -162,13 +161,6 @@ def _covered(start: float, length: float, n_pixels: int) -> FloatArray:
     """Return the share of each pixel along an axis that lies between `start` and `start + length`."""
     pixels = np.arange(n_pixels)
     return np.asarray(np.clip(np.minimum(pixels + 0.5, start + length) - np.maximum(pixels - 0.5, start), 0, 1))
-
-
-def _disc(left: float, top: float, size: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Return the share of each pixel, (H, W), that the largest disc in a rectangle covers: its edge is a ramp of one pixel."""
-    y, x = np.ogrid[: shape[0], : shape[1]]
-    from_middle = np.hypot(x - (left + size[0] / 2), y - (top + size[1] / 2))
-    return np.asarray(np.clip(size.min() / 2 - from_middle + 0.5, 0, 1))
 
 
 def texture_of(size: FloatArray, seed: int) -> NDArray[np.float32]:

@@ -103,7 +103,10 @@ class Stage:
         def texture(index: int) -> NDArray[np.float16]:
             sheet = self._sheets[index]
             light = np.ones((1, 1), np.float32) if lighting is None else light_on(self.planes, index, lighting)
-            return _lit(self._drawn(sheet, index, float(texels[index])), light, sheet.glow)
+            reflectance = self._drawn(sheet, index, float(texels[index]))
+            smooth = np.asarray(cv2.resize(light, reflectance.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+            # Rounded as the truth keeps it.
+            return np.asarray(np.maximum(reflectance, _DARKEST) * (smooth + np.float32(sheet.glow)), np.float16)
 
         with ThreadPoolExecutor(max(1, threads)) as pool:
             return Scene(self.planes, tuple(pool.map(texture, range(len(self._sheets)))))
@@ -187,14 +190,6 @@ def _hung(sheet: _Sheet, side: str, photo: NDArray[np.float32]) -> _Sheet:
     fitted = getattr(sheet, side) * (height / ratio / width if side == "along" else width * ratio / height)
     corner = sheet.corner + (getattr(sheet, side) - fitted) / 2
     return replace(sheet, corner=corner, picture=photo, **{side: fitted})
-
-
-def _lit(reflectance: NDArray[np.float32], light: NDArray[np.float32], glow: float) -> NDArray[np.float16]:
-    """Return the light that a texture sends out, rounded as the truth keeps it."""
-    height, width = reflectance.shape
-    smooth = np.asarray(cv2.resize(light, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-    texture: NDArray[np.float16] = (np.maximum(reflectance, _DARKEST) * (smooth + np.float32(glow))).astype(np.float16)
-    return texture
 
 
 def with_objects(
