@@ -124,7 +124,9 @@ def measure_local_flicker(gains: Gains, frequency: float) -> LocalFlicker:
         amplitudes = _amplitudes(seen, waves, *_lit(gains, waves, amplitudes, slow))
         expected, _ = _lit(gains, waves, amplitudes, slow)
         steady = expected / slow[seen.times]
-        photons, sums = (_running(np.bincount(seen.times, each, len(slow)), period) for each in (seen.photons, steady))
+        photons, sums = (
+            _running(np.bincount(seen.times, each, len(slow)).astype(float), period) for each in (seen.photons, steady)
+        )
         slow = np.maximum(photons / np.maximum(sums, 1e-12), 1e-3)
         slow = slow / slow.mean()
     cosine, sine = np.clip(amplitudes, -_MOST, _MOST).astype(np.float32)
