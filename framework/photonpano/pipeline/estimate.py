@@ -9,6 +9,7 @@ import numpy as np
 
 from photonpano.capture import leaving_out
 from photonpano.contracts.protocols import Source
+from photonpano.errors import LocationError
 from photonpano.execution.context import Context
 from photonpano.motion.diagnosis import UntiedError, also_tried
 from photonpano.motion.loop import LevelResult
@@ -37,8 +38,8 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
         return _along(timeline, plan, source, journal, context, plan.motion.start != "none")
     except ApartError as apart:
         shots, error = apart.shots, None
-    except UntiedError as untied:
-        shots, error = shots_of(source, untied), untied
+    except LocationError as unlocated:
+        shots, error = shots_of(source, unlocated) if isinstance(unlocated, UntiedError) else (), unlocated
     del journal[found:]
     if shots:
         return _along(timeline.in_shots(shots), plan, source, journal, context, plan.motion.start != "none")
