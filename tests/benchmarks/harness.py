@@ -108,7 +108,7 @@ class Study:
         """Return the capture that the source of a spec simulates, with its truth beside it."""
         path = self.folder / f"{name.replace(' ', '-')}-{digest(spec['source'])}.npy"
         if not truth_path(path).exists():
-            with open_source(parse_spec({"version": 1, "source": spec["source"]})) as source:
+            with open_source(parse_spec({"version": 1, "source": spec["source"], "corrections": []})) as source:
                 write_packed(source, path)
         return path
 

@@ -353,7 +353,7 @@ def _layers(run: _Run) -> _Found | None:
 
 
 @_doubtful_above(
-    1 / 3,
+    0.35,
     "the background of much of the panorama was never seen, as where one thing fills the middle of all frames",
     "record so that each place is seen without what hides it; the motion may be that of what fills the frames",
 )

@@ -259,7 +259,7 @@ def test_rotations_that_do_not_explain_the_pairs_are_doubtful(
     assert [(reason.what, reason.figure) for reason in reasons] == [(NO_TURN, np.sqrt(rotation))] * doubtful
 
 
-@pytest.mark.parametrize(("what", "most"), [("movers", 0.5), ("background_never_seen", 1 / 3)])
+@pytest.mark.parametrize(("what", "most"), [("movers", 0.5), ("background_never_seen", 0.35)])
 def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained, what: str, most: float) -> None:
     """A thing that fills the middle of all frames passes for the scene, and what is seen beside it for what hides that."""
     found = [judge(explained, (), [Decision(what, share, "")]).reasons for share in (most - 0.02, most + 0.02)]
