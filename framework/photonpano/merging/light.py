@@ -17,6 +17,7 @@ from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Ligh
 _ROUNDS = 8  # steps that solve for the flux of bright pixels in frames of different gains. Each at least halves the error
 _ACCURACY = 1e-4  # the steps end when no flux changes by more than this share
 _FAR = 1e4  # a place on a map of amplitudes that lies beyond its end, in px
+_GRID_PX = 4  # between pixels at which places on a sphere are computed
 _SEEN = 1e-3  # sums of less than this many frames are rounding errors
 
 
@@ -136,10 +137,13 @@ def amplitudes_on(light: Light, canvas: Canvas) -> list[FluxImage]:
         ]
     projection = "planar" if light.camera_matrix is None else "spherical"
     maps = Canvas(height, width, light.to_map, projection, light.camera_matrix)
-    grid = np.stack(np.meshgrid(np.arange(canvas.width, dtype=float), np.arange(canvas.height, dtype=float)), axis=-1)
-    places = np.nan_to_num(maps.pixels(canvas.on_plane(grid) @ maps.plane_to_rays.T), nan=_FAR)
-    x, y = np.moveaxis(np.clip(places, -1, _FAR).astype(np.float32), -1, 0)
-    return [np.asarray(cv2.remap(each, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)) for each in light.maps]
+    # The squares of maps are larger than this grid, whose places take as long as a whole merge at each pixel.
+    rows, columns = (np.arange(0, length + _GRID_PX, _GRID_PX, dtype=float) for length in canvas.shape)
+    grid = canvas.on_plane(np.stack(np.meshgrid(columns, rows), axis=-1)) @ maps.plane_to_rays.T
+    x, y = np.moveaxis(np.clip(np.nan_to_num(maps.pixels(grid), nan=_FAR), -1, _FAR).astype(np.float32), -1, 0)
+    coarse = [cv2.remap(each, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for each in light.maps]
+    finer = np.diag([_GRID_PX, _GRID_PX, 1.0])
+    return [np.asarray(cv2.warpPerspective(each, finer, (canvas.width, canvas.height))) for each in coarse]
 
 
 def gain_image(light: Light, span: FrameSpan, to_plane: Homography, shape: tuple[int, int]) -> FluxImage:
