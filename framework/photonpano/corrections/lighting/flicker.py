@@ -19,7 +19,7 @@ _ACCURACY = 1e-3  # of the frequency, relative to it
 _LEAST_INFORMATION = 0.05  # prior of the waves of a place, relative to its photons: it matters if a place is in view briefly
 _SMALLEST = 0.05  # least root mean square, over places and time, of a flicker that is divided out
 _SPREAD = 0.5  # prior standard deviation of the amplitudes
-_NEIGHBOURHOODS = (32.0, 16.0, 8.0, 4.0, 2.0)  # standard deviations of Gaussians, in squares: lamps have no sharp borders
+_NEIGHBOURHOODS = (32.0, 16.0, 8.0, 4.0)  # standard deviations of Gaussians, in squares: lamps have no sharp borders
 _DIFFERENCE = 0.2  # prior standard deviation of the amplitudes in a neighbourhood, relative to the next larger one
 _LEAST_GAIN = 0.05  # of a place: lamps hardly go out
 # Standard deviation of the Gaussian over which a flicker has one phase; brightness that a tremor changes has not.

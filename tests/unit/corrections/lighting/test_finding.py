@@ -11,8 +11,8 @@ from photonpano.contracts.protocols import WeightedSource
 from photonpano.corrections import Vignette, divided_by
 from photonpano.corrections.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
 from photonpano.corrections.lighting.finding import flicker_frequency, gain_of_frames
-from photonpano.corrections.lighting.flicker import _amplitudes
-from photonpano.corrections.lighting.gains import SeenCells
+from photonpano.corrections.lighting.flicker import _amplitudes, local_frequency
+from photonpano.corrections.lighting.gains import SeenCells, solve_gains
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging.light import gain_image
@@ -224,3 +224,22 @@ def test_phase_of_flicker_is_found_from_a_third_of_a_period() -> None:
     seen = SeenCells(spans, cells, times, photons, np.full(len(cells), 1e6), Canvas(9, 9, np.eye(3)))
     found = _amplitudes(seen, waves, np.full(len(cells), 1e6), np.ones(len(cells)))
     assert found[:, 4, 4] == pytest.approx(amplitudes, abs=0.02)
+
+
+@pytest.mark.parametrize("phases", [(0.0, 2.0), (0.0, 0.0)], ids=["two lamps", "one light"])
+def test_lamps_over_parts_of_the_scene_are_told_from_light_that_is_the_same_everywhere(phases: tuple[float, float]) -> None:
+    """A view of 20 columns passes by: each square is in view for 1.7 periods at most."""
+    n_times, frequency = 200, 1 / 700
+    spans = tuple(FrameSpan(each, each + 10) for each in range(0, 10 * n_times, 10))
+    canvas, rng = Canvas(14, 34, np.eye(3)), np.random.default_rng(0)
+    first = np.arange(n_times) * 14 // n_times
+    seen_at = (np.arange(34) >= first[:, None]) & (np.arange(34) < first[:, None] + 20)
+    times, rows, columns = np.nonzero(np.broadcast_to(seen_at[:, None], (n_times, 14, 34)))
+    share = 1 / (1 + np.exp((columns - 17) / 4))
+    turns = 2 * np.pi * frequency * (10 * times + 4.5)
+    light = 1 + 0.5 * (share * np.cos(turns) + (1 - share) * np.cos(turns + phases[1]))
+    exposure = np.full(len(times), 400.0)
+    photons = rng.poisson(exposure * light * rng.uniform(0.5, 1, (14, 34))[rows, columns]).astype(float)
+    seen = SeenCells(spans, rows * 34 + columns, times, photons, exposure, canvas)
+    found = local_frequency(solve_gains(seen))
+    assert found == pytest.approx(frequency if phases[1] else 0, rel=0.03)
