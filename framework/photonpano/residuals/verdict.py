@@ -69,6 +69,11 @@ class _Run:
         located = self.levels[-1].located
         return len(located.solution.outliers), len(located.edges)
 
+    def decided(self, what: str, meaning: str) -> _Found | None:
+        """Return the figure of the last decision of a name; None if there is none."""
+        figures = [float(each.value) for each in self.decisions if each.what == what]
+        return _Found(figures[-1], meaning) if figures else None
+
 
 class _Found(NamedTuple):
     """Figure of a test and where it occurs; `doubtful` overrides the threshold."""
@@ -338,8 +343,7 @@ def _ambiguous(run: _Run) -> _Found | None:
     "mask what stands in the frame (corrections: mask); the motion may be that of either part",
 )
 def _standing(run: _Run) -> _Found | None:
-    shares = [float(each.value) for each in run.decisions if each.what == "standing_share"]
-    return _Found(shares[0], "share of the parts that show motion or rest") if shares else None
+    return run.decided("standing_share", "share of the parts that show motion or rest")
 
 
 @_doubtful_above(
@@ -348,8 +352,7 @@ def _standing(run: _Run) -> _Found | None:
     "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
 )
 def _layers(run: _Run) -> _Found | None:
-    shares = [float(each.value) for each in run.decisions if each.what == "movers"]
-    return _Found(shares[-1], "share of the frames that is left out, on average") if shares else None
+    return run.decided("movers", "share of the frames that is left out, on average")
 
 
 @_doubtful_above(
@@ -358,8 +361,7 @@ def _layers(run: _Run) -> _Found | None:
     "record so that each place is seen without what hides it; the motion may be that of what fills the frames",
 )
 def _never_seen(run: _Run) -> _Found | None:
-    shares = [float(each.value) for each in run.decisions if each.what == "background_never_seen"]
-    return _Found(shares[-1], "share of the panorama") if shares else None
+    return run.decided("background_never_seen", "share of the panorama")
 
 
 @_doubtful_above(
