@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -62,6 +62,9 @@ def pictures(source: Source, spans: Sequence[FrameSpan], style: Style, threads: 
 def still_exposure(source: Source, span: FrameSpan) -> FluxImage:
     """Return the flux of the sum of some frames, without motion: (H, W), or (H, W, 3) in colour; NaN where masked."""
     still = Chunk(span, np.eye(3))
+    if len(span) == 1:
+        # In dimmer light, it has less than the frame of mean light that a flux needs.
+        source = replace(capture_of(source), light=None)
 
     def merged(each: Source) -> Panorama:
         photons = accumulate(each, [still], np.eye(3), each.info.frame_shape)

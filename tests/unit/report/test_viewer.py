@@ -12,13 +12,14 @@ import pytest
 
 import photonpano.report
 from photonpano import FrameSpan, Group, Panorama, StreamInfo, VirtualExposure
-from photonpano.capture import before
+from photonpano.capture import before, in_light
 from photonpano.geometry import Canvas, rescaling, translation
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.report import OpenCapture, render_report, viewer
+from photonpano.report.preview import still_exposure
 from photonpano.testing import KnownMotion, MemorySource
-from photonpano.values import CELL_PX, Background
+from photonpano.values import CELL_PX, Background, Light
 
 SCRIPT = Path(photonpano.report.__file__).parent / "templates" / "viewer.js"
 
@@ -166,6 +167,11 @@ def test_pictures_of_frames_have_all_photons():
     assert {each["hidden"] for each in found} == {0.5}
     seen = decoded_picture(found[20]["uri"])
     assert seen[:, :100].mean() == pytest.approx(seen[:, 140:].mean(), rel=0.05)
+
+
+def test_frame_in_dim_light_is_seen_by_itself():
+    source = in_light(MemorySource(np.ones((4, 20, 30), bool)), Light.of_frames(np.array([1.2, 0.5, 1.1, 1.2])))
+    assert np.isfinite(still_exposure(source, FrameSpan(1, 2))).all()
 
 
 @pytest.mark.parametrize(("hidden_cells", "width"), [(31, 1400), (31, 400), (0, 1400)])
