@@ -116,7 +116,7 @@ def through_found_lens(state: State) -> Proposal | None:
 def without_shading(state: State) -> Proposal | None:
     """Divide the capture by the flat field that its spec asks for, or by its vignette.
 
-    Raises `InputError` if the motion does not separate a flat field from the scene, or the camera turns too far.
+    Raises `InputError` if the motion does not separate a flat field from the scene.
     """
     plan, source = state.plan, state.view.source
     asked = any(isinstance(each, FlatField) for each in plan.corrections)
