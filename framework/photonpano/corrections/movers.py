@@ -15,12 +15,12 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from photonpano.capture import before, capture_of
-from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
+from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.corrections.lighting.finding import speed_px
 from photonpano.corrections.lighting.gains import scene_canvas
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
-from photonpano.geometry import PATCHES, Canvas
+from photonpano.geometry import PATCHES, Camera, Canvas
 from photonpano.merging import Chunk, accumulate, binned_mean
 from photonpano.robust import cauchy_weights, robust_std
 from photonpano.values import CELL_PX, Background, BoolArray, Decision, FloatArray, FluxImage, FrameSpan, Homography
@@ -98,16 +98,22 @@ class _Seen:
 
 
 def find_background(
-    source: Source, trajectory: Trajectory, span: FrameSpan, context: Context, *, exact: bool = False
+    source: Source,
+    trajectory: Trajectory,
+    camera: Camera | None,
+    span: FrameSpan,
+    context: Context,
+    *,
+    exact: bool = False,
 ) -> Background | None:
-    """Find the parts of the frames of a span that show the background; None if all do.
+    """Find the parts of the frames of a span that show the background; None if all do. The `camera` is None unless it turns.
 
     The background of a place is the brightness that it has most often: that of things that pass is spread over many values. A
     patch of squares that differs from it by more than photon noise hides it. Along an `exact` motion, smaller patches do, and
     the background is not known where what is left of a place still changes.
     """
     tolerance = _EXACT if exact else _ROUGH
-    seen = _seen(source, trajectory, span, context)
+    seen = _seen(source, trajectory, camera, span, context)
     if seen is None or len(seen.spans) < _FEWEST_SUMS:
         return None
     known = seen.known
@@ -161,7 +167,7 @@ def decision_of(background: Background) -> Decision:
     return Decision(MOVERS, round(float(hidden.mean()), 4), f"{hidden.mean():.1%} of the frames {reason}; they are left out")
 
 
-def _seen(source: Source, trajectory: Trajectory, span: FrameSpan, context: Context) -> _Seen | None:
+def _seen(source: Source, trajectory: Trajectory, camera: Camera | None, span: FrameSpan, context: Context) -> _Seen | None:
     """Sum the frames all over a span; None if too few photons arrive while the image hardly moves."""
     probes = [binned_mean(source, each) for each in source.info.spread(_PROBES, 1)]
     photons = float(np.nanmean(probes)) * np.pi * (_BLUR * CELL_PX) ** 2
@@ -172,7 +178,7 @@ def _seen(source: Source, trajectory: Trajectory, span: FrameSpan, context: Cont
     centres = np.linspace(span.start + length / 2, span.stop - length / 2, min(_INSTANTS, len(span) // length))
     spans = [FrameSpan(start, start + length) for start in (centres - length / 2).astype(int).tolist()]
     motions = trajectory.at([each.centre for each in spans])
-    fine = scene_canvas(camera_of_motion(trajectory), motions, source.info.frame_shape, 2 / CELL_PX)
+    fine = scene_canvas(camera, motions, source.info.frame_shape, 2 / CELL_PX)
     canvas = fine.part(0, 0, fine.height // 2 * 2, fine.width // 2 * 2)
     summed = partial(_brightness, source, canvas)
     root, std = (

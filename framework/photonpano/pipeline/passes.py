@@ -218,7 +218,9 @@ def without_movers(state: State) -> Proposal | None:
     last, source = state.results[-1], before(state.view.source, None)
     # The motion after a single level is as rough as that after the first of several.
     exact = len(state.levels) > 1 and last.level.number == state.levels[-1].number
-    found = find_background(source, state.trajectory, state.motion.span, state.context, exact=exact)
+    found = find_background(
+        source, state.trajectory, camera_of_motion(state.trajectory), state.motion.span, state.context, exact=exact
+    )
     located = last.located
     if (layers := located.solution.layers) is not None:
         there = located.solution.located
@@ -234,7 +236,7 @@ def without_what_changes(state: State) -> Proposal | None:
     if share < _CHANGING or _uncertain(state):
         return None
     source, known = before(state.view.source, None), capture_of(state.source).background
-    found = find_background(source, state.motion.trajectory, state.motion.span, state.context, exact=True)
+    found = find_background(source, state.motion.trajectory, state.motion.camera, state.motion.span, state.context, exact=True)
     if found is None:
         return None
     found = found if known is None else found.without(known)

@@ -16,7 +16,7 @@ from photonpano.corrections.movers import (
     write_background,
 )
 from photonpano.execution.context import Context
-from photonpano.geometry import PATCHES, translation
+from photonpano.geometry import PATCHES, Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging import accumulate, chunks_of
 from photonpano.testing import KnownMotion, MemorySource, Scene
 
@@ -61,7 +61,7 @@ def shares(found: object, frames: range, side: int = 32, speed: float = 0.06) ->
 
 @pytest.mark.parametrize("light", [0.0, 0.4], ids=["steady", "flickering"])
 def test_what_walks_before_the_background_is_hidden_whatever_the_light(light: float) -> None:
-    found = find_background(panned(with_mover=True, light=light), MOTION, ALL, Context(1))
+    found = find_background(panned(with_mover=True, light=light), MOTION, None, ALL, Context(1))
     assert found is not None
     hit, false = shares(found, range(100, 1500, 100))
     assert hit > 0.97
@@ -73,14 +73,14 @@ def test_what_walks_before_the_background_is_hidden_whatever_the_light(light: fl
 @pytest.mark.parametrize("exact", [False, True])
 def test_nothing_is_hidden_where_nothing_moves(light: float, tremor_px: float, *, exact: bool) -> None:
     source = panned(with_mover=False, light=light, tremor_px=tremor_px)
-    assert find_background(source, MOTION, ALL, Context(1), exact=exact) is None
+    assert find_background(source, MOTION, None, ALL, Context(1), exact=exact) is None
 
 
 def test_what_is_small_is_hidden_along_an_exact_motion_alone() -> None:
     """A square of 16 px covers 2 % of the frame, as much as the errors of a first motion may."""
     source = panned(with_mover=True, side=16)
-    assert find_background(source, MOTION, ALL, Context(1)) is None
-    found = find_background(source, MOTION, ALL, Context(1), exact=True)
+    assert find_background(source, MOTION, None, ALL, Context(1)) is None
+    found = find_background(source, MOTION, None, ALL, Context(1), exact=True)
     assert found is not None
     hit, false = shares(found, range(100, 1500, 100), side=16)
     assert hit > 0.9
@@ -90,7 +90,7 @@ def test_what_is_small_is_hidden_along_an_exact_motion_alone() -> None:
 def test_places_that_something_hides_most_of_the_time_are_not_taken_for_background_along_an_exact_motion() -> None:
     """It follows the camera, and so stays before a place that leaves the frame."""
     source, frames = panned(with_mover=True, speed=0.02), range(0, 1600, 100)
-    rough, exact = (find_background(source, MOTION, ALL, Context(1), exact=each) for each in (False, True))
+    rough, exact = (find_background(source, MOTION, None, ALL, Context(1), exact=each) for each in (False, True))
     assert rough is not None
     assert exact is not None
     assert shares(exact, frames, speed=0.02)[0] > shares(rough, frames, speed=0.02)[0]
@@ -98,7 +98,7 @@ def test_places_that_something_hides_most_of_the_time_are_not_taken_for_backgrou
 
 
 def test_the_merged_background_is_that_without_the_walker() -> None:
-    found = find_background(panned(with_mover=True), MOTION, ALL, Context(1))
+    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
     assert found is not None
     onto, shape = translation(0, 0), (112, 192)
     chunks = chunks_of(ALL, MOTION, SHAPE, 1.0)
@@ -114,7 +114,7 @@ def test_the_merged_background_is_that_without_the_walker() -> None:
 
 
 def test_every_place_that_was_seen_is_in_the_panorama() -> None:
-    found = find_background(panned(with_mover=True), MOTION, ALL, Context(1))
+    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
     assert found is not None
     assert (found.filled >= found.shown).all()
 
@@ -134,7 +134,7 @@ def test_patches_that_do_not_follow_the_motion_are_hidden() -> None:
 
 
 def test_layers_are_read_as_they_were_written(tmp_path: Path) -> None:
-    source, found = panned(with_mover=True), find_background(panned(with_mover=True), MOTION, ALL, Context(1))
+    source, found = panned(with_mover=True), find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
     assert found is not None
     assert before_background_of(source, tmp_path) is source
     write_background(tmp_path, found)
@@ -147,3 +147,13 @@ def test_layers_are_read_as_they_were_written(tmp_path: Path) -> None:
     (tmp_path / "layers.npz").write_bytes(b"no archive")
     with pytest.raises(InputError, match="cannot be read as the layers of a run"):
         before_background_of(source, tmp_path)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_movers_are_looked_for_all_around_a_camera_that_turns(exact: bool) -> None:
+    """Frames look up to 120 degrees aside, where no plane shows them; homographies of every frame do not say so."""
+    camera = Camera(np.array([[60, 0, 47.5], [0, 60, 31.5], [0, 0, 1.0]]))
+    turns = rotation_matrices(np.linspace([0, -2.1, 0], [0, 2.1, 0], 600))
+    motion = FrameTrajectory(camera.matrix @ turns @ np.linalg.inv(camera.matrix))
+    source = MemorySource(np.random.default_rng(0).random((600, 64, 96)) < 0.3)
+    assert find_background(source, motion, camera, source.info.span, Context(1), exact=exact) is None
