@@ -85,7 +85,7 @@ def showing(
         movers: hide or show them, or show them as they were at a frame, or, with action, several times along their way.
     """
     background = capture_of(source).background
-    if background is None or movers == "show":
+    if background is None:
         return before(source, None), []
     motions = trajectory.at(background.instants)
     frames = scene_canvas(camera, motions, source.info.frame_shape, 2 / CELL_PX)
@@ -93,15 +93,18 @@ def showing(
     canvas = frames.part(-margin, -margin, frames.height + 2 * margin, frames.width + 2 * margin)
     places = np.array([*places_of_cells(source, canvas, motions)])[..., ::-1]
     scene = _Scene(background, canvas.shape, np.clip(places.round(), 0, np.subtract(canvas.shape, 1)).astype(np.intp))
+    decisions, share = list[Decision](), round(scene.never_seen(), 3)
+    if share:
+        instead = "" if movers == "show" else "; what differs least from the usual is shown there"
+        said = f"the background of {share:.1%} of the panorama was never seen{instead}"
+        decisions.append(Decision("background_never_seen", share, said))
+    if movers == "show":
+        return before(source, None), decisions
     hidden, moments = ~background.filled, list[tuple[int, BoolArray]]()
     if movers != "hide":
         nearest = 0 if movers == "action" else int(np.abs(background.instants - movers).argmin())
         moments = _whole_movers(hidden) if movers == "action" else [(nearest, hidden[nearest])]
     shown, times = scene.with_movers(moments)
-    decisions, share = [], round(scene.never_seen(), 3)
-    if share:
-        said = f"the background of {share:.1%} of the panorama was never seen; what differs least from the usual is shown there"
-        decisions.append(Decision("background_never_seen", share, said))
     if movers != "hide":
         at = ", ".join(f"{background.instants[each]:.0f}" for each in times) or "none"
         decisions.append(Decision("shown_movers", len(times), f"what moves is shown as it was around frames: {at}"))

@@ -107,11 +107,13 @@ def test_nothing_is_said_where_nothing_moves() -> None:
     assert not decisions
 
 
-def test_the_share_whose_background_was_never_seen_is_told() -> None:
+@pytest.mark.parametrize("movers", ["hide", "show"])
+def test_the_share_whose_background_was_never_seen_is_told(movers: Literal["hide", "show"]) -> None:
+    """The verdict doubts large ones, whatever the panorama shows."""
     source, motion = crossed(0.0)
     shown = np.ones((len(INSTANTS), 12, 16), bool)
     shown[:, 4:8, 4:12] = False
     never = before(source, Background(INSTANTS, shown, np.ones_like(shown), SHAPE))
-    _, (said,) = showing(never, motion, None, "hide")
+    _, (said,) = showing(never, motion, None, movers)
     assert said.what == "background_never_seen"
     assert float(said.value) == pytest.approx(32 / 192, abs=0.02)
