@@ -1,6 +1,7 @@
 """What moves is shown in a panorama as it was at some moments, and the background everywhere else."""
 
 from functools import cache, partial
+from typing import Literal
 
 import numpy as np
 import pytest

@@ -14,7 +14,7 @@ from scipy.interpolate import UnivariateSpline
 
 from photonpano.capture import in_light
 from photonpano.contracts.protocols import Source, Trajectory, light_of
-from photonpano.corrections.lighting.flicker import LocalFlicker, local_frequency, measure_local_flicker
+from photonpano.corrections.lighting.flicker import LocalFlicker, local_flicker
 from photonpano.corrections.lighting.gains import Gains, seen_cells, solve_gains
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
@@ -43,7 +43,7 @@ def find_light(source: Source, trajectory: Trajectory, context: Context) -> Ligh
     n_frames = source.info.n_frames
     longest = max(1, min(_PROBE_FRAMES, int(_SPAN_PX / max(speed_px(source, trajectory), 1e-9)), n_frames // _PROBES))
     gains = _gains(source, trajectory, _spread(n_frames, longest), context)
-    return measure_light(source, trajectory, context) if changes(gains) or local_frequency(gains) else None
+    return measure_light(source, trajectory, context) if changes(gains) or local_flicker(gains) is not None else None
 
 
 def changes(gains: Gains) -> bool:
@@ -62,9 +62,8 @@ def _measured(source: Source, trajectory: Trajectory, context: Context) -> Light
     length = min(n_frames, max(_FEWEST_FRAMES, -(-n_frames // _MOST_SPANS)))
     bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
     gains = _gains(source, trajectory, [FrameSpan(*pair) for pair in pairwise(bounds)], context)
-    frequency = local_frequency(gains)
-    if frequency:
-        return _light_of(measure_local_flicker(gains, frequency), gains, n_frames)
+    if (flicker := local_flicker(gains)) is not None:
+        return _light_of(flicker, gains, n_frames)
     lengths = np.array([len(span) for span in gains.seen.spans], float)
     gain, std, frequency = gain_of_frames(gains.seen.instants, gains.gain, gains.std, lengths, n_frames)
     mean = float(gain.mean())
@@ -97,10 +96,9 @@ def _light_of(flicker: LocalFlicker, gains: Gains, n_frames: int) -> Light:
     frames = np.arange(n_frames)
     slow, std = (np.interp(frames, gains.seen.instants, each) for each in (flicker.slow, gains.std))
     phase = 2 * np.pi * flicker.frequency * frames
-    maps = np.stack([flicker.cosine, flicker.sine])
     waves, canvas = np.stack([np.cos(phase), np.sin(phase)]), gains.seen.canvas
     camera_matrix = None if canvas.planar else canvas.camera_matrix
-    return Light(slow / slow.mean(), waves, maps, canvas.transform, flicker.frequency, std, camera_matrix)
+    return Light(slow / slow.mean(), waves, flicker.maps, canvas.transform, flicker.frequency, std, camera_matrix)
 
 
 def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -33,13 +33,12 @@ class LocalFlicker:
     """The flicker of each square of the scene: `1 + cosine cos(2 pi f t) + sine sin(2 pi f t)` of its mean light."""
 
     frequency: float  # f, in cycles per frame
-    cosine: FluxImage  # (h, w) float32
-    sine: FluxImage  # (h, w) float32
+    maps: FluxImage  # (2, h, w) float32, cosine and sine
     slow: FloatArray  # (S,) gain of the spans, over which it does not flicker
 
 
-def local_frequency(gains: Gains) -> float:
-    """Return the frequency at which places flicker, each at its own phase, in cycles per frame; 0 if none stands out.
+def local_flicker(gains: Gains) -> LocalFlicker | None:
+    """Return the flicker of places, each at its own phase; None if no frequency stands out, or all places flicker alike.
 
     What a wave explains is added up over all squares, whatever its phase there. A square is in view for a short time only, in
     which few waves tell a flicker from a slow change: it has to explain more than its neighbours in frequency do, and together
@@ -55,7 +54,7 @@ def local_frequency(gains: Gains) -> float:
     highest = 1 / max(4 * length, 2.0 * (instants[-1] - instants[0]) / (4 * len(instants)))
     frequencies = np.arange(_PERIODS / duration, highest, 1 / (_FINER * duration))
     if len(frequencies) < 8 or duration < 8 * length:
-        return 0.0
+        return None
     ratio, weight = _relative(gains)
     series, weights = _of_neighbours(seen, weight * ratio), _of_neighbours(seen, weight)
     found = [_explained(series, weights, instants, each) for each in frequencies]
@@ -63,15 +62,17 @@ def local_frequency(gains: Gains) -> float:
     # Of a wave of amplitude a, this is a^2 / 2.
     smallest = max(_STANDS_OUT * float(np.median(found)), _SMALLEST**2)
     if peak in (0, len(found) - 1) or found[peak] < smallest:
-        return 0.0
+        return None
     near = float(frequencies[peak - 1]), float(frequencies[peak + 1])
-    best = minimize_scalar(lambda each: _left_of_places(gains, each)[0], bounds=near, options={"xatol": _ACCURACY * near[0]})
-    left, noise = _left_of_places(gains, float(best.x))
-    nowhere = np.zeros((2, *seen.canvas.shape))
-    common, _ = _left(seen, _lit(gains, np.zeros((2, len(seen.cells))), nowhere, gains.gain)[0])
+    best = minimize_scalar(
+        lambda each: _left(gains, measured_flicker(gains, each))[0], bounds=near, options={"xatol": _ACCURACY * near[0]}
+    )
+    flicker = measured_flicker(gains, float(best.x))
+    left, noise = _left(gains, flicker)
+    common, _ = _left(gains, replace(flicker, maps=np.zeros_like(flicker.maps), slow=gains.gain))
     # Of light that is the same everywhere, one gain leaves as little as places do.
     is_local = common - left > max((1 - _BETTER) * (common - noise), (_SMALLEST / 2) ** 2)
-    return float(best.x) if is_local else 0.0
+    return flicker if is_local else None
 
 
 def _explained(series: FloatArray, weights: FloatArray, instants: FloatArray, frequency: float) -> float:
@@ -96,29 +97,25 @@ def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:
     return found.T
 
 
-def _left_of_places(gains: Gains, frequency: float) -> tuple[float, float]:
-    """Return what a flicker of places leaves in the photons; see `_left`."""
-    flicker, turns = measure_local_flicker(gains, frequency), 2 * np.pi * frequency * gains.seen.instants
-    waves = np.stack([np.cos(turns), np.sin(turns)])[:, gains.seen.times]
-    expected, _ = _lit(gains, waves, np.stack([flicker.cosine, flicker.sine]), flicker.slow)
-    return _left(gains.seen, expected)
-
-
-def _left(seen: SeenCells, expected: FloatArray) -> tuple[float, float]:
-    """Return the mean square that (N,) expected photons leave, relative to them, and that of their noise."""
+def _left(gains: Gains, flicker: LocalFlicker) -> tuple[float, float]:
+    """Return the mean square that a flicker leaves in the photons, relative to what it predicts, and that of their noise."""
+    expected, _ = _lit(gains, _waves(gains.seen, flicker.frequency), flicker.maps.astype(float), flicker.slow)
     weight = 1 / (1 / expected + STRUCTURE**2)
-    left, noise = (seen.photons / expected - 1) ** 2, 1 / expected / SMOOTHING**2
+    left, noise = (gains.seen.photons / expected - 1) ** 2, 1 / expected / SMOOTHING**2
     return float((weight * left).sum() / weight.sum()), float((weight * noise).sum() / weight.sum())
 
 
-def measure_local_flicker(gains: Gains, frequency: float) -> LocalFlicker:
-    """Fit the amplitude and the phase of each square of the scene at a frequency; spans must be much shorter than a period."""
-    seen = gains.seen
-    lengths = np.array([len(span) for span in seen.spans], float)
+def _waves(seen: SeenCells, frequency: float) -> FloatArray:
+    """Return cosine and sine of each observation, averaged over its span: (2, N)."""
     turns = 2 * np.pi * frequency * seen.instants
-    cosines, sines = (np.sinc(frequency * lengths) * each(turns) for each in (np.cos, np.sin))
+    averaged = np.sinc(frequency * np.array([len(span) for span in seen.spans], float))
+    return np.asarray((averaged * np.stack([np.cos(turns), np.sin(turns)]))[:, seen.times])
+
+
+def measured_flicker(gains: Gains, frequency: float) -> LocalFlicker:
+    """Fit the amplitude and the phase of each square of the scene at a frequency; spans must be much shorter than a period."""
+    seen, waves = gains.seen, _waves(gains.seen, frequency)
     period = max(1, round(1 / (frequency * float(np.median(np.diff(seen.instants))))))
-    waves = np.stack([cosines, sines])[:, seen.times]
     amplitudes, slow = np.zeros((2, *seen.canvas.shape)), np.ones(len(seen.spans))
     for _ in range(_ROUNDS):
         amplitudes = _amplitudes(seen, waves, *_lit(gains, waves, amplitudes, slow))
@@ -129,8 +126,7 @@ def measure_local_flicker(gains: Gains, frequency: float) -> LocalFlicker:
         )
         slow = np.maximum(photons / np.maximum(sums, 1e-12), 1e-3)
         slow = slow / slow.mean()
-    cosine, sine = np.clip(amplitudes, -_MOST, _MOST).astype(np.float32)
-    return LocalFlicker(frequency, cosine, sine, slow)
+    return LocalFlicker(frequency, np.clip(amplitudes, -_MOST, _MOST).astype(np.float32), slow)
 
 
 def _lit(gains: Gains, waves: FloatArray, amplitudes: FloatArray, slow: FloatArray) -> tuple[FloatArray, FloatArray]:
