@@ -125,8 +125,9 @@ def test_masked_pixel_is_filled_by_the_motion(small_capture: Path, tmp_path: Pat
     blind = np.zeros(SHAPE, bool)
     blind[:, 80:86] = True
     np.save(tmp_path / "blind.npy", blind)
-    truth = np.load(truth_path(small_capture))
-    motion = KnownMotion(lambda frame: truth["homographies"][min(round(float(frame)), N - 1)])
+    with np.load(truth_path(small_capture)) as truth:
+        homographies = truth["homographies"]
+    motion = KnownMotion(lambda frame: homographies[min(round(float(frame)), N - 1)])
     seen = {}
     for name, corrections in {"all": [], "masked": [{"mask": {"file": str(tmp_path / "blind.npy")}}]}.items():
         with build_source(parse_spec(spec_of(small_capture, *corrections))) as source:

@@ -75,7 +75,7 @@ def test_check_run_keeps_what_only_the_run_can_find(finished: Path) -> None:
     other = repeats | {"what": "the light changes over time"}
     standing = {"what": "standing_share", "value": 0.7, "reason": "measured"}
     change(finished, lambda record: record["verdict"].update(reasons=[repeats, other]))
-    change(finished, lambda record: record["decisions"].insert(0, standing))
+    change(finished, lambda record: record["decisions"].append(standing))
     found = [reason.what for reason in check_run(finished).verdict.reasons]
     assert found[-2:] == ["more than half of the frame stands still while the rest moves", REPEATS]
     assert other["what"] not in found
