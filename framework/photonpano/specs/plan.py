@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -102,6 +102,16 @@ class Plan:
     decisions: tuple[Decision, ...] = ()
     corrects_itself: bool = False
     pose: Choice | None = None
+
+    def having(self, section: str, **values: Any) -> Plan:
+        """Return this plan with other values of keys of a section; for `source`, of keys of its component."""
+        of_source, written = section == "source", self.document[section]
+        found: Any = (self.source.config if of_source else getattr(self, section)).model_copy(update=values)
+        plain = found.model_dump(mode="json", by_alias=True, include=set(values))
+        if of_source:
+            found, plain = replace(self.source, config=found), {"with": {**written["with"], **plain}}
+        changed = {section: found, "document": {**self.document, section: {**written, **plain}}}
+        return replace(self, **changed)
 
     def place(self, where: str) -> Place:
         """Return where a value was written, by its path in `document`; for a default, where it would stand."""

@@ -67,7 +67,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
         spool: Spool | None = None
         spooled = folder / SPOOL
         if isinstance(what, Piped):
-            plan = _from_file(plan, spooled)
+            plan = plan.having("source", path=spooled)
         with run_folder(directory, overwrite=overwrite, inputs=capture_files(plan)):
             pass  # a folder that cannot be written is refused now, not when the capture is complete
         if isinstance(what, Piped):
@@ -112,14 +112,6 @@ def _followable(plan: Plan) -> Callable[[Any], Any]:
     if isinstance(config, PartOfCapture) and config.frames is not None:
         raise plan.error("source.with.frames", "a part of a capture cannot be followed; remove this key")
     return contribution.arrived
-
-
-def _from_file(plan: Plan, path: Path) -> Plan:
-    """Return a plan whose capture is a file and not standard input."""
-    config = plan.source.config.model_copy(update={"path": path})
-    section = plan.document["source"]
-    source = {**section, "with": {**section["with"], "path": str(path)}}
-    return replace(plan, source=replace(plan.source, config=config), document={**plan.document, "source": source})
 
 
 def _standard_input() -> int:
