@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import open_source
+from photonpano import LocationError, open_source
 from photonpano import run as run_plan
-from photonpano.execution.context import Context
+from photonpano.execution.context import Context, Quiet
 from photonpano.pipeline.obstacles import timeline_of
+from photonpano.pipeline.shots import run_others
 from photonpano.specs import parse_spec
+from photonpano.specs.plan import Plan
+from photonpano.text import listed
 from photonpano.values import FrameSpan
 
 pytestmark = pytest.mark.usefixtures("without_report")
@@ -91,24 +95,85 @@ def flux_of(run: Path) -> float:
     return float(np.nanmedian(tifffile.imread(run / "panorama.tiff")))
 
 
-def test_shots_that_nothing_ties_together_are_kept_apart(simulated: Callable[..., Path], tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def two_shots(simulated: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames 20 to 139 and 140 to 319 are of two shots; those before are not to be read."""
     elsewhere = {"kind": "street", "width": 1024, "height": 682, "seed": 5}
     first, other = (np.load(simulated(path=PAN, **changes)) for changes in ({}, {"scene": elsewhere}))
-    np.save(tmp_path / "cube.npy", np.concatenate([first[:120], other[:180]]))
-    result = run_plan(parse_spec(spec_of(tmp_path / "cube.npy"), output=tmp_path / "run"))
+    path = tmp_path_factory.mktemp("shots") / "cube.npy"
+    np.save(path, np.concatenate([first[:20], first[:120], other[:180]]))
+    return path
+
+
+def test_shots_that_nothing_ties_together_are_run_apart(
+    two_shots: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    spec = spec_of(two_shots) | {"render": {"reference": 30}}
+    spec["source"]["with"]["frames"] = [20, 320]
+    plan = parse_spec(spec, output=tmp_path / "run")
+    result = run_plan(plan)
     with np.load(tmp_path / "run" / "trajectory.npz") as motion:
         np.testing.assert_array_equal(np.flatnonzero(motion["located"]), np.arange(120, 300))
         assert motion["reference"] == 210
     assert result.record["warnings"][0] == (
         "the capture holds 2 shots that no pair of exposures ties together: frames 0 to 119 and frames 120 to 299. The "
-        "panorama is of frames 120 to 299 alone; for one of frames 0 to 119, write source: {with: {frames: [0, 120]}}"
+        "panorama is of frames 120 to 299 alone; the others have run folders of their own beside this one, unless their runs "
+        "failed: frames 0 to 119 in run.panorama-2"
     )
     assert result.verdict is not None
     assert str(result.verdict.reasons[0]) == (
         "the capture holds shots that no pair of exposures ties together, and the panorama is of the longest alone (frames 0 "
-        "to 119 and frames 120 to 299): 2, trusted up to 1; make a panorama of each: write "
-        "source.with.frames: [first, last + 1]"
+        "to 119 and frames 120 to 299): 2, trusted up to 1; look at the panoramas of the others beside the run folder: "
+        "DIR.panorama-2 and so on"
     )
+    folder = tmp_path / "run.panorama-2"
+    assert [each.directory for each in result.others] == [folder]
+    assert str(folder / "report.html") in result._repr_html_()
+    assert sorted(each.name for each in folder.iterdir()) == sorted([*result.others[0].record["files"], "run.json"])
+    again = result.others[0].record["spec"]
+    assert (again["source"]["with"]["frames"], again["output"]["directory"]) == ([20, 140], str(folder))
+    with np.load(folder / "trajectory.npz") as motion:
+        np.testing.assert_array_equal(motion["located"], np.ones(120, bool))
+        assert motion["reference"] == 30
+
+    # As if the run had been interrupted before the other shot.
+    shutil.rmtree(folder)
+    resumed = run_plan(plan, resume=True)
+    assert [(each.was_finished, each.directory) for each in (resumed, *resumed.others)] == [
+        (True, tmp_path / "run"),
+        (False, folder),
+    ]
+    # A folder of the user is not touched, and costs the result nothing.
+    (folder / "notes.txt").write_text("mine")
+    refused = run_plan(plan, resume=True)
+    assert (refused.record, refused.others) == (resumed.record, ())
+    assert caplog.messages[-1] == (
+        f"no panorama of frames 0 to 119, another shot, was written into {folder}: {folder} holds files that no run has "
+        "written: notes.txt; choose another folder with --output, or write the results among them with --overwrite"
+    )
+    assert (folder / "notes.txt").read_text() == "mine"
+
+
+def test_other_shots_are_numbered_by_their_length_and_those_that_fail_are_left_out(
+    tiny_spec: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    spans = [FrameSpan(0, 10), FrameSpan(10, 40), FrameSpan(40, 60), FrameSpan(60, 100)]
+    record: Any = {"decisions": [{"what": "shots", "value": listed(map(str, spans))}]}
+
+    def run(plan: Plan) -> Plan:
+        if plan.output.directory.name == "run.panorama-3":
+            raise LocationError("too dark")
+        return plan
+
+    spec = tiny_spec | {"render": {"reference": 5, "movers": 15}}
+    plans = list(run_others(parse_spec(spec, output=tmp_path / "run"), record, run, Quiet()))
+    found = [(each.output.directory.name, each.document["source"]["with"]["frames"], each.document["render"]) for each in plans]
+    assert [(name, frames, render["reference"], render["movers"]) for name, frames, render in found] == [
+        ("run.panorama-2", [10, 40], "middle", 5),
+        ("run.panorama-4", [0, 10], 5, "hide"),
+    ]
+    name = tmp_path / "run.panorama-3"
+    assert caplog.messages == [f"no panorama of frames 40 to 59, another shot, was written into {name}: too dark"]
 
 
 def test_constant_velocity_is_tried_where_exposures_are_not_located(simulated: Callable[..., Path], tmp_path: Path) -> None:

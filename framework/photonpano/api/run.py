@@ -61,6 +61,9 @@ def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
         yield f"panorama  {directory / 'panorama.png'}"
     if "report.html" in record["files"]:
         yield f"report    {directory / 'report.html'}"
+    for other in result.others:
+        yield f"another   shot of {counted(other.record['source']['n_frames'], 'frame')}, run by itself:"
+        yield from _lines(other)
     if strict and result.verdict is not None:
         require_trust(result.verdict, "all files of the run folder are written")
     if strict and poses and poses["doubts"]:
@@ -92,6 +95,7 @@ def _run(
 
     Writes the run folder: panorama.png to look at, panorama.tiff with linear flux, coverage.tiff, trajectory.npz, run.json
     (settings, versions, results) and report.html. The verdict says whether motion and panorama explain the photons.
+    Of several shots, each one but the longest gets a run folder of its own, DIR.panorama-2 and so on.
     A spec with `pose` finds the poses of a camera instead: poses.npz, and files of other programs.
 
     Args:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from photonpano.capture import capture_of
@@ -20,6 +21,7 @@ from photonpano.pipeline.pose_run import find_poses
 from photonpano.pipeline.refiners import build_refiners, refine
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_steps import BegunRun, begun_run
+from photonpano.pipeline.shots import run_others
 from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import LiveFigures, OpenCapture, render_report
@@ -40,6 +42,7 @@ class RunResult:
         verdict: whether motion and panorama explain the photons; None for poses, whose doubts are in the record.
         was_finished: whether `resume` found that nothing was left to do.
         followed: how fast the frames of a capture were located that was followed.
+        others: the runs of the other shots of the capture, longer ones first; those that failed are missing.
     """
 
     directory: Path
@@ -47,10 +50,11 @@ class RunResult:
     verdict: Verdict | None
     was_finished: bool = False
     followed: LiveFigures | None = None
+    others: tuple[RunResult, ...] = ()
 
     def _repr_html_(self) -> str:
-        """Show picture, verdict and files in a notebook."""
-        return run_html(self.directory, self.record)
+        """Show picture, verdict and files in a notebook, and those of other shots."""
+        return run_html(self.directory, self.record) + "".join(each._repr_html_() for each in self.others)
 
 
 def run(
@@ -65,6 +69,9 @@ def run(
     end_after: float = END_AFTER_S,
 ) -> RunResult:
     """Run a plan and write its run folder: panorama, coverage, trajectory, record and report; or poses, for a plan with `pose`.
+
+    Where the capture holds shots that nothing ties together, the longest is run, and then each other one into a folder of its
+    own: `runs/scan.panorama-2` beside `runs/scan`, and so on, longer ones first. One that fails is a warning.
 
     Args:
         plan: from `load_spec` or `parse_spec`.
@@ -93,7 +100,14 @@ def run(
         with followed(plan, usual(progress), overwrite=overwrite, end_after=end_after) as (complete, figures):
             result = run(complete, progress, overwrite=overwrite, keep_work=keep_work)
             return replace(result, followed=figures)
-    with begun_run(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite=overwrite) as begun:
+    result = _run_one(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite)
+    again = partial(run, progress=progress, overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work)
+    return replace(result, others=tuple(run_others(plan, result.record, again, usual(progress))))
+
+
+def _run_one(plan: Plan, progress: Progress, how: Continuation, overwrite: bool) -> RunResult:
+    """Run a plan, of whose shots the longest is located."""
+    with begun_run(plan, progress, how, overwrite=overwrite) as begun:
         if not begun.was_finished:
             (make_panorama if plan.pose is None else find_poses)(begun)
         return RunResult(plan.output.directory, begun.record, begun.verdict, begun.was_finished)

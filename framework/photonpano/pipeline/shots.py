@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import logging
+import re
+from collections.abc import Callable, Iterator
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
 from photonpano.contracts.protocols import Source
+from photonpano.errors import PhotonpanoError, described
+from photonpano.execution.context import Progress
 from photonpano.merging import binned_mean
 from photonpano.motion.diagnosis import UntiedError
+from photonpano.motion.timeline import SHOTS
+from photonpano.plugins.contributions import PartOfCapture
+from photonpano.record.run_warnings import other_shots
+from photonpano.record.schema import RunRecord
+from photonpano.specs.plan import Plan
 from photonpano.values import FloatArray, FrameSpan
+
+logger = logging.getLogger(__name__)
+ResultT = TypeVar("ResultT")
 
 _BLOCKS, _SHORTEST, _LONGEST = 64, 4, 32  # blocks of frames that are compared; fewest and most frames of one
 _SIDE = 4  # blocks before and after an instant whose means are compared
@@ -70,3 +84,27 @@ def _first_after_change(source: Source, span: FrameSpan) -> int | None:
     before, after = means[max(index - 1, 0)], means[min(index + _SIDE + 1, len(means) - 1)]
     misfit: FloatArray = np.array([((frame - before) ** 2 - (frame - after) ** 2).sum() for frame in frames])
     return first + int(np.concatenate([[0.0], misfit.cumsum()]).argmin())
+
+
+def run_others(plan: Plan, record: RunRecord, run: Callable[[Plan], ResultT], progress: Progress) -> Iterator[ResultT]:
+    """Run each shot that a finished run has left out, into a folder beside its own. One that fails is a warning."""
+    found = next((str(each["value"]) for each in record["decisions"] if each["what"] == SHOTS), "")
+    shots = [FrameSpan(int(first), int(last) + 1) for first, last in re.findall(r"(\d+) to (\d+)", found)]
+    for folder, shot in other_shots(shots, plan.output.directory).items():
+        progress.note(f"{plan.output.directory} is finished; {shot}, another shot, are run into {folder}")
+        try:
+            yield run(_narrowed(plan, shot).having("output", directory=folder))
+        except Exception as error:
+            message = str(error) if isinstance(error, PhotonpanoError) else described(error)
+            logger.warning("no panorama of %s, another shot, was written into %s: %s", shot, folder, message)
+
+
+def _narrowed(plan: Plan, shot: FrameSpan) -> Plan:
+    """Return a plan that reads the frames of a shot alone, which count from the first frame that `plan` reads."""
+    config = plan.source.config
+    first = config.frames[0] if isinstance(config, PartOfCapture) and config.frames is not None else 0
+    plan = plan.having("source", frames=(first + shot.start, first + shot.stop))
+    for key, default in (("reference", "middle"), ("movers", "hide")):
+        if isinstance(frame := getattr(plan.render, key), int):
+            plan = plan.having("render", **{key: frame - shot.start if shot.start <= frame < shot.stop else default})
+    return plan

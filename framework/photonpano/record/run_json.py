@@ -61,7 +61,7 @@ def record_of(
         "refinements": [refinement_record(each) for each in explained.refinements],
         "verdict": judged,
         "warnings": [
-            *left_out_warnings(timeline),
+            *left_out_warnings(timeline, plan.output.directory),
             *level_warnings(levels),
             *motion_warnings(motion, timeline),
             *refinement_warnings(explained.refinements),

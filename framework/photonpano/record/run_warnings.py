@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import Timeline
 from photonpano.residuals.refinement import Refinement
 from photonpano.text import listed
-from photonpano.values import FloatArray, PoseEstimate, true_spans
+from photonpano.values import FloatArray, FrameSpan, PoseEstimate, true_spans
 
 # Expected corner error above which a warning names the frames: it is likely to be visible.
 UNCERTAIN_PX = 0.5
@@ -52,16 +53,23 @@ def level_warnings(results: Sequence[LevelResult]) -> list[str]:
     return warnings
 
 
-def left_out_warnings(timeline: Timeline | None) -> list[str]:
+def other_shots(shots: Sequence[FrameSpan], directory: Path) -> dict[Path, FrameSpan]:
+    """Return all shots but the longest, longer ones first, by their run folders: `runs/scan.panorama-2` beside `runs/scan`."""
+    others = sorted(shots, key=len, reverse=True)[1:]
+    place = directory.absolute().resolve()
+    return {place.with_name(f"{place.name}.panorama-{number}"): shot for number, shot in enumerate(others, start=2)}
+
+
+def left_out_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
     """Warn of shots and of dark frames, which are left out of the panorama."""
     warnings: list[str] = []
     if timeline is not None and timeline.shots:
-        shots, shown = timeline.shots, timeline.shot
-        other = next(each for each in shots if each != shown)
+        shots = timeline.shots
+        others = [f"{shot} in {folder.name}" for folder, shot in other_shots(shots, directory).items()]
         warnings.append(
-            f"the capture holds {len(shots)} shots that no pair of exposures ties together: "
-            f"{listed(map(str, shots))}. The panorama is of {shown} alone; for one of {other}, write "
-            f"source: {{with: {{frames: [{other.start}, {other.stop}]}}}}"
+            f"the capture holds {len(shots)} shots that no pair of exposures ties together: {listed(map(str, shots))}. The "
+            f"panorama is of {timeline.shot} alone; the others have run folders of their own beside this one, unless their "
+            f"runs failed: {listed(others)}"
         )
     if timeline is not None and timeline.dark:
         warnings.append(

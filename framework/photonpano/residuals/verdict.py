@@ -129,7 +129,7 @@ def contradictions(dropped: int, pairs: int) -> Reason | None:
 @_doubtful_above(
     1,
     "the capture holds shots that no pair of exposures ties together, and the panorama is of the longest alone",
-    "make a panorama of each: write source.with.frames: [first, last + 1]",
+    "look at the panoramas of the others beside the run folder: DIR.panorama-2 and so on",
 )
 def _shots(run: _Run) -> _Found | None:
     shots = next((str(each.value) for each in run.decisions if each.what == SHOTS), "")

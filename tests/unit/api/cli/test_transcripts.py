@@ -62,12 +62,14 @@ class World:
         module = f"photonpano.api.{name.replace('-', '_')}"
         self.patch.setitem(COMMANDS, module, replace(COMMANDS[module], calls=lambda **_: result))
 
-    def runs(self, verdict: Verdict, **record: Any) -> None:
-        """Let `run` have a verdict."""
+    def runs(self, verdict: Verdict, *others: Verdict, **record: Any) -> None:
+        """Let `run` have a verdict, and those of other shots of 120 frames."""
         refined = {"use": "short-spans", "rounds": ["tremor at 223 Hz", "less"], "change_px": 0.664, "kept_out": None}
         still = {"use": "other", "rounds": [], "change_px": 0.0, "kept_out": None}
         found = {"warnings": ["a warning"], "refinements": [refined, still], "decisions": [], "files": {"report.html": {}}}
-        result = RunResult(Path("run").absolute(), found | record, verdict)
+        shot = found | {"source": {"n_frames": 120}, "warnings": []}
+        shots = [RunResult(Path(f"run.panorama-{n}").absolute(), shot, each) for n, each in enumerate(others, start=2)]
+        result = RunResult(Path("run").absolute(), found | record, verdict, others=tuple(shots))
         self.patch.setattr("photonpano.api.run.run", lambda *_, **_options: result)
 
     def batches(self) -> None:
@@ -207,6 +209,7 @@ SET_UPS: dict[str, Callable[[World], object]] = {
     "out-has-another-summary": lambda _: (Path("out").mkdir(), Path("out/summary.csv").touch()),
     "trusted": lambda world: world.runs(TRUSTED, panorama=RANGE, decisions=[START, SIZE]),
     "doubtful": lambda world: world.runs(DOUBTFUL),
+    "three-shots": lambda world: world.runs(DOUBTFUL, TRUSTED, DOUBTFUL),
     "check-run-doubtful": lambda world: world.answer("check-run", RunCheck(DOUBTFUL, ("pairs are not judged",))),
     "check-run-unknown": lambda world: world.answer("check-run", RunCheck(replace(DOUBTFUL, residual_ratio=None), ())),
     "warm": lambda world: world.answer("warm-up", 31.4),
