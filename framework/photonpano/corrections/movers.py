@@ -47,7 +47,9 @@ _SURE = 6.0  # standard deviations by which a patch hides the background
 _APART = 9.0  # mean square of the residuals of a patch that does not follow the motion, in variances
 _FEWEST = 4  # squares of a patch that are sure
 _ROUNDS, _TINY = 4, 1e-6  # of the fit of light and shift
-_CHANGING, _FEWEST_SEEN = 6.0, 8  # mean square, in variances, of a place that has no usual brightness, and times it was seen
+# Mean square of places that have no usual brightness, relative to the median place, and times that they were seen. What errors
+# of the motion change is thin: the mean is over this side, in squares. The least mean square of a place, in variances.
+_CHANGING, _FEWEST_SEEN, _TOGETHER, _STEADY = 3.0, 8, 5, 0.6
 _SMOOTH = 5  # sums over which deviations are averaged where the background was never seen
 _LEAST_HIDDEN = 0.25  # share of the sums that are taken for the background there
 
@@ -244,12 +246,18 @@ def _deviation(squares: FluxImage, known: BoolArray) -> FluxImage:
 
 
 def _changing(squares: FluxImage, shown: BoolArray) -> BoolArray:
-    """Return the places that change even where no patch hides them, as where something is most of the time: (h, w)."""
+    """Return the places that change even where no patch hides them, as where something near shifts all the time: (h, w)."""
     number = shown.sum(axis=0)
+    known = np.asarray(number >= _FEWEST_SEEN)
+    if not known.any():
+        return known
     mean = np.where(shown, squares, 0).sum(axis=0) / np.maximum(number, 1)
-    changing = (mean > _CHANGING) & (number >= _FEWEST_SEEN)
-    thick = cv2.morphologyEx(changing.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    return cv2.dilate(thick, np.ones((3, 3), np.uint8)) > 0
+    side = (_TOGETHER, _TOGETHER)
+    total, there = (
+        cv2.boxFilter(each, -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for each in (np.where(known, mean, 0).astype(np.float64), known.astype(np.float64))
+    )
+    return np.asarray(known & (total > _CHANGING * max(float(np.median(mean[known])), _STEADY) * there))
 
 
 def _patches(deviation: FluxImage, known: BoolArray, tolerance: _Tolerance) -> BoolArray:

@@ -30,7 +30,8 @@ START = "start"  # name of the decision on the initial motion
 def estimate(plan: Plan, source: Source, journal: list[Decision], context: Context) -> State:
     """Estimate the motion of a capture, and correct the lens, shading, flicker and cuts that its own frames show.
 
-    `journal` receives the decisions, in the order in which components and passes take them. For errors, see `run`.
+    `journal` receives the decisions: first those of components, then those of passes that hold at the end. For errors, see
+    `run`.
     """
     require_centre(plan, source)
     timeline, found = timeline_of(source, context), len(journal)
@@ -67,9 +68,8 @@ def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decisio
         passes.cut_at_jumps,
     )
     for each in tried:
-        n_decisions, state = len(state.decisions), passes.tried(state, each).state
-        journal += state.decisions[n_decisions:]
-    journal += [*state.timeline.decisions, *_model_decisions(plan, state.results)]
+        state = passes.tried(state, each).state
+    journal += [*state.decisions, *state.timeline.decisions, *_model_decisions(plan, state.results)]
     return state
 
 

@@ -14,6 +14,7 @@ from photonpano.capture import before, capture_of, leaving_out
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
 from photonpano.corrections.lighting import (
+    LIGHT_DECISION,
     corrected_light,
     decision_of,
     find_light,
@@ -261,13 +262,14 @@ def again_without_movers(state: State) -> Proposal | None:
 
 
 def _in_lamps(state: State) -> State:
-    """Return the state in the light that lamps, if there are any, shed on the background that is known now."""
+    """Return the state in the light that lamps, if any flicker, shed on the background that is known now."""
     light = light_of(state.source)
-    if light is None or not light.has_lamps:
+    if light is None or not light.frequency:
         return state
-    unlit = leaving_out(replace(capture_of(state.view.source), light=None), light.shown)
-    found = measure_light(unlit, state.trajectory, state.context)
-    return replace(state, source=in_light(state.source, found), context=within(state.context, found))
+    found = measure_light(_in_steady_light(state.view.source), state.trajectory, state.context)
+    if not found.has_lamps:
+        return state
+    return state.corrected(in_light(state.source, found), found, decision_of(found, state.source.info.frame_rate_hz))
 
 
 def cut_at_jumps(state: State) -> Proposal | None:
@@ -301,10 +303,23 @@ def cut_at_jumps(state: State) -> Proposal | None:
 
 
 def _located_anew(state: State) -> State:
-    """Locate all levels; what hides the background is found anew, since that was done along another motion."""
-    if capture_of(state.source).background is None:
+    """Locate all levels; light, and what hides the background, are found anew, since that was done along another motion."""
+    capture = capture_of(state.source)
+    changing = any(each.what == LIGHT_DECISION for each in state.decisions)
+    if capture.background is None and not changing:
         return state.located(state.levels, state.start)
-    anew = replace(state, source=before(state.source, None), watched=False).located(state.levels[:1], state.start)
-    for each in (without_movers, partial(later_levels, journal=[]), again_without_movers):
+    anew = replace(state, source=before(state.source, None), watched=False)
+    if changing:
+        decisions = tuple(each for each in state.decisions if each.what != LIGHT_DECISION)
+        anew = replace(anew, source=_in_steady_light(anew.source), decisions=decisions)
+    anew = anew.located(state.levels[:1], state.start)
+    light_again = (in_changing_light,) if changing else ()
+    for each in (without_movers, *light_again, partial(later_levels, journal=[]), again_without_movers):
         anew = tried(anew, each).state
     return anew
+
+
+def _in_steady_light(source: Source) -> Source:
+    """Return a capture as if its light were steady; frames that were left out stay so."""
+    light = light_of(source)
+    return source if light is None else leaving_out(replace(capture_of(source), light=None), light.shown)

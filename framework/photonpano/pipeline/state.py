@@ -83,8 +83,12 @@ class State:
         return replace(again, refined=None, known_fit=None)
 
     def corrected(self, source: Source, correction: Vignette | Light, decision: Decision) -> State:
-        """Return the state of a capture with one more correction, on which its checkpoints then depend."""
-        context, decisions = within(self.context, correction), (*self.decisions, decision)
+        """Return the state of a capture with one more correction, on which its checkpoints then depend.
+
+        It replaces an earlier one of the same name.
+        """
+        others = (each for each in self.decisions if each.what != decision.what)
+        context, decisions = within(self.context, correction), (*others, decision)
         return replace(self, source=source, context=context, outdated=True, decisions=decisions)
 
     @property

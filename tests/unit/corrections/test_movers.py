@@ -97,6 +97,26 @@ def test_places_that_something_hides_most_of_the_time_are_not_taken_for_backgrou
     assert shares(exact, frames, speed=0.02)[0] > 0.9
 
 
+def test_what_stands_near_and_shifts_all_the_time_is_hidden_along_an_exact_motion() -> None:
+    """Of a low contrast, it looks like the background at any instant; the place changes over time, in patches."""
+    scene, near, rng = Scene(0, (0.1, 0.5)), Scene(1, (0.15, 0.45)), np.random.default_rng(0)
+    frames = np.empty((N, *SHAPE), np.uint8)
+    standing = np.zeros((N, *SHAPE), bool)
+    for first in range(0, N, 8):
+        motion = MOTION.at([first + 3.5])[0]
+        view = scene.view(motion, SHAPE).copy()
+        left = 80 - round(motion[0, 2])
+        square = slice(24, 72), slice(max(left, 0), max(left + 48, 0))
+        view[square] = near.view(motion @ translation(first / 80, 0), SHAPE)[square]
+        standing[first : first + 8][:, *square] = True
+        frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-view)
+    found = find_background(MemorySource(frames), MOTION, None, ALL, Context(1), exact=True)
+    assert found is not None
+    hidden = [found.pixels(FrameSpan(frame, frame + 1)) == 0 for frame in range(100, 1500, 100)]
+    assert np.mean([each[there].mean() for each, there in zip(hidden, standing[100:1500:100], strict=True)]) > 0.7
+    assert np.mean([each[~there].mean() for each, there in zip(hidden, standing[100:1500:100], strict=True)]) < 0.2
+
+
 def test_the_merged_background_is_that_without_the_walker() -> None:
     found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
     assert found is not None
