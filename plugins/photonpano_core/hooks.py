@@ -77,6 +77,7 @@ def photonpano_mergers() -> Iterator[MergerContribution]:
         summary="Maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
         config=configs.PhotonMleConfig,
         build=lambda config, context: plugin.PhotonMleMerger(config, context.decide),
+        leaves_out_movers=True,
     )
     yield MergerContribution(
         name="splat",

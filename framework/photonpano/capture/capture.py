@@ -142,6 +142,11 @@ class Capture(Closing):
         """Return the spans that hold no frame that is left out, such as one without light: its gain is 0."""
         return [span for span in spans if self.light is None or self.light.shown[span.start : span.stop].all()]
 
+    def masking_movers(self, span: FrameSpan) -> Capture:
+        """Return the capture with a mask of the pixels in which something hides the background at any time of a span."""
+        shown = None if self.background is None else self.background.pixels(span)
+        return self if shown is None else replace(self, valid=self.valid & (shown > 0), background=None)
+
     def weights(self) -> FluxImage:
         """Return the statistical weight of a frame of each pixel: (H, W) float32, 1 for an ordinary pixel."""
         return np.ones(self.info.frame_shape, np.float32) if self.weight is None else self.weight

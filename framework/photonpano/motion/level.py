@@ -9,6 +9,7 @@ from typing import Any, NewType
 
 import numpy as np
 
+from photonpano.capture import capture_of
 from photonpano.contracts.loop import EXPOSURE, Asked
 from photonpano.contracts.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler, Source, Trajectory
 from photonpano.contracts.rules import attributing
@@ -74,11 +75,12 @@ class Level:
     # who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0"
     origins: Mapping[str, str]
     recorder: Recorder = field(default_factory=Recorder)  # records what they decide
+    leaves_out_movers: bool = False  # whether the merger does: see `MergerContribution`
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave out what only the process of the loop needs: the resampler and the interpolator."""
         components = None, self.merger, self.locators, None
-        return Level, (self.number, self.scale, *components, self.origins, self.recorder)
+        return Level, (self.number, self.scale, *components, self.origins, self.recorder, self.leaves_out_movers)
 
     def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:
         """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator: `attributing`."""
@@ -139,7 +141,8 @@ class VirtualExposures:
         Raises:
             PluginError: the merger failed, or returned anything but an exposure of the group at the level's scale.
         """
-        level = self.level
+        level, group = self.level, self.groups[index]
+        source = self.source if level.leaves_out_movers else capture_of(self.source).masking_movers(group.span)
         with (clock or self.clock)("merge"), level.attributing("merger"):
-            exposure = level.merger.merge(self.source, self.groups[index], self.previous or self.start, level.scale)
-            return EXPOSURE.require(exposure, Asked(self.groups[index], level.scale, self.frame_shape))
+            exposure = level.merger.merge(source, group, self.previous or self.start, level.scale)
+            return EXPOSURE.require(exposure, Asked(group, level.scale, self.frame_shape))

@@ -21,6 +21,7 @@ from photonpano.execution.threads import in_order, thread_count
 from photonpano.motion.level import Level, NamedLocator, Recorder
 from photonpano.plugins.contributions import (
     ExecutorContext,
+    MergerContribution,
     PartOfCapture,
     SourceContext,
     StageContext,
@@ -142,6 +143,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
             component(level.interpolate),
             {choice.contribution.kind: choice.label for choice in (level.resample, level.merge, level.interpolate)},
             recorder,
+            isinstance(level.merge.contribution, MergerContribution) and level.merge.contribution.leaves_out_movers,
         )
         for number, level in enumerate(plan.levels, start=1)
     )

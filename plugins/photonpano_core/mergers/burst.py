@@ -153,9 +153,10 @@ def wiener_mean(counts: Image, weight: Image, reference: int, response: Response
     """Merge sums of blocks of patches, (K, rows, columns, side, side), in the frequency domain to mean counts of a frame.
 
     D is the difference of a frequency of a block from that of the reference block, and s^2 the variance of D from photon noise.
-    The block is replaced by the reference by the share `|D|^2 / (|D|^2 + 8 s^2)`.
+    The block is replaced by the reference by the share `|D|^2 / (|D|^2 + 8 s^2)`. Where that is masked, it is the mean of all.
     """
-    fixed = _mean(counts[reference], weight[reference], np.float32(0))
+    unseen = _mean(counts.sum(axis=0), weight.sum(axis=0), np.float32(0))
+    fixed = _mean(counts[reference], weight[reference], unseen)
     frames = weight.mean(axis=(-2, -1))
     noise = count_variance(fixed.mean(axis=(-2, -1)), response)
     own = fft.rfft2(fixed)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, InputError
+from photonpano import FrameSpan, Group, InputError, Source, parse_spec
 from photonpano.capture import before, capture_of
 from photonpano.corrections.movers import (
     before_background_of,
@@ -16,8 +16,11 @@ from photonpano.corrections.movers import (
     write_background,
 )
 from photonpano.execution.context import Context
+from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import PATCHES, Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging import accumulate, chunks_of
+from photonpano.motion.level import VirtualExposures
+from photonpano.pipeline.components import build_levels
 from photonpano.testing import KnownMotion, MemorySource, Scene
 
 SHAPE, N = (96, 128), 1600
@@ -131,6 +134,25 @@ def test_the_merged_background_is_that_without_the_walker() -> None:
     ghost, clean = (flux(source) - true for source in (panned(with_mover=True), before(panned(with_mover=True), found)))
     assert np.nanmax(np.abs(ghost)) > 0.2
     assert np.sqrt(np.nanmean(clean**2)) < 0.25 * np.sqrt(np.nanmean(ghost**2))
+
+
+@pytest.mark.parametrize("merger", ["photon-mle", "splat", "burst", "local-flow"])
+def test_exposures_of_any_merger_show_the_background_alone(merger: str) -> None:
+    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
+    assert found is not None
+    group = Group(FrameSpan(700, 860), 779.5)
+
+    def flux(source: Source) -> np.ndarray:
+        spec = {"version": 1, "source": {"use": "simulator"}, "levels": [{"merge": {"use": merger}}]}
+        (level,) = build_levels(parse_spec(spec), source, [])
+        return VirtualExposures(level, source, [group], MOTION, Stopwatch(1)).merged(0).flux
+
+    ghost, clean, background = map(
+        flux, (panned(with_mover=True), before(panned(with_mover=True), found), before(panned(with_mover=False), found))
+    )
+    assert np.isfinite(clean).mean() > 0.7
+    assert np.nanmax(np.abs(ghost - background)) > 0.2
+    np.testing.assert_allclose(clean, background, atol=1e-6)
 
 
 def test_every_place_that_was_seen_is_in_the_panorama() -> None:
