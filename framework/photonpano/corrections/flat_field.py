@@ -168,7 +168,8 @@ class _Seen:
 
     @classmethod
     def of(cls, capture: Capture, span: FrameSpan, trajectory: Trajectory) -> _Seen:
-        counts, valid = capture.corrected_counts(span) * capture.valid, capture.valid
+        valid = capture.masking_movers(span).valid
+        counts = capture.corrected_counts(span) * valid
         photons, area = (sums_of_blocks(np.asarray(each, float), _CELL_PX) for each in (counts, valid))
         seen = (area == _CELL_PX**2) & (photons > 0)
         distance, (rows, columns) = _distances(capture.info.frame_shape, _CELL_PX)[seen], np.nonzero(seen)

@@ -60,7 +60,6 @@ def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decisio
     tried: tuple[passes.Pass, ...] = (
         passes.through_found_lens,
         passes.without_shading,
-        passes.without_movers,
         passes.in_changing_light,
         partial(passes.later_levels, journal=journal),
         *[passes.through_found_lens] * _MOST_LENSES,

@@ -115,17 +115,29 @@ def through_found_lens(state: State) -> Proposal | None:
 
 
 def without_shading(state: State) -> Proposal | None:
-    """Divide the capture by the flat field that its spec asks for, or by its vignette.
+    """Divide the capture by the flat field that its spec asks for, or by its vignette; leave out what hides the background.
 
-    Raises `InputError` if the motion does not separate a flat field from the scene.
+    Shading hides what moves, and what moves looks like shading: the vignette is measured again on the background alone. Raises
+    `InputError` if the motion does not separate a flat field from the scene.
     """
     plan, source = state.plan, state.view.source
     asked = any(isinstance(each, FlatField) for each in plan.corrections)
     found = _flat_field(state) if asked else vignette_of(plan, source, state.trajectory)
     if found is None:
-        return None
-    divided = state.corrected(divided_by(state.source, found), found, found.decision)
-    return Proposal(lambda: replace(divided, vignette=found), worse=None)
+        return without_movers(state)
+
+    def divided(by: Vignette) -> State:
+        corrected = state.corrected(divided_by(state.source, by), by, by.decision)
+        return tried(replace(corrected, vignette=by), without_movers).state
+
+    def make() -> State:
+        first = divided(found)
+        if asked or (background := capture_of(first.source).background) is None:
+            return first
+        again = vignette_of(plan, before(source, background), state.trajectory)
+        return first if again is None else divided(again)
+
+    return Proposal(make, worse=None)
 
 
 def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:

@@ -8,6 +8,7 @@ import pytest
 
 from photonpano import FrameSpan, Group, InputError, Source, parse_spec
 from photonpano.capture import before, capture_of
+from photonpano.corrections import estimate_vignette
 from photonpano.corrections.movers import (
     before_background_of,
     decision_of,
@@ -153,6 +154,23 @@ def test_exposures_of_any_merger_show_the_background_alone(merger: str) -> None:
     assert np.isfinite(clean).mean() > 0.7
     assert np.nanmax(np.abs(ghost - background)) > 0.2
     np.testing.assert_allclose(clean, background, atol=1e-6)
+
+
+def test_the_vignette_is_that_of_the_background_without_the_walker() -> None:
+    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
+    assert found is not None
+    y, x = np.indices(SHAPE)
+    gain = 1 - 0.3 * ((y - 47.5) ** 2 + (x - 63.5) ** 2) / (47.5**2 + 63.5**2)
+    passed = np.random.default_rng(1).random((N, *SHAPE), np.float32) < gain
+    plain, walked = (MemorySource(panned(with_mover=each).frames(ALL) * passed) for each in (False, True))
+
+    def corner(source: Source) -> float:
+        vignette = estimate_vignette(source, MOTION)
+        assert vignette is not None
+        return float(vignette.gain[0, 0])
+
+    assert abs(corner(walked) - corner(plain)) > 0.1
+    assert abs(corner(before(walked, found)) - corner(plain)) < 0.03
 
 
 def test_every_place_that_was_seen_is_in_the_panorama() -> None:
