@@ -17,6 +17,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -24,9 +25,18 @@ from typing import Any
 
 import cv2
 import numpy as np
-from harness import Study, chosen, command, simulator
+from harness import Study, chosen, command, packed, rendered, simulator
 from harness import table as table_of
 from trust import is_honest, reasons, scored, status
+
+from photonpano import evaluate, load_panorama, open_source, parse_spec
+from photonpano.api.opened_run import opened_run
+from photonpano.capture import before, capture_of
+from photonpano.capture.writing import truth_path
+from photonpano.corrections import divided_by, estimate_vignette
+from photonpano.corrections.moments import showing
+from photonpano.evaluation import image_score, load_run_trajectory, load_truth, true_panorama, white_flux
+from photonpano.geometry import FrameTrajectory
 
 SHAPE, HEIGHT = (254, 496), 900
 BASE: dict[str, Any] = {
@@ -100,7 +110,8 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "sensor, tremor, lamps, street 4": (TREMOR, FAULTY | LAMPS | street(4)),
 }
 """Of each capture by its name: keys of the path, and others."""
-HEAD = ("Capture", "Mean (max)", "Claimed", "Within 2 / 3", "Located", "Cuts", "Honest", "CPU s", "Says")
+FEWEST_FRAMES = 20  # that show the background of a place where ghosts are looked for
+HEAD = ("Capture", "Mean (max)", "Claimed", "Within 2 / 3", "Located", "Cuts", "Ghosts", "Honest", "CPU s", "Says")
 
 
 def settings(name: str, photographs: Path) -> dict[str, Any]:
@@ -116,8 +127,32 @@ def settings(name: str, photographs: Path) -> dict[str, Any]:
 
 def measured(name: str, photographs: Path, frames: int, captures: Path) -> dict[str, Any]:
     """Simulate a capture if it is not there, run it, and return the scores."""
-    cube = Study(captures).capture(name.replace(",", ""), simulator(**settings(name, photographs), n_frames=frames))
-    return {"row": name, "frames": frames, **scored(cube)}
+    study, given = Study(captures), settings(name, photographs) | {"n_frames": frames}
+    cube = study.capture(name.replace(",", ""), simulator(**given))
+    bare = {key: value for key, value in given.items() if key not in ("people", "clutter")}
+    if bare == given:
+        return {"row": name, "frames": frames, **scored(cube)}
+    return {"row": name, "frames": frames, **scored(cube, partial(ghosts, cube, study.capture("bare", simulator(**bare))))}
+
+
+def ghosts(cube: Path, bare: Path, folder: Path) -> dict[str, float]:
+    """Return by how many dB the panorama is worse than that of the capture of the background alone, where the run has seen it.
+
+    The same photons are left out of both, and both have the motion of the run.
+    """
+    found, truth, panorama = load_run_trajectory(folder), load_truth(truth_path(cube)), load_panorama(folder)
+    canvas, motion = found.canvas_of(panorama.flux.shape[:2]), FrameTrajectory(found.homographies)
+    with opened_run(folder) as run, open_source(parse_spec(packed(bare, corrections=[]))) as other:
+        alone = replace(capture_of(run.source), steps=capture_of(run.capture).steps, source=capture_of(other).source)
+        vignette = estimate_vignette(before(alone, None), motion)
+        shown, _ = showing(alone if vignette is None else divided_by(alone, vignette), motion, found.camera, "hide")
+        oracle, seen = rendered(shown, motion, canvas), rendered(run.source, motion, canvas).weight >= FEWEST_FRAMES
+    around = truth.turn if truth.around else None
+    alignment = evaluate(folder, truth_path(cube), oracle=False).trajectory.alignment
+    assert truth.scene is not None
+    scene = true_panorama(truth.scene, canvas, alignment, None if around is None else around.camera.matrix)
+    best, own = (image_score(each.flux, scene, seen, white_flux(truth.scene)).psnr_db for each in (oracle, panorama))
+    return {"ghosts_db": best - own}
 
 
 def row(result: dict[str, Any]) -> Iterator[str]:
@@ -128,8 +163,9 @@ def row(result: dict[str, Any]) -> Iterator[str]:
         yield f"{result['std_px']:.3f}"
         yield f"{result['within_2']:.0%} / {result['within_3']:.0%}"
         yield from (f"{result['located']:.0%}", str(result["cuts"]))
+        yield f"{result['ghosts_db']:.2f} dB" if "ghosts_db" in result else "-"
     else:
-        yield from "-----"
+        yield from "------"
     yield "yes" if is_honest(result) else "no"
     yield f"{result['cpu_s']:.0f}"
     yield ": ".join([status(result), *(reason.splitlines()[0] for reason in reasons(result)[:1])])

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -177,8 +177,8 @@ def figures_of_run(folder: Path, truth: Truth) -> Result:
     return figures_of(estimated | {"homographies": found.homographies @ lens}, truth)
 
 
-def scored(cube: Path) -> Result:
-    """Run a capture with a source alone, and one thread; return its scores, or why there are none."""
+def scored(cube: Path, more: Callable[[Path], Result] = lambda _: {}) -> Result:
+    """Run a capture with a source alone, and one thread; return its scores, and more of its folder, or why there are none."""
     result: Result = {"exit_code": 0, "message": "", "verdict": None}
     with passing() as study:
         start = time.process_time()
@@ -191,7 +191,7 @@ def scored(cube: Path) -> Result:
         record = record_of(folder)
         result |= {"verdict": record.get("verdict"), "warnings": list(record["warnings"]), "decisions": record["decisions"]}
         result["cuts"] = sum(each["what"] == "cut" for each in record["decisions"])
-        return result | figures_of_run(folder, load_truth(truth_path(cube)))
+        return result | figures_of_run(folder, load_truth(truth_path(cube))) | more(folder)
 
 
 def status(result: Result) -> str:
