@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ from photonpano.values import BoolArray, Edge, FloatArray, Located
 
 # Share of the patches that contradict a camera that only turns, above which they are told from the background.
 _CONTRADICTED = 0.005
+_HELD = 3.0  # expected errors by which k1 may differ from what is given, to be held while the focal length is free
 _FEWEST_NODES = 12  # of which pairs tell what is the background over time
 
 
@@ -52,6 +53,15 @@ class GraphOptions(Protocol):
     @property
     def disconnected(self) -> Literal["error", "largest"]:
         """Whether a graph that falls apart is an error, or its largest part is used."""
+
+
+class Freed(NamedTuple):
+    """What edges show of the camera where a number that is given is free."""
+
+    number: int  # which: 0 for the focal length in px, 1 for k1
+    given: float
+    found: float
+    std: float  # expected error of what was found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,6 +87,8 @@ class GraphSolution:
     # (N, P) how far patches of each node lie from where the motion lets expect them, as mean squares in variances, 1 for noise;
     # 0 where nothing is known, and None where patches do not contradict the motion
     layers: FloatArray | None = None
+    # returns what of a given camera the edges contradict most; None where nothing is given, and for homographies
+    freed: Callable[[], Freed | None] = lambda: None
 
 
 def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
@@ -189,6 +201,26 @@ def _compared(tied: _Tied, start: FloatArray | None, model: MotionModel, fit: _F
     return Evidence.of(_costs({model: fit, HOMOGRAPHIES: free}))
 
 
+def _freed(tied: _Tied, model: MotionModel, fit: _Fit) -> Freed | None:
+    """Return what edges contradict most, the focal length or k1; None where the model gives neither.
+
+    Where k1 is as it was given, it is held, since the two depend on each other.
+    """
+    if not isinstance(fit.state, Rotations) or (model.focal_px is None and not model.distortion[0]):
+        return None
+    given = fit.state.camera.numbers
+    for free in ({0, 1}, {0}):
+        adjustment = RotationAdjustment(tied.problem, model.seen_by(tied.frame_shape), tuple(sorted(free.union(model.unknown))))
+        freed = tied.fit(adjustment, fit.state)
+        found, stds = freed.state.camera.numbers, adjustment.assess(freed.state, freed.norms, freed.kept).std_camera
+        tested = (stds > 0) & ~np.isin(np.arange(5), model.unknown)
+        away = np.divide(np.abs(found - given), stds, out=np.zeros(5), where=tested)
+        if away[1] > _HELD:
+            break
+    number = int(away.argmax())
+    return Freed(number, given[number], found[number], stds[number])
+
+
 def _costs(fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, Cost]:
     """Return the costs of models for the edges that the one with most unknowns keeps."""
     richest = max(fits.values(), key=lambda fit: fit.adjustment.unknowns)
@@ -296,7 +328,8 @@ class _Tied:
         outliers = tuple(int(position) for position in self.positions[~fit.kept])
         assess = partial(adjustment.assess, found, fit.norms, fit.kept)
         rotations = found if isinstance(found, Rotations) else None
-        return GraphSolution(homographies, self.located, outliers, residual_px, assess, model, rotations, compare, self.layers)
+        left, freed = (self.layers,), partial(_freed, self, model, fit)
+        return GraphSolution(homographies, self.located, outliers, residual_px, assess, model, rotations, compare, *left, freed)
 
     def alone(self, model: MotionModel) -> GraphSolution:
         """Return the solution of a single node."""

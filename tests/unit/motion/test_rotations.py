@@ -206,6 +206,30 @@ def test_patches_without_a_lens_show_none() -> None:
     assert solution.model.name == "rotation"
 
 
+@pytest.mark.parametrize(
+    ("given", "contradicted"),
+    [((330.0, -0.1), None), ((331.0, -0.1), None), ((337.0, -0.1), 0), ((330.0, -0.08), 1), ((330.0, 0.0), 1)],
+)
+def test_pairs_contradict_a_focal_length_or_a_lens_that_is_wrong(given: tuple[float, float], contradicted: int | None) -> None:
+    """A wrong lens does not pass for a wrong focal length, with which the best one with that lens is many px too large."""
+    focal_px, k1 = given
+    true, seen_by = Camera.of(330.0, SHAPE, LENS), Camera.of(focal_px, SHAPE, (k1, 0, 0, 0))
+    model = MotionModel("rotation", focal_px, distortion=(k1, 0.0, 0.0, 0.0))
+    solution = solve(20, bent(turn(20, 60.0), true, seen_by), 10, SHAPE, model=model)
+    assert solution.rotations is not None
+    np.testing.assert_array_equal(solution.rotations.camera.numbers[:2], given)
+    freed = solution.freed()
+    assert freed is not None
+    assert freed.given == given[freed.number]
+    assert abs(freed.found - true.numbers[freed.number]) < 4 * freed.std
+    assert (freed.number if abs(freed.found - freed.given) > 10 * freed.std else None) == contradicted
+
+
+@pytest.mark.parametrize("model", [MotionModel("rotation"), MotionModel("rotation", distortion=(None, 0.0, 0.0, 0.0))])
+def test_pairs_contradict_nothing_where_the_camera_is_found(model: MotionModel) -> None:
+    assert solve(20, edges_of(turn(20, 60.0), np.random.default_rng(0)), 10, SHAPE, model=model).freed() is None
+
+
 def test_patches_that_move_by_themselves_do_not_bend_the_lens() -> None:
     """A quarter of the frame moves by 3 px in each pair, as a person who walks."""
     camera, assumed = Camera.of(330.0, SHAPE, (-0.11, 0.03, 0, 0)), Camera.of(333.0, SHAPE, NEAR)

@@ -12,6 +12,7 @@ from photonpano import FrameSpan
 from photonpano.geometry import Canvas, FrameTrajectory
 from photonpano.motion.evidence import Evidence, Rival
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.graph import Freed
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, V, n_blocks
@@ -239,11 +240,13 @@ def level_with(
     evidence: Evidence | None = None,
     n_ambiguous: int = 0,
     motion: Located = UNINFORMED,
+    **of_solution: object,
 ) -> Any:
     """A level of 30 pairs."""
     pairs = tuple((index + 1, index) for index in range(n_ambiguous))
     ambiguity = Ambiguity(1, pairs, 40.0) if pairs else None
-    solution = SimpleNamespace(rotations=rotations, outliers=(), model=MotionModel("rotation"))
+    known = {"rotations": rotations, "outliers": (), "model": MotionModel("rotation"), "freed": lambda: None}
+    solution = SimpleNamespace(**known | of_solution)
     edges = (Edge(1, 0, motion),) * 30
     located = SimpleNamespace(ambiguity=ambiguity, evidence=evidence, edges=edges, solution=solution, frame_shape=SHAPE)
     return SimpleNamespace(level=SimpleNamespace(number=1), located=located)
@@ -264,6 +267,22 @@ def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained, what
     """A thing that fills the middle of all frames passes for the scene, and what is seen beside it for what hides that."""
     found = [judge(explained, (), [Decision(what, share, "")]).reasons for share in (most - 0.02, most + 0.02)]
     assert [[reason.figure for reason in reasons] for reasons in found] == [[], [most + 0.02]]
+
+
+@pytest.mark.parametrize(
+    ("freed", "says"),
+    [
+        (None, None),
+        (Freed(0, 330.0, 331.8, 0.2), None),
+        (Freed(0, 500.0, 431.21, 2.0), "a focal length of 431.2 ± 2 px fits, 500 px is given; in expected errors"),
+        (Freed(1, -0.1, -0.0481, 0.004), "k1 of -0.0481 ± 0.004 fits, -0.1 is given; in expected errors"),
+    ],
+)
+def test_camera_that_pairs_contradict_by_ten_expected_errors_is_doubtful(
+    explained: Explained, freed: Freed | None, says: str | None
+) -> None:
+    reasons = judge(explained, [level_with(freed=lambda: freed)]).reasons
+    assert [reason.where for reason in reasons] == ([] if says is None else [says])
 
 
 @pytest.mark.parametrize(("along", "doubtful"), [(6.0, True), (1.5, False), (0.1, False)])
