@@ -22,6 +22,7 @@ from photonpano.errors import InputError
 from photonpano.execution.context import Context
 from photonpano.geometry import PATCHES, Camera, Canvas
 from photonpano.merging import Chunk, accumulate, binned_mean
+from photonpano.motion.consensus import APART
 from photonpano.robust import cauchy_weights, robust_std
 from photonpano.values import CELL_PX, Background, BoolArray, Decision, FloatArray, FluxImage, FrameSpan, Homography
 
@@ -44,7 +45,6 @@ _UNEVEN = 0.02  # share of their brightness that squares may differ by beyond ph
 _MEDIAN = 0.455  # the median of the square of a Gaussian number of unit variance
 _AROUND = np.ones((3, 3))  # squares that are tested together
 _SURE = 6.0  # standard deviations by which a patch hides the background
-_APART = 9.0  # mean square of the residuals of a patch that does not follow the motion, in variances
 _FEWEST = 4  # squares of a patch that are sure
 _ROUNDS, _TINY = 4, 1e-6  # of the fit of light and shift
 # Mean square of places that have no usual brightness, relative to the median place, and times that they were seen. What errors
@@ -147,7 +147,7 @@ def without_layers(
 
     Given are, at N instants, the mean squares of the residuals of patches, (N, P): see `GraphSolution`.
     """
-    apart = (layers > _APART).reshape(len(layers), PATCHES, PATCHES)
+    apart = (layers > APART).reshape(len(layers), PATCHES, PATCHES)
     if not apart.any():
         return background
     around = maximum_filter1d(apart, 3, axis=0, mode="nearest")

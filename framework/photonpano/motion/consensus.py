@@ -20,6 +20,7 @@ _FEWEST = 8.0  # patches, by their weights, that determine the motion of a pair
 _UNCERTAIN = 1e-4  # factor of the information of a pair that has fewer
 _FAR, _FAR_PX = 4.0, 0.5  # standard deviations, and px, beyond which a patch contradicts a motion
 _ALIKE_PX = 0.1  # error of patches beside photon noise
+APART = 9.0  # mean square of the residuals of a patch that does not follow the motion, in variances
 _DAMPING, _TINY = 1e-6, 1e-12
 
 
@@ -70,6 +71,18 @@ def layers(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: Fl
             )
             numbers[moving, seen] += 1
     return np.asarray(squares / np.maximum(numbers, 1))
+
+
+def travelled(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: FloatArray, layers: FloatArray) -> float:
+    """Return how far what does not follow the camera moves beside the background from the first node to the last, px."""
+    steps = []
+    for (moving, fixed), motion, left in zip(pairs, motions, residuals, strict=True):
+        apart = layers[moving] > APART
+        if motion.patches is not None and (apart := apart & (motion.patches.information[:, 0, 0] > 0)).sum() >= _FEWEST:
+            noise = np.trace(_covariances(motion.patches.information[apart]), axis1=1, axis2=2)
+            sizes = np.sqrt(np.maximum((left[apart] ** 2).sum(axis=-1) - noise, 0))
+            steps.append(float(np.median(sizes)) / abs(moving - fixed))
+    return float(np.median(steps)) * (len(layers) - 1) if steps else 0.0
 
 
 def _by_patches(motion: Located, weights: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> Located:

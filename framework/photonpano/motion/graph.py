@@ -25,7 +25,7 @@ from photonpano.geometry import (
     scaled_ahead,
 )
 from photonpano.motion.adjustment import OUTLIER, Adjustment, Assessment, Cost, Problem
-from photonpano.motion.consensus import TOLERANCES_PX, agreeing, contradicting, layers
+from photonpano.motion.consensus import TOLERANCES_PX, agreeing, contradicting, layers, travelled
 from photonpano.motion.evidence import Evidence, likeliest
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
@@ -87,6 +87,8 @@ class GraphSolution:
     # (N, P) how far patches of each node lie from where the motion lets expect them, as mean squares in variances, 1 for noise;
     # 0 where nothing is known, and None where patches do not contradict the motion
     layers: FloatArray | None = None
+    # angle by which what does not follow the motion passes the background: the way of the camera over its distance, if it rests
+    parallax: float = 0.0
     # returns what of a given camera the edges contradict most; None where nothing is given, and for homographies
     freed: Callable[[], Freed | None] = lambda: None
 
@@ -164,7 +166,8 @@ def _of_background(
         except (ValueError, np.linalg.LinAlgError):
             return tied, fits  # too few patches agree
     found = layers(tied.pairs, tied.motions, first.beside(fit.state), len(tied.located))
-    background = replace(background, layers=found)
+    parallax = travelled(tied.pairs, tied.motions, first.beside(fit.state), found) / fit.state.camera.focal_px
+    background = replace(background, layers=found, parallax=parallax)
     others = [model for model in fits if model is not turning]
     return background, {model: _fitted(background, start, model) for model in others} | {turning: fit}
 
@@ -268,6 +271,7 @@ class _Tied:
     motions: Sequence[Located]  # their motions
     frame_shape: tuple[int, int]  # (height, width) of a frame
     layers: FloatArray | None = None  # see `GraphSolution`
+    parallax: float = 0.0
 
     @classmethod
     def of(cls, n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> _Tied:
@@ -328,7 +332,7 @@ class _Tied:
         outliers = tuple(int(position) for position in self.positions[~fit.kept])
         assess = partial(adjustment.assess, found, fit.norms, fit.kept)
         rotations = found if isinstance(found, Rotations) else None
-        left, freed = (self.layers,), partial(_freed, self, model, fit)
+        left, freed = (self.layers, self.parallax), partial(_freed, self, model, fit)
         return GraphSolution(homographies, self.located, outliers, residual_px, assess, model, rotations, compare, *left, freed)
 
     def alone(self, model: MotionModel) -> GraphSolution:

@@ -366,7 +366,12 @@ def _standing(run: _Run) -> _Found | None:
     "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
 )
 def _layers(run: _Run) -> _Found | None:
-    return run.decided("movers", "share of the frames that is left out, on average")
+    # Later levels leave out what is near.
+    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
+    where = "share of the frames that is left out, on average"
+    if parallax:
+        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
+    return run.decided("movers", where)
 
 
 @_doubtful_above(

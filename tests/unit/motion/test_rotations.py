@@ -263,6 +263,7 @@ def test_pairs_follow_the_background_behind_things_that_are_near() -> None:
     true = camera.homographies(rotations[8].T @ rotations)
     away = corner_displacements(np.linalg.inv(true) @ solution.homographies, np.eye(3), SHAPE)
     assert away.mean() < 0.15
+    assert solution.parallax == pytest.approx(15 * 0.8 / 430, rel=0.2)
     without = [replace(each, motion=replace(each.motion, patches=None)) for each in edges]
     pulled = solve(16, without, 8, SHAPE, model=MotionModel("rotation", focal_px=430.0)).homographies
     assert corner_displacements(np.linalg.inv(true) @ pulled, np.eye(3), SHAPE).mean() > 1

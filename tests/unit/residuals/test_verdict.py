@@ -245,7 +245,7 @@ def level_with(
     """A level of 30 pairs."""
     pairs = tuple((index + 1, index) for index in range(n_ambiguous))
     ambiguity = Ambiguity(1, pairs, 40.0) if pairs else None
-    known = {"rotations": rotations, "outliers": (), "model": MotionModel("rotation"), "freed": lambda: None}
+    known = {"rotations": rotations, "outliers": (), "model": MotionModel("rotation"), "freed": lambda: None, "parallax": 0.0}
     solution = SimpleNamespace(**known | of_solution)
     edges = (Edge(1, 0, motion),) * 30
     located = SimpleNamespace(ambiguity=ambiguity, evidence=evidence, edges=edges, solution=solution, frame_shape=SHAPE)
@@ -267,6 +267,12 @@ def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained, what
     """A thing that fills the middle of all frames passes for the scene, and what is seen beside it for what hides that."""
     found = [judge(explained, (), [Decision(what, share, "")]).reasons for share in (most - 0.02, most + 0.02)]
     assert [[reason.figure for reason in reasons] for reasons in found] == [[], [most + 0.02]]
+
+
+def test_things_that_pass_the_background_tell_how_far_the_camera_travels(explained: Explained) -> None:
+    levels = [level_with(parallax=parallax) for parallax in (0.0412, 0.003)]
+    [reason] = judge(explained, levels, [Decision("movers", 0.6, "")]).reasons
+    assert reason.where.endswith("if what is near stands still, the camera travelled by about 0.04 of its distance")
 
 
 @pytest.mark.parametrize(
