@@ -77,7 +77,7 @@ def photonpano_mergers() -> Iterator[MergerContribution]:
         summary="Maximum-likelihood flux of all photons of a pixel, along the motion (paper, equation 3)",
         config=configs.PhotonMleConfig,
         build=lambda config, context: plugin.PhotonMleMerger(config, context.decide),
-        leaves_out_movers=True,
+        handles_movers=True,
     )
     yield MergerContribution(
         name="splat",
@@ -91,6 +91,7 @@ def photonpano_mergers() -> Iterator[MergerContribution]:
         summary="photon-mle, and optical flow where photons contradict the global motion: moving things and parallax are sharp",
         config=configs.LocalFlowConfig,
         build=lambda config, _: plugin.LocalFlowMerger(config),
+        handles_movers=True,
     )
     yield MergerContribution(
         name="burst",

@@ -138,8 +138,9 @@ def with_colours(source: Source, places: NDArray[np.int8], look: bool = True) ->
     weight, slope, offset = np.ones(shape, np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
     decisions, mix = list(capture.decisions), np.ones(3)
     if look:
-        sums, n_frames = _sampled(capture)
-        n_seen = n_frames * len(sums)
+        spans = capture.info.spread(_SPANS, _SPAN_FRAMES)
+        sums = np.stack([np.asarray(capture.corrected_counts(span), np.float32) for span in spans])
+        n_frames, n_seen = len(spans[0]), sum(map(len, spans))
         mean = sums.sum(axis=0) / np.float32(n_seen)
         means = np.array([mean[each].mean() if each.any() else np.nan for each in pixels], np.float32)
         flux = capture.response.flux(means, _MANY_FRAMES).astype(np.float64)
@@ -167,12 +168,6 @@ def _as_float32(counts: Counts | FluxImage, n_frames: int) -> FluxImage:
     """Convert a sum, so that it is corrected in single precision."""
     del n_frames
     return np.asarray(counts, np.float32)
-
-
-def _sampled(capture: Capture) -> tuple[NDArray[np.float32], int]:
-    """Return corrected sums of frames all over the capture, (S, H, W), and the number of frames of each."""
-    spans = capture.info.spread(_SPANS, _SPAN_FRAMES)
-    return np.stack([np.asarray(capture.corrected_counts(span), np.float32) for span in spans]), len(spans[0])
 
 
 def _line(response: Response, mean: float, gain: float) -> tuple[float, float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +22,7 @@ from photonpano.execution.context import Context
 from photonpano.geometry import PATCHES, Camera, Canvas
 from photonpano.merging import Chunk, accumulate, binned_mean
 from photonpano.motion.consensus import APART
+from photonpano.reading import reading
 from photonpano.robust import cauchy_weights, robust_std
 from photonpano.values import CELL_PX, Background, BoolArray, Decision, FloatArray, FluxImage, FrameSpan, Homography
 
@@ -249,15 +249,14 @@ def _changing(squares: FluxImage, shown: BoolArray) -> BoolArray:
     """Return the places that change even where no patch hides them, as where something near shifts all the time: (h, w)."""
     number = shown.sum(axis=0)
     known = np.asarray(number >= _FEWEST_SEEN)
-    if not known.any():
-        return known
     mean = np.where(shown, squares, 0).sum(axis=0) / np.maximum(number, 1)
     side = (_TOGETHER, _TOGETHER)
     total, there = (
         cv2.boxFilter(each, -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
         for each in (np.where(known, mean, 0).astype(np.float64), known.astype(np.float64))
     )
-    return np.asarray(known & (total > _CHANGING * max(float(np.median(mean[known])), _STEADY) * there))
+    usual = max(float(np.median(mean[known])), _STEADY) if known.any() else _STEADY
+    return np.asarray(known & (total > _CHANGING * usual * there))
 
 
 def _patches(deviation: FluxImage, known: BoolArray, tolerance: _Tolerance) -> BoolArray:
@@ -323,11 +322,8 @@ def before_background_of(source: Source, folder: Path) -> Source:
     path, shape = folder / LAYERS_FILE, source.info.frame_shape
     if not path.exists():
         return source
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            instants, shown, filled = (archive[name] for name in _ARRAYS)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read as the layers of a run ({error}); run again") from error
+    with reading(path, "cannot be read as the layers of a run; run again"), np.load(path, allow_pickle=False) as archive:
+        instants, shown, filled = (archive[name] for name in _ARRAYS)
     expected = len(instants), *(-(-side // CELL_PX) for side in shape)
     if not shown.shape == filled.shape == expected:
         raise InputError(f"{path} has cells of the shape {shown.shape}, not {expected} as the capture; run again")

@@ -96,6 +96,8 @@ def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike:
     Pixels of each mask in `alike` may be compared with each other, such as those of one colour; by default all. The parts are
     those that most of the pixels show.
     """
+    import cv2
+
     colours = [usable & part for part in alike] if alike else [usable]
     single = np.logical_or.reduce([_single_pixels(sums, n_frames, part) for part in colours])
     moving, stood = _parts(sums, n_frames, max(colours, key=np.count_nonzero) & ~single)
@@ -107,7 +109,8 @@ def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike:
     if share > _HALF:
         why = f"are masked: {share:.0%} of the frame stands still, so that it is open which part is the scene"
         return Still(np.zeros_like(usable), share, why)
-    mask = (single | _widened(standing)) & usable
+    side = 2 * (_SIDE_PX // 2 + 2) + 1  # a square that reaches over the edge of what stands shows motion
+    mask = (single | (cv2.dilate(standing.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)) & usable
     return Still(
         mask, share, f"stand still in {len(sums) * n_frames} frames sampled all over the capture, while the rest moves"
     )
@@ -215,14 +218,6 @@ def _continued(standing: BoolArray, allowed: BoolArray) -> BoolArray:
     for _ in range(_REACH_PX):
         grown = np.where(allowed, cv2.dilate(grown, square), grown)
     return grown > 0
-
-
-def _widened(standing: BoolArray) -> BoolArray:
-    """Return the pixels of what stands: a square that reaches over its edge shows motion."""
-    import cv2
-
-    side = 2 * (_SIDE_PX // 2 + 2) + 1
-    return np.asarray(cv2.dilate(standing.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def _kernel() -> NDArray[np.float64]:

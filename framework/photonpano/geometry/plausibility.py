@@ -33,7 +33,8 @@ def why_implausible(homography: Homography, shape: tuple[int, int], min_overlap:
             f"(at most {shapes.MAX_SIDE_CHANGE:g} is plausible)",
         }[kind]
     frame = corners(shape).astype(np.float32)
-    covered, _ = cv2.intersectConvexConvex(transform_points(homography, frame).astype(np.float32), frame)
+    # OpenCV loses parts of polygons whose corners lie closer together than this.
+    covered, _ = cv2.intersectConvexConvex(transform_points(homography, frame).round(1).astype(np.float32), frame)
     overlap = covered / ((shape[0] - 1) * (shape[1] - 1))
     if overlap < min_overlap:
         return f"the images overlap by {overlap:.0%} (at least {min_overlap:.0%} is needed)"

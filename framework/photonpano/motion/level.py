@@ -75,12 +75,12 @@ class Level:
     # who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0"
     origins: Mapping[str, str]
     recorder: Recorder = field(default_factory=Recorder)  # records what they decide
-    leaves_out_movers: bool = False  # whether the merger does: see `MergerContribution`
+    handles_movers: bool = False  # whether the merger does: see `MergerContribution`
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave out what only the process of the loop needs: the resampler and the interpolator."""
         components = None, self.merger, self.locators, None
-        return Level, (self.number, self.scale, *components, self.origins, self.recorder, self.leaves_out_movers)
+        return Level, (self.number, self.scale, *components, self.origins, self.recorder, self.handles_movers)
 
     def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:
         """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator: `attributing`."""
@@ -142,7 +142,7 @@ class VirtualExposures:
             PluginError: the merger failed, or returned anything but an exposure of the group at the level's scale.
         """
         level, group = self.level, self.groups[index]
-        source = self.source if level.leaves_out_movers else capture_of(self.source).masking_movers(group.span)
+        source = self.source if level.handles_movers else capture_of(self.source).masking_movers(group.span)
         with (clock or self.clock)("merge"), level.attributing("merger"):
             exposure = level.merger.merge(source, group, self.previous or self.start, level.scale)
             return EXPOSURE.require(exposure, Asked(group, level.scale, self.frame_shape))

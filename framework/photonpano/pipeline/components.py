@@ -143,7 +143,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple
             component(level.interpolate),
             {choice.contribution.kind: choice.label for choice in (level.resample, level.merge, level.interpolate)},
             recorder,
-            isinstance(level.merge.contribution, MergerContribution) and level.merge.contribution.leaves_out_movers,
+            isinstance(level.merge.contribution, MergerContribution) and level.merge.contribution.handles_movers,
         )
         for number, level in enumerate(plan.levels, start=1)
     )

@@ -316,17 +316,15 @@ def cut_at_jumps(state: State) -> Proposal | None:
 
 def _located_anew(state: State) -> State:
     """Locate all levels; light, and what hides the background, are found anew, since that was done along another motion."""
-    capture = capture_of(state.source)
-    changing = any(each.what == LIGHT_DECISION for each in state.decisions)
-    if capture.background is None and not changing:
+    decisions = tuple(each for each in state.decisions if each.what != LIGHT_DECISION)
+    changing = len(decisions) < len(state.decisions)
+    if capture_of(state.source).background is None and not changing:
         return state.located(state.levels, state.start)
-    anew = replace(state, source=before(state.source, None), watched=False)
-    if changing:
-        decisions = tuple(each for each in state.decisions if each.what != LIGHT_DECISION)
-        anew = replace(anew, source=_in_steady_light(anew.source), decisions=decisions)
+    anew = replace(state, source=before(_in_steady_light(state.source), None), decisions=decisions, watched=False)
     anew = anew.located(state.levels[:1], state.start)
-    light_again = (in_changing_light,) if changing else ()
-    for each in (without_movers, *light_again, partial(later_levels, journal=[]), again_without_movers):
+    light = [in_changing_light] if changing else []
+    again: tuple[Pass, ...] = (without_movers, *light, partial(later_levels, journal=[]), again_without_movers)
+    for each in again:
         anew = tried(anew, each).state
     return anew
 

@@ -24,6 +24,7 @@ from photonpano.values import Decision, Refined
 MAX_ROUNDS = 6  # maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against
 # A later correction that moves frames by less than this on average needs no new panorama: residuals change in proportion to it.
 _LINEAR_PX = 0.1
+_NOT_RELOCATED = "the motion of the last level along the refined one is not used"
 _BLURRED_PX = 1.0  # mean correction by which the exposures were blurred so that it pays to locate them again
 
 
@@ -51,14 +52,10 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Expla
             rounds.append(summary)
             state.context.progress.note(f"{refiner.name}: {summary}")
             if len(rounds) == 1 and _change_px(before, state.motion) > _BLURRED_PX:
-                state = tried(state, _relocated).state
+                state = tried(state, lambda known: Proposal(known.relocated, rejection=_NOT_RELOCATED)).state
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(before, state.motion), kept_out))
     state = tried(state, without_what_changes).state
     return state, state.fit.explained(refinements)
-
-
-def _relocated(state: State) -> Proposal:
-    return Proposal(state.relocated, rejection="the motion of the last level along the refined one is not used")
 
 
 def _corrected(state: State, refiner: NamedRefiner, place: int, number: int) -> Proposal | None:

@@ -248,6 +248,15 @@ def test_why_implausible_gives_reason(homography: np.ndarray, reason: str) -> No
     assert why_implausible(homography, SMALL) == reason
 
 
+@pytest.mark.parametrize("px", [1e-10, 1e-6, 1e-3])
+def test_frames_that_hardly_move_overlap(px: float) -> None:
+    """OpenCV's intersection of polygons with nearly equal corners was empty, or a half."""
+    shifts = np.random.default_rng(0).choice([0, px], (200, 2))
+    assert {why_implausible(translation(*shift), SMALL, min_overlap=0.99) for shift in shifts.tolist()} == {None}
+    tilted = [np.array([[1, 0, 0], [0, 1, 0], [0, tilt, 1]]) for tilt in (px * 1e-2, -px * 1e-2)]
+    assert {why_implausible(each, SMALL, min_overlap=0.98) for each in tilted} == {None}
+
+
 @given(
     st.builds(
         lambda *p: about_centre(from_parameters(p)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-import zipfile
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +18,7 @@ from photonpano.corrections.lighting.gains import Gains, seen_cells, solve_gains
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
 from photonpano.geometry import corner_displacements, inverse
+from photonpano.reading import reading
 from photonpano.values import Decision, FloatArray, FrameSpan, Light
 
 LIGHT_DECISION = "light"  # what a record names the decision to divide by the gain of the light
@@ -232,12 +232,9 @@ def in_light_of(source: Source, folder: Path) -> Source:
     path = folder / LIGHT_FILE
     if not path.exists():
         return source
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays: dict[str, Any] = {name: archive[name] for name in _ARRAYS if name in archive}
+    with reading(path, "cannot be read as the light of a run; run again"), np.load(path, allow_pickle=False) as archive:
+        arrays: dict[str, Any] = {name: archive[name] for name in _ARRAYS if name in archive}
         light = Light(**{**arrays, "frequency": float(arrays["frequency"])})
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read as the light of a run ({error}); run again") from error
     if len(light.gain) != source.info.n_frames:
         raise InputError(
             f"{path} is the light of {len(light.gain)} frames, but the capture has {source.info.n_frames}; run again"

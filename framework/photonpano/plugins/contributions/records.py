@@ -226,13 +226,13 @@ class MergerContribution(StageContribution, kind="merger", section="merge", defa
     Attributes:
         accepts_corrected_sums: whether it merges corrected sums. The framework then divides the sums of frames by
             a vignette that it finds.
-        leaves_out_movers: whether it leaves out by itself what hides `Capture.background`, instant by instant. Any other
+        handles_movers: whether it leaves out by itself what hides `Capture.background`, or merges it sharply. Any other
             merger gets a capture in which the pixels are masked that something hides at any time of the group.
     """
 
     build: Callable[[Any, StageContext], Merger]
     accepts_corrected_sums: bool = True
-    leaves_out_movers: bool = False
+    handles_movers: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
