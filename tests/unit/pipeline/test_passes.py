@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, LocationError, Refined
+from photonpano.capture import before, capture_of
 from photonpano.errors import CanvasTooLargeError
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, corner_displacements, inverse, likely_rotations, translation
@@ -28,9 +29,10 @@ from photonpano.specs import parse_spec
 from photonpano.testing import MemorySource
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded
 from photonpano.testing.scenes import Scene
+from photonpano.values import Background
 
 PLAN = parse_spec({"version": 1, "source": {"use": "simulator"}})
-BEFORE = State(PLAN, None, Context(), 0, (), Timeline.regular(9))
+BEFORE = State(PLAN, MemorySource(np.zeros((9, 8, 16))), Context(), 0, (), Timeline.regular(9))
 
 
 AFTER = replace(BEFORE, reference=4)
@@ -120,6 +122,18 @@ def test_cut_among_dark_frames_is_not_compared(dark: FrameSpan | None, worse: st
     assert proposal.rejection == "the image seems to jump before frame 4, but the motion is not cut there"
 
 
+def test_jumps_are_looked_for_in_all_photons(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Along a motion that misses a jump, most of the frames around it look as if something hid the background there."""
+    searched = []
+    monkeypatch.setattr("photonpano.pipeline.passes.find_cuts", lambda source, *_: searched.append(source) or ())
+    monkeypatch.setattr(State, "fit", None)
+    cells = np.zeros((1, 1, 2), bool)
+    assert (
+        cut_at_jumps(replace(BEFORE, source=before(BEFORE.source, Background(np.array([4.0]), cells, cells, (8, 16))))) is None
+    )
+    assert [capture_of(each).background for each in searched] == [None]
+
+
 @pytest.mark.parametrize(("sizes_px", "kept"), [((3.0, 0.2), [4]), ((3.0, 2.0), [4, 7]), ((0.9, 0.2), None)])
 def test_motion_is_not_cut_where_pieces_meet(
     sizes_px: tuple[float, ...], kept: list[int] | None, monkeypatch: pytest.MonkeyPatch
@@ -131,7 +145,7 @@ def test_motion_is_not_cut_where_pieces_meet(
     monkeypatch.setattr(Cut, "along", lambda cut, *_: found[cut.frame])
     monkeypatch.setattr(State, "motion", SimpleNamespace(trajectory=None, frame_shape=None))
     monkeypatch.setattr(State, "fit", None)
-    state = cut_at_jumps(replace(BEFORE, source=MemorySource(np.zeros((9, 8, 16))))).make()
+    state = cut_at_jumps(BEFORE).make()
     assert (state and [cut.frame for cut in state.timeline.cuts]) == kept
 
 
