@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, uniform_filter, uniform_filter1d
 
 from photonpano.capture import before, capture_of
 from photonpano.contracts.protocols import Source, Trajectory
@@ -48,8 +48,9 @@ _SURE = 6.0  # standard deviations by which a patch hides the background
 _FEWEST = 4  # squares of a patch that are sure
 _ROUNDS, _TINY = 4, 1e-6  # of the fit of light and shift
 # Mean square of places that have no usual brightness, relative to the median place, and times that they were seen. What errors
-# of the motion change is thin: the mean is over this side, in squares. The least mean square of a place, in variances.
-_CHANGING, _FEWEST_SEEN, _TOGETHER, _STEADY = 3.0, 8, 5, 0.6
+# of the motion change is thin: the mean is over this side, in squares. The least mean square of a place, in variances; the
+# largest share of such places, since along a wrong motion nearly all change.
+_CHANGING, _FEWEST_SEEN, _TOGETHER, _STEADY, _MOST_CHANGING = 3.0, 8, 5, 0.6, 0.35
 _SMOOTH = 5  # sums over which deviations are averaged where the background was never seen
 _LEAST_HIDDEN = 0.25  # share of the sums that are taken for the background there
 
@@ -250,13 +251,10 @@ def _changing(squares: FluxImage, shown: BoolArray) -> BoolArray:
     number = shown.sum(axis=0)
     known = np.asarray(number >= _FEWEST_SEEN)
     mean = np.where(shown, squares, 0).sum(axis=0) / np.maximum(number, 1)
-    side = (_TOGETHER, _TOGETHER)
-    total, there = (
-        cv2.boxFilter(each, -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for each in (np.where(known, mean, 0).astype(np.float64), known.astype(np.float64))
-    )
+    total, there = (uniform_filter(each, _TOGETHER, mode="constant") for each in (np.where(known, mean, 0.0), known * 1.0))
+    around = np.where(known, total / np.maximum(there, 1e-9), 0)
     usual = max(float(np.median(mean[known])), _STEADY) if known.any() else _STEADY
-    return np.asarray(known & (total > _CHANGING * usual * there))
+    return np.asarray(around > max(_CHANGING * usual, float(np.quantile(around, 1 - _MOST_CHANGING))))
 
 
 def _patches(deviation: FluxImage, known: BoolArray, tolerance: _Tolerance) -> BoolArray:
