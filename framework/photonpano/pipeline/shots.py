@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import TypeVar
 
@@ -39,8 +39,8 @@ class ApartError(Exception):
         self.shots = shots
 
 
-def shots_of(source: Source, error: UntiedError) -> tuple[FrameSpan, ...]:
-    """Return the shots of a capture whose exposures fall into parts; none unless the image changes at once between them.
+def shots_of(source: Source, error: UntiedError, cuts: Sequence[int] = ()) -> tuple[FrameSpan, ...]:
+    """Return the shots of a capture whose exposures fall into parts; none unless there are `cuts`, or abrupt changes, between.
 
     Motion that is too fast, and darkness, also tear the exposures apart; there, the image changes all the time, or not at all.
     """
@@ -53,7 +53,8 @@ def shots_of(source: Source, error: UntiedError) -> tuple[FrameSpan, ...]:
     for one, other in pairwise(members):
         # A group that holds the change may be tied to either part.
         first, last = groups[one[-1]].span, groups[other[0]].span
-        start = _first_after_change(source, FrameSpan(min(first.start, last.start), max(first.stop, last.stop)))
+        between = FrameSpan(min(first.start, last.start), max(first.stop, last.stop))
+        start = next((cut for cut in cuts if between.start < cut < between.stop), None) or _first_after_change(source, between)
         if start is None:
             return ()
         starts.append(start)
