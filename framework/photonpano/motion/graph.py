@@ -16,12 +16,10 @@ from photonpano.geometry import (
     Camera,
     align_planes,
     corner_displacements,
-    generators,
     inverse,
     lenses_apart_px,
     likely_rotations,
     normalised,
-    parameters,
     scaled_ahead,
 )
 from photonpano.motion.adjustment import OUTLIER, Adjustment, Assessment, Cost, Problem
@@ -29,7 +27,7 @@ from photonpano.motion.consensus import TOLERANCES_PX, agreeing, contradicting, 
 from photonpano.motion.evidence import Evidence, likeliest
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
-from photonpano.motion.planar import PlanarName, basis_of, moved, nearest
+from photonpano.motion.planar import PlanarAdjustment, nearest
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, Located
 
@@ -221,7 +219,7 @@ def _freed(tied: _Tied, model: MotionModel, fit: _Fit) -> Freed | None:
         if away[1] > _HELD:
             break
     number = int(away.argmax())
-    return Freed(number, given[number], found[number], stds[number])
+    return Freed(number, given[number], found[number], stds[number]) if away.any() else None
 
 
 def _costs(fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, Cost]:
@@ -370,52 +368,3 @@ def _pairs(edges: Sequence[Edge]) -> NDArray[np.integer]:
     """Return the (moving, fixed) of the located edges: (E, 2)."""
     located = [(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)]
     return np.array(located, dtype=int).reshape(-1, 2)
-
-
-class PlanarAdjustment(Adjustment[FloatArray]):
-    """The least-squares problem of a graph of homographies of a planar model; its state is these, (N, 3, 3) with h33 = 1.
-
-    The unknowns of a node are those of a small motion of its own frame, in coordinates of about unit size.
-    """
-
-    def __init__(self, problem: Problem, model: PlanarName) -> None:
-        """Set up the problem."""
-        super().__init__(problem)
-        self._basis = basis_of(model)
-
-    @property
-    def _n_node(self) -> int:
-        return int(self._basis.shape[1])
-
-    def homographies(self, state: FloatArray) -> FloatArray:
-        """Return the state."""
-        return state
-
-    def changed(self, state: FloatArray, nodes: FloatArray, shared: FloatArray) -> FloatArray:
-        """Return the homographies after a step; nothing is shared."""
-        del shared
-        return moved(state, nodes, self._basis, self._frame_shape)
-
-    def anchored(self, state: FloatArray) -> FloatArray:
-        """Return the homographies, of which the anchor's is the identity."""
-        state[self._anchor] = np.eye(3)
-        return state
-
-    def generators(self, state: FloatArray) -> FloatArray:
-        """Return those of the model in unit coordinates: (k, 3, 3)."""
-        del state
-        return np.asarray(np.einsum("pk,pij->kij", self._basis, generators(self._frame_shape)))
-
-    def information(self, state: FloatArray, blocks: FloatArray) -> FloatArray:
-        """Convert (N, k, k) information on changes of nodes to that on p1..p8 of their homographies.
-
-        What the model does not move is as sure as all that it does together.
-        """
-        back = np.linalg.pinv(self._basis)
-        fixed = np.eye(8) - self._basis @ back
-        blocks = back.T @ blocks @ back + np.trace(blocks, axis1=1, axis2=2)[:, None, None] * fixed
-        changed = state[:, None] @ generators(self._frame_shape)
-        slopes = changed - state[:, None] * changed[..., 2:, 2:]
-        to_parameters = parameters(np.eye(3) + slopes).transpose(0, 2, 1)
-        to_change = np.linalg.inv(to_parameters)
-        return np.asarray(to_change.transpose(0, 2, 1) @ blocks @ to_change)

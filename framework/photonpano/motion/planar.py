@@ -1,4 +1,4 @@
-"""The planar models of motion: groups of homographies, from translations to all of them."""
+"""The planar models of motion, groups of homographies from translations to all of them, and the motion graph of one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from photonpano.geometry import corners, generators, normalised, transform_points
+from photonpano.geometry import corners, generators, normalised, parameters, transform_points
+from photonpano.motion.adjustment import Adjustment, Problem
 from photonpano.values import FloatArray, Homography
 
 PlanarName = Literal["translation", "euclidean", "similarity", "affine", "homography"]
@@ -66,3 +67,52 @@ def nearest(model: PlanarName, homographies: Homography, frame_shape: tuple[int,
         found[:, 1, 0], found[:, 1, 1] = factor.imag, factor.real
     found[:, :2, 2] = moved_middle - np.einsum("nij,j->ni", found[:, :2, :2], middle)
     return found
+
+
+class PlanarAdjustment(Adjustment[FloatArray]):
+    """The least-squares problem of a graph of homographies of a planar model; its state is these, (N, 3, 3) with h33 = 1.
+
+    The unknowns of a node are those of a small motion of its own frame, in coordinates of about unit size.
+    """
+
+    def __init__(self, problem: Problem, model: PlanarName) -> None:
+        """Set up the problem."""
+        super().__init__(problem)
+        self._basis = basis_of(model)
+
+    @property
+    def _n_node(self) -> int:
+        return int(self._basis.shape[1])
+
+    def homographies(self, state: FloatArray) -> FloatArray:
+        """Return the state."""
+        return state
+
+    def changed(self, state: FloatArray, nodes: FloatArray, shared: FloatArray) -> FloatArray:
+        """Return the homographies after a step; nothing is shared."""
+        del shared
+        return moved(state, nodes, self._basis, self._frame_shape)
+
+    def anchored(self, state: FloatArray) -> FloatArray:
+        """Return the homographies, of which the anchor's is the identity."""
+        state[self._anchor] = np.eye(3)
+        return state
+
+    def generators(self, state: FloatArray) -> FloatArray:
+        """Return those of the model in unit coordinates: (k, 3, 3)."""
+        del state
+        return np.asarray(np.einsum("pk,pij->kij", self._basis, generators(self._frame_shape)))
+
+    def information(self, state: FloatArray, blocks: FloatArray) -> FloatArray:
+        """Convert (N, k, k) information on changes of nodes to that on p1..p8 of their homographies.
+
+        What the model does not move is as sure as all that it does together.
+        """
+        back = np.linalg.pinv(self._basis)
+        fixed = np.eye(8) - self._basis @ back
+        blocks = back.T @ blocks @ back + np.trace(blocks, axis1=1, axis2=2)[:, None, None] * fixed
+        changed = state[:, None] @ generators(self._frame_shape)
+        slopes = changed - state[:, None] * changed[..., 2:, 2:]
+        to_parameters = parameters(np.eye(3) + slopes).transpose(0, 2, 1)
+        to_change = np.linalg.inv(to_parameters)
+        return np.asarray(to_change.transpose(0, 2, 1) @ blocks @ to_change)

@@ -10,13 +10,13 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from photonpano.corrections.lighting.gains import SMOOTHING, STRUCTURE, Gains, SeenCells
+from photonpano.robust import robust_std
 from photonpano.values import FloatArray, FluxImage
 
 _PERIODS = 1.2  # periods for which a place must be in view
 _FINER = 3  # oversampling of frequency: steps per 1/T, where a place is in view for T
 _STANDS_OUT = 3.0  # what a flicker explains at least, relative to the median over frequencies
 _BETTER = 0.7  # of what one gain for all of the scene leaves, what a flicker of places leaves at most
-_MEDIAN = 0.455  # the median of the square of a Gaussian number of unit variance
 _ACCURACY = 1e-3  # of the frequency, relative to it
 _LEAST_INFORMATION = 0.05  # prior of the waves of a place, relative to its photons: it matters if a place is in view briefly
 _SMALLEST = 0.05  # least root mean square, over places and time, of a flicker that is divided out
@@ -70,7 +70,7 @@ def local_flicker(gains: Gains) -> LocalFlicker | None:
     flicker = measured_flicker(gains, float(best.x))
     alike = replace(flicker, maps=np.zeros_like(flicker.maps), slow=gains.gain)
     # Medians, since things that move change the light of their places, too.
-    left, common = (float(np.median(_left(gains, each)[0])) / _MEDIAN for each in (flicker, alike))
+    left, common = (robust_std(_left(gains, each)[0]) ** 2 for each in (flicker, alike))
     noise = float(np.median(_left(gains, flicker)[1]))
     # Of light that is the same everywhere, one gain leaves as little as places do.
     is_local = common - left > max((1 - _BETTER) * (common - noise), (_SMALLEST / 2) ** 2)
@@ -102,13 +102,13 @@ def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:
 def _misfit(gains: Gains, frequency: float) -> float:
     """Return the mean square that a flicker of a frequency leaves in the photons."""
     left, noise = _left(gains, measured_flicker(gains, frequency))
-    return float(np.average(left, weights=1 / (SMOOTHING**2 * noise + STRUCTURE**2)))
+    return float(np.average(left**2, weights=1 / (SMOOTHING**2 * noise + STRUCTURE**2)))
 
 
 def _left(gains: Gains, flicker: LocalFlicker) -> tuple[FloatArray, FloatArray]:
-    """Return the squares that a flicker leaves in the photons, relative to what it predicts, and those of noise: (N,) each."""
+    """Return what a flicker leaves of the photons, relative to what it predicts, and its variance by noise: (N,) each."""
     expected, _ = _lit(gains, _waves(gains.seen, flicker.frequency), flicker.maps.astype(float), flicker.slow)
-    return (gains.seen.photons / expected - 1) ** 2, 1 / expected / SMOOTHING**2
+    return gains.seen.photons / expected - 1, 1 / expected / SMOOTHING**2
 
 
 def _waves(seen: SeenCells, frequency: float) -> FloatArray:
