@@ -137,6 +137,20 @@ def _shots(run: _Run) -> _Found | None:
 
 
 @_doubtful_above(
+    10,
+    "the photons contradict the focal length or the lens that the spec gives",
+    "write camera: {focal_px: find}, and distortion: {k1: find} if the lens distorts, or calibrate the camera anew",
+)
+def _given_camera(run: _Run) -> _Found | None:
+    freed = run.levels[-1].located.solution.freed() if run.levels else None
+    if freed is None:
+        return None
+    what, unit = [("a focal length", " px"), ("k1", "")][freed.number]
+    where = f"{what} of {freed.found:.4g} ± {freed.std:.2g}{unit} fits, {freed.given:.4g}{unit} is given; in expected errors"
+    return _Found(abs(freed.found - freed.given) / freed.std, where)
+
+
+@_doubtful_above(
     2.0,
     "the image moves within groups by more than the motion that was found",
     "use the refiner short-spans, or smaller groups (resample.with.group_size)",
@@ -322,20 +336,6 @@ def _no_turn(run: _Run) -> _Found | None:
     residual, free = np.sqrt([evidence.rivals[each].chi2 for each in (name, "homography")]).tolist()
     where = f"residuals in units of their noise; those of any homographies are {free:.2g}"
     return _Found(residual, where, doubtful=not evidence.suffices(name))
-
-
-@_doubtful_above(
-    10,
-    "the photons contradict the focal length or the lens that the spec gives",
-    "write camera: {focal_px: find}, and distortion: {k1: find} if the lens distorts, or calibrate the camera anew",
-)
-def _given_camera(run: _Run) -> _Found | None:
-    freed = run.levels[-1].located.solution.freed() if run.levels else None
-    if freed is None:
-        return None
-    what, unit = [("a focal length", " px"), ("k1", "")][freed.number]
-    where = f"{what} of {freed.found:.4g} ± {freed.std:.2g}{unit} fits, {freed.given:.4g}{unit} is given; in expected errors"
-    return _Found(abs(freed.found - freed.given) / freed.std, where)
 
 
 @_doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")
