@@ -48,6 +48,7 @@ CAUSES: dict[str, tuple[str, ...]] = {
     "tutorial": ("within groups",),
     "vibration": ("within groups",),
     "shake": ("within groups",),
+    "shaking": ("shake",),
     "pan of 1.5": ("within groups", "expected error", "contradict"),
     "hot pixels": ("single pixels", "still"),
     "dirt": ("the sensor", "still"),

@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
+from harness import RATE_HZ
 
 Settings: TypeAlias = dict[str, Any]
 
@@ -136,6 +137,12 @@ ROWS: dict[str, Row] = {
     "tremor of 1 px": Row(LONG, lambda size: shaken(size, LONG, 1, (223, 590, 1270))),
     "tutorial": Row("clean tutorial", lambda size: shaken(size, "clean tutorial", 2, (25, 120, 400))),
     "vibration of 3 px": Row(PAN, lambda size: shaken(size, PAN, 3, (1000,))),
+    **{
+        f"shaking by {rms_px:g} px every {period:g} frames": Row(
+            PAN, lambda size, rms_px=rms_px, period=period: shaken(size, PAN, rms_px, (RATE_HZ / period,))
+        )
+        for rms_px, period in ((2, 12), (0.7, 12.5), (0.7, 11.5), (0.35, 6.2), (1, 4), (1.4, 3), (1.4, 2))
+    },
     "strong shake": Row(PAN, lambda size: shaken(size, PAN, 10, (25, 90, 210))),
     "hot pixels 5 %": Row(DIM, changed({"sensor": {"hot_fraction": 0.05, "dark_rate": 0.001}})),
     "hot pixels 20 %": Row(DIM, changed({"sensor": {"hot_fraction": 0.2, "dark_rate": 0.001}})),

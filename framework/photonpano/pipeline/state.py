@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
+import numpy as np
+
 from photonpano.capture import seen_through
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.corrections import Vignette
@@ -74,13 +76,19 @@ class State:
         """Run the last level again along the refined motion, which it corrects: its exposures are then sharper.
 
         The model of the motion stays the one that was chosen, since tremor in each exposure is explained by any that is richer.
+        Exposures average over the noise of single frames that refiners let through, which stays in the motion and its error.
         """
         motion: Trajectory = self.motion.trajectory
         if self.motion.camera is not None:
             motion = RotationTrajectory(motion, self.motion.camera, self.reference)
         result = self.results[-1]
         again = replace(self, model=result.located.solution.model).located([result.level], motion, corrects=True)
-        return replace(again, refined=None, known_fit=None)
+        again = replace(again, refined=None, known_fit=None)
+        known, before = self.motion.std_px, replace(self, refined=None).motion.std_px
+        finite = np.isfinite(known) & np.isfinite(before)
+        noise_px = np.zeros_like(known)
+        noise_px[finite] = np.sqrt(np.maximum(known[finite] ** 2 - before[finite] ** 2, 0))
+        return replace(again, refined=replace(again.motion, std_px=np.hypot(again.motion.std_px, noise_px)))
 
     def corrected(self, source: Source, correction: Vignette | Light, decision: Decision) -> State:
         """Return the state of a capture with one more correction, on which its checkpoints then depend.

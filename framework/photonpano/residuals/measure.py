@@ -29,6 +29,7 @@ from photonpano.residuals.block_sums import (
     n_blocks,
 )
 from photonpano.residuals.prediction import Prediction, Predictions
+from photonpano.residuals.shaking import Shaking, find_shaking
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, SpanResiduals
 
 N_STEPS = 4  # steps of the motion: shift along x and y, roll, zoom. The gain of the light is the fifth unknown of a span
@@ -40,6 +41,8 @@ _MAX_MOTION_PX = 2.0  # a span is short enough that the image moves by no more t
 _JUMP_PX, _JUMP_RATIO = 1.0, 5.0
 _FEWEST_SPANS = 64  # a capture is divided into at least this many spans, if it has the frames
 _BATCH = 64  # spans that a thread measures at a time
+# Frames that are measured one by one, in windows of at least so many, to see what moves faster than a span.
+_SINGLE_FRAMES, _WINDOW_FRAMES = 512, 32
 _PIXEL_STRIDE = 4  # one span in 4 is added to the sums of single pixels, which no other sum needs
 _DARK = 1e-6  # least weight of a frame in the mean motion of a span
 _PROBES = 8  # instants at which the noise of a shift is predicted
@@ -71,16 +74,11 @@ class Residuals:
     frames_seen: float  # frames that saw a place of the panorama, the median over its pixels
     frame_shape: tuple[int, int]  # (height, width) of a frame
     light: FloatArray  # (S,) mean gain of the light of each span, 1 in steady light
+    shaking: Shaking  # motion that is faster than a span
 
     def steps(self) -> SpanResiduals:
         """Solve for the motion of each span; the gain of the light is solved for, too, and left out."""
-        kept, gain = self.normal[:, :N_STEPS, :N_STEPS], self.normal[:, N_STEPS, N_STEPS]
-        mixed = self.normal[:, :N_STEPS, N_STEPS]
-        weight = 1 / (gain + _PRIOR[N_STEPS])
-        information = kept - mixed[:, :, None] * mixed[:, None, :] * weight[:, None, None]
-        right = self.gradient[:, :N_STEPS] - mixed * (weight * self.gradient[:, N_STEPS])[:, None]
-        steps = np.linalg.solve(information + np.diag(_PRIOR[:N_STEPS]), right[..., None])[..., 0]
-        return SpanResiduals(self.spans, steps, information)
+        return SpanResiduals(self.spans, *_solved(self.normal, self.gradient))
 
     def moved(self, steps: FloatArray) -> Residuals:
         """Return the residuals after steps (S, 4) of the spans, to first order; chi-square stays that before them."""
@@ -107,8 +105,14 @@ class Residuals:
 
 
 def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Residuals:
-    """Compare the located frames with what the panorama predicts along the motion, each pixel in its colour."""
-    spans = spans_of(span, predictions)
+    """Compare the located frames with what the panorama predicts along the motion, each pixel in its colour.
+
+    Spans are shorter where single frames of some windows show that the image shakes faster.
+    """
+    size, spans = spans_of(span, predictions)
+    shaking = _shaking(spans, size, predictions, context)
+    if shaking.size_px:
+        _, spans = spans_of(span, predictions, shaking.span_frames)
     # The mean over the frames, which is not the motion at the centre where frames are repeated, or tremble.
     starts = [each.start - span.start for each in spans]
     trajectory, changing = predictions.first.trajectory, predictions.first.light
@@ -149,11 +153,52 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
             predictions.frames_seen,
             predictions.first.frame_shape,
             light,
+            shaking,
         )
 
 
-def spans_of(span: FrameSpan, predictions: Predictions) -> tuple[FrameSpan, ...]:
-    """Divide frames into spans: long enough for the photons to carry a shift, short enough for the motion."""
+def _solved(normal: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the steps of the equations of spans, (S, 4), and their information, (S, 4, 4), whatever the gain is."""
+    kept, gain = normal[:, :N_STEPS, :N_STEPS], normal[:, N_STEPS, N_STEPS]
+    mixed = normal[:, :N_STEPS, N_STEPS]
+    weight = 1 / (gain + _PRIOR[N_STEPS])
+    information = kept - mixed[:, :, None] * mixed[:, None, :] * weight[:, None, None]
+    right = gradient[:, :N_STEPS] - mixed * (weight * gradient[:, N_STEPS])[:, None]
+    steps = np.linalg.solve(information + np.diag(_PRIOR[:N_STEPS]), right[..., None])[..., 0]
+    return steps, information
+
+
+def _shaking(spans: Sequence[FrameSpan], size: int, predictions: Predictions, context: Context) -> Shaking:
+    """Measure single frames of windows all over the capture, which are as long as a span of `size` frames or longer."""
+    length = -(-max(size, _WINDOW_FRAMES) // size) * size
+    runs, first = list[FrameSpan](), 0
+    for index, each in enumerate(spans):  # frames between two jumps
+        if index + 1 == len(spans) or len(each) != size:
+            runs.append(FrameSpan(spans[first].start, each.stop))
+            first = index + 1
+    starts = [start for run in runs for start in range(run.start, run.stop - length + 1, length)]
+    if size < 3 or not starts:
+        return Shaking(0.0, float("nan"), size)
+    taken = np.unique(np.linspace(0, len(starts) - 1, max(1, _SINGLE_FRAMES // length)).astype(int))
+    windows = [np.arange(starts[index], starts[index] + length) for index in taken]
+    frames = [[FrameSpan(int(frame), int(frame) + 1) for frame in window] for window in windows]
+
+    def single(index: int) -> tuple[FloatArray, FloatArray]:
+        homographies = predictions.first.trajectory.at(windows[index])
+        (normal, gradient, _), _ = _measured(predictions, frames[index], homographies, slice(None))
+        return _solved(normal, gradient)
+
+    steps, information = (np.array(each) for each in zip(*context.in_order(single, range(len(windows))), strict=True))
+    known = np.maximum(np.diagonal(information, axis1=2, axis2=3)[..., :2], 0)
+    with np.errstate(divide="ignore"):
+        return find_shaking(steps[..., :2], 1 / known, size)
+
+
+def spans_of(span: FrameSpan, predictions: Predictions, longest: int = _LONGEST) -> tuple[int, tuple[FrameSpan, ...]]:
+    """Divide frames into spans: long enough for the photons to carry a shift, short enough for the motion.
+
+    Returns the number of frames of a span, `longest` at most, and the spans.
+    """
     frames = np.arange(span.start, span.stop)
     frame_shape = predictions.first.frame_shape
     homographies = predictions.first.trajectory.at(frames)
@@ -166,12 +211,12 @@ def spans_of(span: FrameSpan, predictions: Predictions) -> tuple[FrameSpan, ...]
     noise_px = _shift_noise_px(predictions, homographies[probes])
     wanted = np.clip(np.ceil((noise_px / _NOISE_PX) ** 2), _SHORTEST, _LONGEST)
     size = int(min(wanted, _MAX_MOTION_PX / max(speed, 1e-9), len(frames) / _FEWEST_SPANS))
-    size = max(1, size)
+    size = max(1, min(size, longest))
     spans = []
     for piece in pairwise([span.start, *jumps.tolist(), span.stop]):
         bounds = [*range(piece[0], max(piece[1] - size, piece[0]) + 1, size), piece[1]]
         spans += [FrameSpan(start, stop) for start, stop in pairwise(bounds)]
-    return tuple(spans)
+    return size, tuple(spans)
 
 
 def _shift_noise_px(predictions: Predictions, homographies: FloatArray) -> float:

@@ -63,8 +63,12 @@ def unexplained_px(residuals: Residuals, n_frames: int) -> FloatArray:
     """Return the corner error that the residuals show beyond photon noise, for every frame of the capture: (n_frames,).
 
     It is the root mean square over 33 spans around the frame, or the step of a single span if that stands out, as at a place
-    where frames are missing; 0 where noise explains it.
+    where frames are missing; 0 where noise explains it. What frames shake within spans is added.
     """
+    return np.hypot(_beyond_noise_px(residuals, n_frames), residuals.shaking.size_px)
+
+
+def _beyond_noise_px(residuals: Residuals, n_frames: int) -> FloatArray:
     steps, variances = _series(residuals)
     known = np.isfinite(variances).all(axis=1)
     if known.sum() < 2:

@@ -160,6 +160,17 @@ def _fast_motion(run: _Run) -> _Found:
 
 
 @_doubtful_above(
+    0.1,
+    "frames shake faster than the motion that was found can follow",
+    "use the refiner short-spans; if it was used, the photons do not carry this motion: use more light, or damp what shakes",
+)
+def _shaking(run: _Run) -> _Found | None:
+    shaking = run.explained.residuals.shaking
+    where = f"px within spans, most with a period of {shaking.period_frames:.3g} frames"
+    return _Found(shaking.size_px, where) if shaking.size_px else None
+
+
+@_doubtful_above(
     1.1,
     "the panorama does not explain the photons: they differ from its prediction by more than their noise",
     "look at the maps of the report; the motion may be wrong, or the scene changes",

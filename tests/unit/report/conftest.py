@@ -15,6 +15,7 @@ from photonpano.photometry import BinaryResponse
 from photonpano.residuals.block_sums import GXX, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
+from photonpano.residuals.shaking import Shaking
 from photonpano.testing import KnownMotion
 
 FRAME_SHAPE = (254, 496)
@@ -82,6 +83,7 @@ def make_residuals(n_frames: int = N_FRAMES, tremor_px: float = 0.0, period: flo
         frames_seen=4000.0,
         frame_shape=FRAME_SHAPE,
         light=np.ones(len(spans)),
+        shaking=Shaking(0.0, float("nan"), 16),
     )
 
 

@@ -27,21 +27,21 @@ FRAMES = 800
 PERIOD = 90
 
 
-def shaken(frame: float, tremor_px: float) -> np.ndarray:
-    tremor = tremor_px * np.sin(2 * np.pi * frame / PERIOD)
+def shaken(frame: float, tremor_px: float, period: float = PERIOD) -> np.ndarray:
+    tremor = tremor_px * np.sin(2 * np.pi * frame / period)
     return translation(0.08 * frame + tremor, 0.02 * frame)
 
 
 @cache
-def capture(tremor_px: float = 0.0) -> ReadOnlySource:
-    motion = KnownMotion(lambda frame: shaken(frame, tremor_px))
+def capture(tremor_px: float = 0.0, period: float = PERIOD) -> ReadOnlySource:
+    motion = KnownMotion(lambda frame: shaken(frame, tremor_px, period))
     return ReadOnlySource(recorded(Scene(seed=5, flux=(0.1, 0.8)), motion, FRAMES, SHAPE))
 
 
 @cache
-def residuals_of(tremor_px: float = 0.0, threads: int = 1) -> Residuals:
+def residuals_of(tremor_px: float = 0.0, threads: int = 1, period: float = PERIOD) -> Residuals:
     """Measure the residuals of a capture with a tremor along a path without it."""
-    source, span = capture(tremor_px), FrameSpan(0, FRAMES)
+    source, span = capture(tremor_px, period), FrameSpan(0, FRAMES)
     trajectory = FrameTrajectory(np.array([shaken(frame, 0) for frame in range(FRAMES)]))
     canvas = plan_canvas(trajectory, span, SHAPE, 1.0, 2**30)
     panorama = render(source, trajectory, span, canvas, 0.25, Context())
@@ -73,6 +73,16 @@ def test_steps_are_the_tremor_that_the_motion_lacks() -> None:
     assert residual_ratio(found) > 2
     assert unexplained_px(found, FRAMES).mean() == pytest.approx(0.4 / np.sqrt(2), rel=0.4)
     assert bounded_std_px(np.full(FRAMES, 10.0), found).min() == 10
+
+
+def test_spans_are_shorter_than_the_shaking_of_single_frames() -> None:
+    usual, shaking = residuals_of(), residuals_of(1.0, period=4.2)
+    assert usual.shaking.size_px == 0
+    assert shaking.shaking.size_px == pytest.approx(1 / np.sqrt(2), rel=0.4)
+    assert shaking.shaking.period_frames == pytest.approx(4.2, rel=0.1)
+    assert max(map(len, shaking.spans)) <= 2 < min(map(len, usual.spans))
+    # Frames may be off by what they shake, wherever they are.
+    assert unexplained_px(shaking, FRAMES).min() >= shaking.shaking.size_px
 
 
 def test_bounded_std_px_at_an_extrapolated_end_is_what_the_photons_allow() -> None:

@@ -18,6 +18,7 @@ from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
+from photonpano.residuals.shaking import Shaking
 from photonpano.residuals.verdict import NO_TURN, TESTS, Reason, contradictions, judge
 from photonpano.values import Ambiguity, Decision, Edge, Located
 
@@ -53,6 +54,7 @@ def noise() -> Residuals:
         frames_seen=1000.0,
         frame_shape=SHAPE,
         light=np.ones(N_SPANS),
+        shaking=Shaking(0.0, float("nan"), SPAN),
     )
 
 
@@ -168,6 +170,13 @@ def left_of_radial(shape: tuple[int, ...]) -> float:
             pytest.approx(left_of_radial((8, 12)), rel=0.1),
             "px, over the frame",
             id="deformation",
+        ),
+        pytest.param(
+            lambda _: {"shaking": Shaking(0.3, 4.2, 1)},
+            "frames shake faster than the motion that was found can follow",
+            0.3,
+            "px within spans, most with a period of 4.2 frames",
+            id="shaking",
         ),
     ],
 )
