@@ -123,7 +123,13 @@ def solve(
         return solution if turned is None else replace(solution, assess=partial(_doubting, tied, solution, turned))
     tied, fits = _of_background(tied, start, {model: _fitted(tied, start, model)})
     fit = fits[model]
-    return tied.solution(fit, model, partial(_compared, tied, start, model, fit))
+    solution = tied.solution(fit, model, partial(_compared, tied, start, model, fit))
+    if not (model.chosen and model.is_simple):
+        return solution
+    with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
+        turned = _fitted(tied, start, replace(model, kind="rotation"), [fit])
+        return replace(solution, assess=partial(_doubting, tied, solution, turned))
+    return solution
 
 
 def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[MotionModel, _Fit]:

@@ -28,6 +28,7 @@ class MotionModel:
     # k1, k2, p1, p2 of its lens; None for those that are to be found
     distortion: tuple[float | None, float | None, float | None, float | None] = (0.0, 0.0, 0.0, 0.0)
     known: Camera | None = None  # the camera that the level before has found
+    chosen: bool = False  # whether "auto" chose it: errors then contain how well pairs tell it from others
     layered: bool = False  # whether frames are known to show more than a background that follows the camera
 
     @property

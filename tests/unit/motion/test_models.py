@@ -92,3 +92,14 @@ def test_expected_errors_of_a_model_hold(model: PlanarName) -> None:
         squares.append(np.mean(error_px(solution.homographies, true) ** 2))
         variances.append(np.mean(solution.assess().std_px ** 2))
     assert np.mean(squares) / np.mean(variances) == pytest.approx(1, abs=0.4)
+
+
+def test_a_chosen_model_that_is_held_stays_as_uncertain_as_the_choice() -> None:
+    edges = measured(path("euclidean"), 2)
+    chosen = solve(N_NODES, edges, N_NODES // 2, SHAPE, model=MotionModel("auto"))
+    held, given_model = (
+        solve(N_NODES, edges, N_NODES // 2, SHAPE, chosen.homographies, MotionModel("euclidean", chosen=each)).assess().std_px
+        for each in (True, False)
+    )
+    np.testing.assert_allclose(held, chosen.assess().std_px, rtol=0.1)
+    assert held.mean() > given_model.mean()
