@@ -41,8 +41,9 @@ _MAX_MOTION_PX = 2.0  # a span is short enough that the image moves by no more t
 _JUMP_PX, _JUMP_RATIO = 1.0, 5.0
 _FEWEST_SPANS = 64  # a capture is divided into at least this many spans, if it has the frames
 _BATCH = 64  # spans that a thread measures at a time
-# Frames that are measured one by one, in windows of at least so many, to see what moves faster than a span.
-_SINGLE_FRAMES, _WINDOW_FRAMES = 512, 32
+# Most frames that are measured one by one, and most as a share of the capture, to see what moves faster than a span; and the
+# fewest in a row.
+_SINGLE_FRAMES, _SINGLE_SHARE, _WINDOW_FRAMES = 512, 1 / 8, 32
 _PIXEL_STRIDE = 4  # one span in 4 is added to the sums of single pixels, which no other sum needs
 _DARK = 1e-6  # least weight of a frame in the mean motion of a span
 _PROBES = 8  # instants at which the noise of a shift is predicted
@@ -179,7 +180,8 @@ def _shaking(spans: Sequence[FrameSpan], size: int, predictions: Predictions, co
     starts = [start for run in runs for start in range(run.start, run.stop - length + 1, length)]
     if size < 3 or not starts:
         return Shaking(0.0, float("nan"), size)
-    taken = np.unique(np.linspace(0, len(starts) - 1, max(1, _SINGLE_FRAMES // length)).astype(int))
+    frames_taken = min(_SINGLE_FRAMES, _SINGLE_SHARE * (spans[-1].stop - spans[0].start))
+    taken = np.unique(np.linspace(0, len(starts) - 1, max(1, int(frames_taken) // length)).astype(int))
     windows = [np.arange(starts[index], starts[index] + length) for index in taken]
     frames = [[FrameSpan(int(frame), int(frame) + 1) for frame in window] for window in windows]
 
