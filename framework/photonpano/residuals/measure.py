@@ -183,17 +183,18 @@ def _shaking(spans: Sequence[FrameSpan], size: int, predictions: Predictions, co
     frames_taken = min(_SINGLE_FRAMES, _SINGLE_SHARE * (spans[-1].stop - spans[0].start))
     taken = np.unique(np.linspace(0, len(starts) - 1, max(1, int(frames_taken) // length)).astype(int))
     windows = [np.arange(starts[index], starts[index] + length) for index in taken]
-    frames = [[FrameSpan(int(frame), int(frame) + 1) for frame in window] for window in windows]
-
-    def single(index: int) -> tuple[FloatArray, FloatArray]:
-        homographies = predictions.first.trajectory.at(windows[index])
-        (normal, gradient, _), _ = _measured(predictions, frames[index], homographies, slice(None))
-        return _solved(normal, gradient)
-
-    steps, information = (np.array(each) for each in zip(*context.in_order(single, range(len(windows))), strict=True))
+    results = context.in_order(partial(_of_single_frames, predictions), windows)
+    steps, information = (np.array(each) for each in zip(*results, strict=True))
     known = np.maximum(np.diagonal(information, axis1=2, axis2=3)[..., :2], 0)
     with np.errstate(divide="ignore"):
         return find_shaking(steps[..., :2], 1 / known, size)
+
+
+def _of_single_frames(predictions: Predictions, frames: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """Return the steps of F frames, (F, 4), and their information, (F, 4, 4)."""
+    spans = [FrameSpan(frame, frame + 1) for frame in frames.tolist()]
+    (normal, gradient, _), _ = _measured(predictions, spans, predictions.first.trajectory.at(frames), slice(None))
+    return _solved(normal, gradient)
 
 
 def spans_of(span: FrameSpan, predictions: Predictions, longest: int = _LONGEST) -> tuple[int, tuple[FrameSpan, ...]]:
