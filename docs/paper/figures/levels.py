@@ -33,11 +33,11 @@ COLOURS = ("#c8a26b", "#1f5a94", "#7a1f5a")  # of the levels
 ENDS = 0.5  # length of an end of the capture, in groups
 
 
-def runs(study: Study) -> tuple[Numbers, Path, list[Path]]:
+def runs(study: Study, **sections: object) -> tuple[Numbers, Path, list[Path]]:
     """Return how large the capture and its groups are, the capture, and the runs of one level, of two, and of three."""
     spec = study.spec("paper/fig6", {}, QUICK)
     capture = study.capture("fig6", spec)
-    folders = [study.run("fig6", spec | {"levels": [{"scale": 1}] * n}, capture) for n in range(1, LEVELS + 1)]
+    folders = [study.run("fig6", spec | {"levels": [{"scale": 1}] * n} | sections, capture) for n in range(1, LEVELS + 1)]
     return {**frames_of(spec, "flux"), "group_size": group_size(spec)}, capture, folders
 
 
@@ -48,7 +48,7 @@ def constant(study: Study, capture: Path) -> Path:
 
 def loop(study: Study) -> tuple[draw.Picture, Numbers]:
     """Fig. 3: the estimated path, with expected errors, after each level."""
-    settings, capture, folders = runs(study)
+    settings, capture, folders = runs(study, refine=[])  # refiners correct the motion of one level, too
     rate = settings["frame_rate_hz"] / 1000
     figure, axes = draw.panels(10, 5.6, 2, LEVELS, sharex=True)
     levels: Numbers = {"error_px": [], "expected_px": [], "exposures": []}
