@@ -85,3 +85,28 @@ def _pattern(known: np.ndarray, homographies: FloatArray, frame_shape: tuple[int
     left = observed - absorbed
     left -= averages @ (averages.T @ left)
     return np.asarray(left.reshape(len(instants), 2, -1).mean(axis=0).T)
+
+
+def deformation_px(shifts: FloatArray, information: FloatArray) -> float | None:
+    """Return the root mean square of a smooth pattern in the shifts of blocks, beyond noise and a motion of the whole frame.
+
+    Args:
+        shifts: (h, w, 2) in px.
+        information: (h, w, 2, 2) their inverse covariances by photon noise, 0 where a block carries no shift.
+
+    Returns:
+        The size of a cubic polynomial in px; None if no block carries a shift.
+    """
+    known = information[..., 0, 0] > 0
+    if not known.any():
+        return None
+    noise = np.trace(np.linalg.inv(information[known]), axis1=-2, axis2=-1)
+    # A shift, roll, zoom or shear of the whole frame is no deformation. Shifts that change from block to block are those of
+    # edges, interpolated at different fractions of a pixel.
+    rows, columns = (np.linspace(-1, 1, n)[index] for n, index in zip(known.shape, np.nonzero(known), strict=True))
+    affine = np.stack([np.ones(len(rows)), columns, rows], axis=1)
+    smooth = np.stack([columns**i * rows ** (power - i) for power in (2, 3) for i in range(power + 1)], axis=1)
+    weights = 1 / np.sqrt(noise)[:, None]
+    beyond = smooth - affine @ np.linalg.lstsq(affine * weights, smooth * weights)[0]
+    fit = beyond @ np.linalg.pinv(beyond * weights) * weights.T
+    return float(np.sqrt(max(float(np.mean(((fit @ shifts[known]) ** 2).sum(axis=-1) - fit**2 @ noise)), 0)))

@@ -15,7 +15,7 @@ from photonpano.geometry import corners, jacobian
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import DARK_JUMP, SHOTS
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
-from photonpano.residuals.lens import lens_distortion
+from photonpano.residuals.lens import deformation_px, lens_distortion
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
 from photonpano.values import BoolArray, Decision, Located
@@ -267,21 +267,8 @@ def _lens(run: _Run) -> _Found | None:
     "look at the arrows in the report; correct the lens or the rolling shutter before",
 )
 def _deformation(run: _Run) -> _Found | None:
-    shifts, information = run.explained.residuals.block_shifts()
-    known = information[..., 0, 0] > 0
-    if not known.any():
-        return None
-    noise = np.trace(np.linalg.inv(information[known]), axis1=-2, axis2=-1)
-    # A shift, roll, zoom or shear of the whole frame is no deformation. Shifts that change from block to block are those of
-    # edges, interpolated at different fractions of a pixel.
-    rows, columns = (np.linspace(-1, 1, n)[index] for n, index in zip(known.shape, np.nonzero(known), strict=True))
-    affine = np.stack([np.ones(len(rows)), columns, rows], axis=1)
-    smooth = np.stack([columns**i * rows ** (power - i) for power in (2, 3) for i in range(power + 1)], axis=1)
-    weights = 1 / np.sqrt(noise)[:, None]
-    beyond = smooth - affine @ np.linalg.lstsq(affine * weights, smooth * weights)[0]
-    fit = beyond @ np.linalg.pinv(beyond * weights) * weights.T
-    size = float(np.sqrt(max(float(np.mean(((fit @ shifts[known]) ** 2).sum(axis=-1) - fit**2 @ noise)), 0)))
-    return _Found(size, "px, over the frame")
+    size = deformation_px(*run.explained.residuals.block_shifts())
+    return None if size is None else _Found(size, "px, over the frame")
 
 
 @_doubtful_above(1.0, "no motion is known", "use smaller groups, or more light")
