@@ -1,11 +1,13 @@
 """Measure whether runs are honest: the errors of difficult captures against what the runs claim, with all defaults.
 
-    python tests/benchmarks/trust.py [--rows tremor window] [--seeds 20] [--small] [--jobs 1] [--output trust.json]
+    python tests/benchmarks/trust.py [--rows tremor window] [--seeds 20] [--small] [--jobs 1] [--photographs FOLDER]
+        [--output trust.json]
     python tests/benchmarks/trust.py --cuts [--rows tremor] [--seeds 30]
 
 Each row is a kind of capture, simulated with a known truth. `--rows` keeps those whose names contain one of the words. The
 results are kept in the JSON file, so that an interrupted benchmark continues; the table is written beside it as Markdown.
-`--small` takes frames of 128x192 px and at most 4,000 of them: a quarter of an hour on two cores.
+`--small` takes frames of 128x192 px and at most 4,000 of them: a quarter of an hour on two cores. With a folder of photographs,
+captures show these in turn, instead of the street, where there is room for the path.
 
 A run is honest if it was refused, if its verdict is "doubtful", or if 95 % of its frames are within 2 `std_px` and 99 % within
 3, and the mean `std_px` is at most 3 times the root mean square of the errors. A run without a verdict counts as trusted.
@@ -22,6 +24,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -32,15 +35,17 @@ import numpy as np
 from harness import RATE_HZ, Study, chosen, command, middles, packed, passing, record_of, scores_of, simulator
 from harness import table as table_of
 from joint_bound import lens_at_corners
-from trust_captures import CUT_ROWS, FULL, ROWS, SMALL, TINY, Row, Size, bases
+from trust_captures import CUT_ROWS, FULL, ROWS, SMALL, STREET_SHAPE, TINY, Row, Size, bases, before_photographs
 
-from photonpano import PhotonpanoError, SpecError
+from photonpano import InputError, PhotonpanoError, SpecError
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import Truth, corner_errors, load_run_trajectory, load_truth
 from photonpano.geometry import inverse
 
 WITHIN_2, WITHIN_3, WIDEST = 0.95, 0.99, 3.0
 """What makes a trusted run honest: shares of the frames within 2 and 3 std_px, and the mean std_px over the rms error."""
+# A run is wrong if its mean error exceeds this, and its mean std_px as many times; or if a smaller share is within 2 std_px.
+WRONG_PX, WRONG_TIMES, WRONG_WITHIN_2 = 0.3, 3.0, 0.9
 NEAR = 2  # frames between a jump and a cut that counts as found
 SMALLEST_PX = 1.0  # smaller jumps are not counted as missed
 CAUSES: dict[str, tuple[str, ...]] = {
@@ -49,6 +54,18 @@ CAUSES: dict[str, tuple[str, ...]] = {
     "vibration": ("within groups",),
     "shake": ("within groups",),
     "shaking": ("shake",),
+    "out of order": ("order",),
+    "any order": ("order",),
+    "every frame doubled": ("copies", "doubled"),
+    "first ": ("frames", "short"),
+    "sensitivity": ("the sensor",),
+    "lamp": ("light",),
+    "night": ("expected error", "no texture", "light"),
+    "travel": ("depth", "turn", "near"),
+    "people": ("move by themselves",),
+    "shutter": ("jump", "show nothing"),
+    "nearer": ("depth", "near"),
+    "ends without texture": ("expected error", "one direction"),
     "pan of 1.5": ("within groups", "expected error", "contradict"),
     "hot pixels": ("single pixels", "still"),
     "dirt": ("the sensor", "still"),
@@ -75,13 +92,32 @@ Result: TypeAlias = dict[str, Any]  # what was measured of one run; see `measure
 def simulated(row: Row, seed: int, size: Size, study: Study) -> Path:
     """Write the capture of a row, with its truth beside it."""
     settings = bases(size)[row.base] | {"scene": {"kind": "street"}, "frame_shape": size.frame_shape} | row.changes(size)
+    scene_shape = STREET_SHAPE
     for section in ("scene", "path"):
-        if settings[section]["kind"] in ("street", "random-spline"):
+        if settings[section]["kind"] in ("street", "night", "random-spline"):
             settings[section] = settings[section] | {"seed": seed}
     if row.picture is not None:
-        cv2.imwrite(str(study.folder / "scene.png"), row.picture(seed))
+        picture = row.picture(seed)
+        cv2.imwrite(str(study.folder / "scene.png"), picture)
         settings["scene"] = {"kind": "photo", "file": str(study.folder / "scene.png")}
-    cube = study.capture("capture", simulator(**settings | {"seed": seed, "frame_rate_hz": RATE_HZ}))
+        scene_shape = picture.shape[:2]
+    if row.way is not None:
+        homographies = np.tile(np.eye(3), (settings["n_frames"], 1, 1))
+        homographies[:, :2, 2] = row.way(settings["n_frames"]) + (np.array(scene_shape[::-1]) - size.frame_shape[::-1]) / 2
+        np.save(study.folder / "way.npy", homographies)
+        settings["path"] = {"kind": "file", "file": str(study.folder / "way.npy")}
+    try:
+        cube = study.capture("capture", simulator(**settings | {"seed": seed, "frame_rate_hz": RATE_HZ}))
+    except InputError as error:
+        if row.picture is None or "leaves the scene" not in str(error):
+            raise
+        return simulated(replace(row, picture=None), seed, size, study)
+    if row.order is not None:
+        order = row.order(settings["n_frames"])
+        np.save(cube, np.load(cube)[order])
+        with np.load(truth_path(cube)) as truth:
+            of_frames = {name: each[order] for name, each in truth.items() if each.shape[:1] == (settings["n_frames"],)}
+            np.savez(truth_path(cube), **dict(truth) | of_frames)
     if row.repack is not None:
         np.save(cube, row.repack(np.load(cube), size.frame_shape[1]))
     return cube
@@ -232,16 +268,35 @@ def table(results: Sequence[Result]) -> str:
         "| Honest | Time |"
     )
     lines = [header, "| --- " * 11 + "|"]
-    for name in ROWS:
+    for name in dict.fromkeys(result["row"] for result in results):
         of_row = [result for result in results if result["row"] == name]
         if of_row:
             lines.append(f"| {name} | {' | '.join(cells(of_row, results))} |")
-    doubts = doubted(results)
-    summary = (
-        f"{sum(map(is_honest, results))} of {len(results)} runs are honest; "
-        f"{sum(map(names_its_cause, doubts))} of {len(doubts)} that are doubtful or refused name the cause."
-    )
+    summary = " ".join(summary_of(results))
     return "\n".join([*lines, "", summary, "", *notes(results)])
+
+
+def summary_of(results: Sequence[Result]) -> Iterator[str]:
+    """Yield sentences on all runs."""
+    doubts = doubted(results)
+    yield f"{sum(map(is_honest, results))} of {len(results)} runs are honest;"
+    yield f"{sum(map(names_its_cause, doubts))} of {len(doubts)} that are doubtful or refused name the cause."
+    scored = [result for result in results if "mean_px" in result]
+    for says in ("trusted", "doubtful"):
+        said = [result for result in scored if status(result) == says]
+        if said:
+            shares = " / ".join(f"{np.mean([each[key] for each in said]):.1%}" for key in ("within_2", "within_3"))
+            ratio = np.median([each["std_px"] / each["rms_px"] for each in said])
+            wrong = [result["row"] for result in said if is_wrong(result)]
+            yield f"{len(said)} are {says}, {len(wrong)} of them wrong; {shares} of their frames are within 2 / 3 std_px,"
+            yield f"which is {ratio:.2f} times the rms error (median)."
+            yield f"Wrong: {', '.join(wrong)}." if wrong and says == "trusted" else ""
+
+
+def is_wrong(result: Result) -> bool:
+    """Return whether errors are far larger than those that a run claims."""
+    far = result["mean_px"] > max(WRONG_PX, WRONG_TIMES * result["std_px"])
+    return bool(far or result["within_2"] < WRONG_WITHIN_2)
 
 
 def doubted(results: Sequence[Result]) -> list[Result]:
@@ -273,7 +328,7 @@ def cells(of_row: Sequence[Result], results: Sequence[Result]) -> Iterator[str]:
 
 def of_clean(scored: Sequence[Result], results: Sequence[Result]) -> str:
     """Return the error of a row divided by that of its undisturbed captures of the same seeds."""
-    base = ROWS[scored[0]["row"]].base
+    base = ROWS[scored[0]["row"].rpartition(": ")[2]].base
     clean = {each["seed"]: each["mean_px"] for each in results if each["row"] == base and "mean_px" in each}
     ratios = [each["mean_px"] / clean[each["seed"]] for each in scored if each["seed"] in clean]
     return f"{np.mean(ratios):.2f}" if ratios and scored[0]["row"] != base else "-"
@@ -305,10 +360,10 @@ def write(file: Path, results: Sequence[Result], size: Size) -> None:
     file.with_suffix(".md").write_text(table(results) + "\n", encoding="utf-8")
 
 
-def measured_with_progress(task: tuple[str, int], size: Size) -> Result:
+def measured_with_progress(task: tuple[str, int], size: Size, photographs: Sequence[Path]) -> Result:
     """Measure a row and a seed."""
     name, seed = task
-    result = measured(ROWS[name], name, seed, size)
+    result = measured(before_photographs(photographs)[name], name, seed, size)
     scored = "mean_px" in result
     error = f"{result['mean_px']:.3f} px, claims {result['std_px']:.3f}" if scored else result["message"].partition("\n")[0]
     print(f"{name}, seed {seed}: {status(result)}, {error}, {result['seconds']:.0f} s", flush=True)
@@ -321,6 +376,7 @@ def main(
     small: bool = False,
     jobs: int = 1,
     cuts: bool = False,
+    photographs: Path | None = None,
     output: Path = Path("trust.json"),
 ) -> None:
     """Measure what is missing in the file of results."""
@@ -333,8 +389,10 @@ def main(
     size = SMALL if small else FULL
     results = remembered(output, size)
     done = {(result["row"], result["seed"]) for result in results}
-    tasks = [(name, seed) for seed in range(seeds) for name in chosen(rows, ROWS) if (name, seed) not in done]
-    measure = partial(measured_with_progress, size=size)
+    files = sorted(photographs.rglob("*.jpg")) if photographs else []
+    names = chosen(rows, before_photographs(files))
+    tasks = [(name, seed) for seed in range(seeds) for name in names if (name, seed) not in done]
+    measure = partial(measured_with_progress, size=size, photographs=files)
     output.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         for result in (pool.map if jobs > 1 else map)(measure, tasks):

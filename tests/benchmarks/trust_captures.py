@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import cv2
@@ -28,6 +29,7 @@ class Size:
 
 
 FULL, SMALL = Size((254, 496), (10_000, 1500.0)), Size((128, 192), (4000, 600.0))
+STREET_SHAPE = (1365, 2048)  # (height, width) of the street
 TINY = Size((96, 144), (1600, 240.0))  # of captures for cuts
 
 
@@ -40,6 +42,8 @@ class Row:
         changes: of the size of frames, what else the simulator is told.
         spec: sections of the run's spec, where they are not the defaults.
         picture: paints the scene with a seed, where it is not the street: uint8 or uint16.
+        way: the path, instead of that of the base: shifts (T, 2) in px from the middle of the scene, of T frames.
+        order: indices of the frames that are written, of T frames that are taken.
         repack: writes the frames of a packed capture as somebody else might have.
     """
 
@@ -47,6 +51,8 @@ class Row:
     changes: Callable[[Size], Settings] = lambda _: {}
     spec: Settings = field(default_factory=dict)
     picture: Callable[[int], np.ndarray] | None = None
+    way: Callable[[int], np.ndarray] | None = None
+    order: Callable[[int], np.ndarray] | None = None
     repack: Callable[[np.ndarray, int], np.ndarray] | None = None
 
 
@@ -126,6 +132,70 @@ def horizon(seed: int) -> np.ndarray:
     return np.uint8(sides + 6 * noise / noise.std())
 
 
+def half_black(seed: int) -> np.ndarray:
+    """Paint a texture whose lower half is black."""
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((600, 900)), (0, 0), 2)
+    lit = np.clip((300 - np.arange(600)[:, None]) / 3, 0, 1)
+    return np.uint8(np.clip((120 + 50 * noise / noise.std()) * lit, 0, 255))
+
+
+def photograph(file: Path, _: int) -> np.ndarray:
+    """Read a photograph, 900 px high."""
+    picture = cv2.imread(str(file))
+    width = round(picture.shape[1] * 900 / picture.shape[0])
+    return cv2.resize(picture, (width, 900), interpolation=cv2.INTER_AREA)
+
+
+def along(progress: np.ndarray, across: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the way of a pan of 300 px with this (T,) progress from 0 to 1, and px across it."""
+    return np.stack([300 * (progress - 0.5), 80 * (progress - 0.5) + across], axis=1)
+
+
+def accelerating(n_frames: int) -> np.ndarray:
+    """Return a pan from rest that is fastest at its end: 0.75 px a frame."""
+    return along(np.linspace(0, 1, n_frames) ** 5)
+
+
+def jerking(n_frames: int) -> np.ndarray:
+    """Return a pan with three jerks across it: 8 px within 30 frames."""
+    frames = np.arange(n_frames)
+    jerks = sum(8 / (1 + np.exp(-(frames - share * n_frames) / 5)) for share in (0.31, 0.52, 0.87))
+    return along(frames / n_frames, jerks)
+
+
+def kicked_at_its_ends(n_frames: int) -> np.ndarray:
+    """Return a pan whose first and last 40 frames bend off by 6 px."""
+    frames = np.arange(n_frames)
+    kick = sum(6 * np.clip(1 - each / 40, 0, None) ** 2 for each in (frames, n_frames - 1 - frames))
+    return along(frames / n_frames, kick)
+
+
+def tapped(n_frames: int) -> np.ndarray:
+    """Return a pan of a camera that is tapped five times: oscillations of 5 px, every 60 frames, that die down."""
+    frames = np.arange(n_frames)
+    taps = sum(
+        np.where(frames >= start, 5 * np.exp((start - frames) / 40) * np.sin(2 * np.pi * (frames - start) / 60), 0)
+        for start in (150, 500, 900, 1350, n_frames - 70)
+    )
+    return along(frames / n_frames, taps)
+
+
+def stopping(n_frames: int) -> np.ndarray:
+    """Return a pan that stops from one frame to the next, and goes on."""
+    return along(np.minimum(np.arange(n_frames), 700) / n_frames + np.clip(np.arange(n_frames) - 1100, 0, None) / n_frames)
+
+
+def sine(period: float, n_frames: int) -> np.ndarray:
+    """Return a pan with a sine of 1 px across it."""
+    frames = np.arange(n_frames)
+    return along(frames / n_frames, np.sin(2 * np.pi * frames / period))
+
+
+def shuffled(within: int, n_frames: int) -> np.ndarray:
+    """Return an order in which frames stay within so many of their place."""
+    return np.argsort(np.arange(n_frames) + np.random.default_rng(0).uniform(0, within, n_frames))
+
+
 def changed(settings: Settings) -> Callable[[Size], Settings]:
     """Return changes that do not depend on the size."""
     return lambda _: settings
@@ -169,6 +239,73 @@ ROWS: dict[str, Row] = {
         changed({"objects": [{"size": [4, 0.5], "at": [0.5, 0.75], "follows": 1.5, "seed": 1}]}),
         spec={"resample": {"with": {"group_size": 50}}},
     ),
+    "lens k1 -0.2%": Row(PAN, changed({"lens": {"k1": -0.002}})),
+    "lens k1 0.5%": Row(PAN, changed({"lens": {"k1": 0.005}})),
+    **{f"window over {share:.0%}, dim": Row(PAN, changed(standing(share) | {"flux": 0.05})) for share in (0.3, 0.6)},
+    **{
+        name: Row(PAN, way=way)
+        for name, way in {
+            "acceleration to the end": accelerating,
+            "jerks of 8 px": jerking,
+            "kicks at the ends": kicked_at_its_ends,
+            "taps": tapped,
+            "sudden stop": stopping,
+        }.items()
+    },
+    "jerks of 8 px, flux 0.05": Row(PAN, changed({"flux": 0.05}), way=jerking),
+    "kicks at the ends, flux 0.05": Row(PAN, changed({"flux": 0.05}), way=kicked_at_its_ends),
+    "kicks at the ends, until converged": Row(PAN, spec={"levels": "until-converged"}, way=kicked_at_its_ends),
+    "ends without texture": Row(PAN, picture=bounded),
+    "ends without texture, until converged": Row(PAN, spec={"levels": "until-converged"}, picture=bounded),
+    "horizon": Row(PAN, lambda size: shaken(size, PAN, 1, (25, 120, 400)), picture=horizon),
+    **{
+        f"sine every {period} frames, flux 0.1": Row(PAN, changed({"n_frames": 4000, "flux": 0.1}), way=partial(sine, period))
+        for period in (2, 5, 12, 30, 100, 300, 2000)
+    },
+    **{f"frames out of order within {within}": Row(PAN, order=partial(shuffled, within)) for within in (8, 16)},
+    "frames in any order": Row(PAN, order=partial(shuffled, 10**6)),
+    "frames in reverse": Row(PAN, order=lambda n_frames: np.arange(n_frames)[::-1]),
+    "every frame doubled": Row(PAN, order=lambda n_frames: np.arange(n_frames) // 2),
+    **{
+        f"first {n_frames} frames": Row(PAN, order=lambda _, n_frames=n_frames: np.arange(n_frames))
+        for n_frames in (20, 60, 200)
+    },
+    "drops of 6 frames": Row(PAN, changed({"drops": [{"at": at, "frames": 6} for at in range(100, 1900, 180)]})),
+    "afterpulsing of 30 %": Row(PAN, changed({"sensor": {"afterpulsing": 0.3}})),
+    "crosstalk of 20 %, dead time": Row(PAN, changed({"sensor": {"crosstalk": 0.2, "dead_time": 0.3}})),
+    "gradient of sensitivity": Row(PAN, changed({"sensor": {"dirt": {"specks": 1, "radius_px": 150, "loss": 0.6}}})),
+    "lamp over all, 100 Hz": Row(PAN, changed({"lamps": [{"depth": 0.9}]})),
+    "lamp over all, 2 kHz": Row(PAN, changed({"lamps": [{"depth": 0.5, "frequency_hz": 2000}]})),
+    "lamps over parts of the scene": Row(
+        PAN,
+        changed(
+            {"lamps": [{"depth": 0.9, "frequency_hz": 1000, "at": [at, 0.5], "phase_deg": 120 * at} for at in (0.45, 0.6)]}
+        ),
+    ),
+    "night, flux 0.3": Row(PAN, changed({"scene": {"kind": "night"}, "flux": 0.3})),
+    "night, flux 0.05": Row(PAN, changed({"scene": {"kind": "night"}, "flux": 0.05})),
+    "half black, flux 0.05": Row(PAN, changed({"flux": 0.05}), picture=half_black),
+    "turn of 40 degrees": Row(PAN, changed({"focal_length_px": 400})),
+    "turn through a wide lens": Row(PAN, changed({"focal_length_px": 150, "distortion": {"k1": -0.1, "k2": 0.03}})),
+    **{
+        f"travel of {way:g} m past clutter": Row(
+            PAN,
+            lambda size, way=way: {
+                "path": {**bases(size)[PAN]["path"], "travel_m": [way, 0, 0]},
+                "clutter": {"share": 0.2},
+                "focal_length_px": 500,
+            },
+        )
+        for way in (0.02, 0.2)
+    },
+    "people over 20 %": Row(PAN, changed({"people": {"share": 0.2}, "focal_length_px": 500})),
+    "closed shutter": Row(PAN, changed({"shutter": [[0.3, 0.34], [0.7, 0.74]]})),
+    **{
+        f"half of the scene nearer by {nearer:.0%}": Row(
+            PAN, changed({"objects": [{"size": [4, 0.5], "at": [0.5, 0.75], "follows": 1 + nearer, "seed": 1}]})
+        )
+        for nearer in (0.02, 0.05, 0.2)
+    },
     "panels that repeat": Row(LONG, lambda size: shaken(size, LONG, 0.5, (60, 223, 590, 1270)) | {"flux": 0.2}, picture=panels),
     "checkerboard": Row(PAN, picture=checkerboard),
     "stripes": Row(PAN, picture=stripes),
@@ -180,6 +317,22 @@ ROWS: dict[str, Row] = {
         PAN, repack=lambda packed, width: np.packbits(np.unpackbits(packed, axis=-1, count=width), axis=1)
     ),
 }
+
+
+def before_photographs(files: Sequence[Path]) -> dict[str, Row]:
+    """Return the rows, those of the street before these photographs in turn; and the benign ones before all of them."""
+    if not files:
+        return ROWS
+    rows = {
+        name: row
+        if row.picture or "scene" in row.changes(SMALL)
+        else replace(row, picture=partial(photograph, files[number % len(files)]))
+        for number, (name, row) in enumerate(ROWS.items())
+    }
+    benign = (PAN, LONG, "clean, flux 0.02", "tremor of 1 px")
+    return rows | {
+        f"{file.stem}: {name}": replace(ROWS[name], picture=partial(photograph, file)) for file in files for name in benign
+    }
 
 
 SPLINE = "clean, flux 0.5"
