@@ -45,7 +45,7 @@ class ShortSpansRefiner:
         if len(residuals.spans) < _FEWEST_SPANS:
             return None
         to_px = np.array([1, 1, self._radius_px, self._radius_px])
-        variances = _variances(residuals.information) * to_px**2
+        variances = residuals.variances * to_px**2
         steps = residuals.steps * to_px
         instants = np.array([span.centre for span in residuals.spans])
         noise = variances[:, 0]
@@ -96,16 +96,6 @@ class ShortSpansRefiner:
         if self._rate is None:
             return f", mostly with periods of {' and '.join(f'{1 / each:.0f}' for each in cycles)} frames"
         return f", mostly at {' and '.join(f'{self._rate * each:,.0f}' for each in cycles)} Hz"
-
-
-def _variances(information: FloatArray) -> FloatArray:
-    """Return the variances of (S, 4) steps; infinite where the photons do not determine one."""
-    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), 0))
-    known = scale > 0
-    unit = information / np.where(known, scale, 1)[:, :, None] / np.where(known, scale, 1)[:, None, :]
-    inverted = np.linalg.pinv(unit, hermitian=True)
-    variances = np.diagonal(inverted, axis1=1, axis2=2) / np.where(known, scale, 1) ** 2
-    return np.where(known & (variances > 0), variances, np.inf)
 
 
 def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> Filtered:

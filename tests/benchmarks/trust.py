@@ -363,7 +363,7 @@ def write(file: Path, results: Sequence[Result], size: Size) -> None:
 def measured_with_progress(task: tuple[str, int], size: Size, photographs: Sequence[Path]) -> Result:
     """Measure a row and a seed."""
     name, seed = task
-    result = measured(before_photographs(photographs)[name], name, seed, size)
+    result = measured(before_photographs(photographs, size)[name], name, seed, size)
     scored = "mean_px" in result
     error = f"{result['mean_px']:.3f} px, claims {result['std_px']:.3f}" if scored else result["message"].partition("\n")[0]
     print(f"{name}, seed {seed}: {status(result)}, {error}, {result['seconds']:.0f} s", flush=True)
@@ -390,7 +390,7 @@ def main(
     results = remembered(output, size)
     done = {(result["row"], result["seed"]) for result in results}
     files = sorted(photographs.rglob("*.jpg")) if photographs else []
-    names = chosen(rows, before_photographs(files))
+    names = chosen(rows, before_photographs(files, size))
     tasks = [(name, seed) for seed in range(seeds) for name in names if (name, seed) not in done]
     measure = partial(measured_with_progress, size=size, photographs=files)
     output.parent.mkdir(parents=True, exist_ok=True)

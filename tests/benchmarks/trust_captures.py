@@ -139,11 +139,11 @@ def half_black(seed: int) -> np.ndarray:
     return np.uint8(np.clip((120 + 50 * noise / noise.std()) * lit, 0, 255))
 
 
-def photograph(file: Path, _: int) -> np.ndarray:
-    """Read a photograph, 900 px high."""
-    picture = cv2.imread(str(file))
-    width = round(picture.shape[1] * 900 / picture.shape[0])
-    return cv2.resize(picture, (width, 900), interpolation=cv2.INTER_AREA)
+def photograph(file: Path, size: Size, _: int) -> np.ndarray:
+    """Read a photograph, five times as high as a frame."""
+    picture, height = cv2.imread(str(file)), 5 * size.frame_shape[0]
+    width = round(picture.shape[1] * height / picture.shape[0])
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def along(progress: np.ndarray, across: np.ndarray | float = 0.0) -> np.ndarray:
@@ -319,19 +319,21 @@ ROWS: dict[str, Row] = {
 }
 
 
-def before_photographs(files: Sequence[Path]) -> dict[str, Row]:
+def before_photographs(files: Sequence[Path], size: Size) -> dict[str, Row]:
     """Return the rows, those of the street before these photographs in turn; and the benign ones before all of them."""
     if not files:
         return ROWS
     rows = {
         name: row
-        if row.picture or "scene" in row.changes(SMALL)
-        else replace(row, picture=partial(photograph, files[number % len(files)]))
+        if row.picture or "scene" in row.changes(size)
+        else replace(row, picture=partial(photograph, files[number % len(files)], size))
         for number, (name, row) in enumerate(ROWS.items())
     }
     benign = (PAN, LONG, "clean, flux 0.02", "tremor of 1 px")
     return rows | {
-        f"{file.stem}: {name}": replace(ROWS[name], picture=partial(photograph, file)) for file in files for name in benign
+        f"{file.stem}: {name}": replace(ROWS[name], picture=partial(photograph, file, size))
+        for file in files
+        for name in benign
     }
 
 

@@ -118,7 +118,7 @@ def solve(
     if model.kind == "auto":
         tied, fits = _of_background(tied, start, _rivals(tied, start, model))
         chosen = _chosen(tied, fits)
-        solution = tied.solution(fits[chosen], chosen, lambda: Evidence.of(_costs(fits)))
+        solution = tied.solution(fits[chosen], replace(chosen, chosen=True), lambda: Evidence.of(_costs(fits)))
         turned = next((fit for model, fit in fits.items() if chosen.is_simple and model.kind == "rotation"), None)
         return solution if turned is None else replace(solution, assess=partial(_doubting, tied, solution, turned))
     tied, fits = _of_background(tied, start, {model: _fitted(tied, start, model)})

@@ -82,8 +82,7 @@ class State:
         if self.motion.camera is not None:
             motion = RotationTrajectory(motion, self.motion.camera, self.reference)
         result = self.results[-1]
-        model = replace(result.located.solution.model, chosen=self.model.kind == "auto")
-        again = replace(self, model=model).located([result.level], motion, corrects=True)
+        again = replace(self, model=result.located.solution.model).located([result.level], motion, corrects=True)
         again = replace(again, refined=None, known_fit=None)
         known, before = self.motion.std_px, replace(self, refined=None).motion.std_px
         finite = np.isfinite(known) & np.isfinite(before)

@@ -29,7 +29,7 @@ from photonpano.report.drawing import (
 )
 from photonpano.residuals.block_sums import BLOCK_PX, M, R
 from photonpano.residuals.measure import Residuals
-from photonpano.values import FloatArray, Light
+from photonpano.values import FloatArray, Light, SpanResiduals
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
@@ -102,7 +102,7 @@ def over_sensor(residuals: Residuals) -> str:
 def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
     """Draw the shifts of short spans beyond the motion with the scatter that noise explains, and their spectrum."""
     found = residuals.steps()
-    steps, stds = found.steps[:, :2], _noise_px(found.information)
+    steps, stds = found.steps[:, :2], _noise_px(found)
     with plain_figure(WIDTH_IN, 5.2) as figure:
         time, spectrum = add_axes(figure, Margins(top=0.35), rows=(1, 1), gap_in=0.6)
         shown = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), MAX_DOTS)).round().astype(int))
@@ -164,7 +164,7 @@ def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     the whole panorama. Returns (F,) frequencies in cycles per frame, and (F,) power; both empty for fewer than 16 spans.
     """
     found = residuals.steps()
-    stds = _noise_px(found.information)
+    stds = _noise_px(found)
     ratios = np.where(np.isfinite(stds), found.steps[:, :2] / stds, 0)
     if len(ratios) < _FEWEST_SPANS:
         return np.zeros(0), np.zeros(0)
@@ -212,10 +212,9 @@ def _brightness(residuals: Residuals) -> FloatArray:
     return gain
 
 
-def _noise_px(information: FloatArray) -> FloatArray:
+def _noise_px(found: SpanResiduals) -> FloatArray:
     """Return the standard deviation of the shifts along x and y that noise and interpolation explain: (S, 2)."""
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.sqrt(1 / np.diagonal(information, axis1=1, axis2=2)[:, :2].clip(min=0) + SYSTEMATIC_PX**2))
+    return np.asarray(np.sqrt(found.variances[:, :2] + SYSTEMATIC_PX**2))
 
 
 def _add_colour_bar(axes: Axes, image: Any, label: str, numbers: str = "{x:.3g}") -> None:

@@ -50,6 +50,7 @@ _PROBES = 8  # instants at which the noise of a shift is predicted
 # Information that keeps the equations of a span regular: a shift is below 10 px, a roll or a zoom below 0.1, and the light
 # changes by less than a factor of 10.
 _PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
+_SHRUNK = 0.5  # share of what is known of the shift of a single frame that comes from it, from which on the photons say nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,17 +185,24 @@ def _shaking(spans: Sequence[FrameSpan], size: int, predictions: Predictions, co
     taken = np.unique(np.linspace(0, len(starts) - 1, max(1, int(frames_taken) // length)).astype(int))
     windows = [np.arange(starts[index], starts[index] + length) for index in taken]
     results = context.in_order(partial(_of_single_frames, predictions), windows)
-    steps, information = (np.array(each) for each in zip(*results, strict=True))
-    known = np.maximum(np.diagonal(information, axis1=2, axis2=3)[..., :2], 0)
-    with np.errstate(divide="ignore"):
-        return find_shaking(steps[..., :2], 1 / known, size)
+    shifts, variances = (np.array(each) for each in zip(*results, strict=True))
+    return find_shaking(shifts, variances, size)
 
 
 def _of_single_frames(predictions: Predictions, frames: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-    """Return the steps of F frames, (F, 4), and their information, (F, 4, 4)."""
+    """Return the shifts of F frames, (F, 2), and their variances, infinite without texture.
+
+    Roll and zoom are held: the photons of a single frame hardly carry them, and they would add their noise to the shifts.
+    """
     spans = [FrameSpan(frame, frame + 1) for frame in frames.tolist()]
     (normal, gradient, _), _ = _measured(predictions, spans, predictions.first.trajectory.at(frames), slice(None))
-    return _solved(normal, gradient)
+    kept = [0, 1, N_STEPS]
+    information, right = normal[:, kept][:, :, kept], gradient[:, kept]
+    covariance = np.linalg.inv(information + np.diag(_PRIOR[kept]))
+    # What the prior alone holds is not known.
+    variances = np.diagonal(covariance @ information @ covariance, axis1=1, axis2=2)[:, :2]
+    shrunk = np.diagonal(covariance, axis1=1, axis2=2)[:, :2] * _PRIOR[:2] > _SHRUNK
+    return (covariance @ right[..., None])[:, :2, 0], np.where(shrunk, np.inf, variances)
 
 
 def spans_of(span: FrameSpan, predictions: Predictions, longest: int = _LONGEST) -> tuple[int, tuple[FrameSpan, ...]]:

@@ -121,10 +121,7 @@ def _series(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
     radius_px = float(np.linalg.norm(shape[0] - shape.mean(axis=0)))
     to_px = np.array([1, 1, radius_px, radius_px])
     found = residuals.steps()
-    information = np.maximum(np.diagonal(found.information, axis1=1, axis2=2), 0)
-    with np.errstate(divide="ignore"):
-        variances = to_px**2 / information + SYSTEMATIC_PX**2
-    return found.steps * to_px, variances
+    return found.steps * to_px, found.variances * to_px**2 + SYSTEMATIC_PX**2
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from photonpano.values.arrays import FloatArray, Homography
 from photonpano.values.frames import FrameSpan
+
+# Share by which information is raised so that it can be inverted, and a floor on it.
+_SINGULAR, _TINY = 1e-9, 1e-200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +107,17 @@ class SpanResiduals:
     spans: tuple[FrameSpan, ...]
     steps: FloatArray
     information: FloatArray
+
+    @property
+    def variances(self) -> FloatArray:
+        """The variances of the steps, (S, 4), if all are unknown; infinite where the photons determine none."""
+        scale = np.sqrt(np.maximum(np.diagonal(self.information, axis1=1, axis2=2), _TINY))
+        unit = self.information / scale[:, :, None]
+        unit /= scale[:, None, :]
+        unit[:, range(4), range(4)] = 1 + _SINGULAR
+        variances = np.diagonal(np.linalg.inv(unit), axis1=1, axis2=2)
+        known = (scale**2 > _TINY) & (variances < 0.1 / _SINGULAR)
+        return np.where(known, variances / scale**2, np.inf)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
