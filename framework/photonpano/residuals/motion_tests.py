@@ -1,0 +1,145 @@
+"""Tests of the motion: its errors, and the decisions that led to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from photonpano.geometry import corners, jacobian
+from photonpano.motion.timeline import DARK_JUMP
+from photonpano.residuals.reasons import Found, Reason, TestedRun, Tests
+from photonpano.values import Located
+
+REPEATS = "the scene repeats, and pairs of exposures fit at several places"
+NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
+_ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
+
+MOTION_TESTS = Tests()
+
+
+@MOTION_TESTS.doubtful_above(1.0, "no motion is known", "use smaller groups, or more light")
+def _unknown(run: TestedRun) -> Found | None:
+    known = run.explained.motion.std_px[run.explained.motion.located]
+    return None if len(known) and np.isfinite(known).all() else Found(0.0, "a single exposure was located", doubtful=True)
+
+
+@MOTION_TESTS.doubtful_above(
+    2.0,
+    "the image says nothing of motion along one direction",
+    "the motion may be wrong by any distance along it, which this panorama does not show; keep other structures in view",
+)
+def _one_direction(run: TestedRun) -> Found | None:
+    located = run.levels[-1].located if run.levels else None
+    pairs = [] if located is None else [edge.motion for edge in located.edges if isinstance(edge.motion, Located)]
+    informed = [pair for pair in pairs if pair.information is not None]
+    if located is None or not informed:
+        return None
+    middle = corners(located.frame_shape).mean(axis=0)[None]
+    slopes = np.array([jacobian(pair.homography, middle)[0] for pair in informed])
+    covariances = slopes @ np.linalg.pinv(np.array([pair.information for pair in informed])) @ slopes.transpose(0, 2, 1)
+    variances, directions = np.linalg.eigh(np.median(covariances, axis=0))
+    strong, weak = np.sqrt(np.maximum(variances, 0)).tolist()
+    if weak < _ASLANT * strong:
+        return None
+    x, y = directions[:, 1]
+    angle = round(np.degrees(np.arctan2(y, x))) % 180
+    return Found(weak, f"px, the error of a pair at {angle} degrees from x towards y; {strong:.2g} px across")
+
+
+@MOTION_TESTS.doubtful_above(1.0, "the expected error of the motion is large", "use more light")
+def _uncertain(run: TestedRun) -> Found | None:
+    motion = run.explained.motion
+    known = motion.std_px[motion.located]
+    if not len(known) or not np.isfinite(known).all():
+        return None
+    worst = int(np.argmax(np.where(motion.located, motion.std_px, 0)))
+    return Found(float(known.mean()), f"px on average, most at frame {worst}")
+
+
+@MOTION_TESTS.doubtful_above(
+    0.1,
+    "pairs of exposures contradict each other, as where a scene repeats",
+    "look at the path in the report; use a slower motion, or smaller groups",
+)
+def _contradictions(run: TestedRun) -> Found | None:
+    return None if run.pairs is None else _contradicting(*run.pairs)
+
+
+def _contradicting(dropped: int, pairs: int) -> Found:
+    return Found(dropped / max(pairs, 1), f"{dropped} of {pairs} pairs of the last level")
+
+
+def contradictions(dropped: int, pairs: int) -> Reason | None:
+    """Judge the pairs of the last level, of which some, `dropped`, contradict the others."""
+    return _contradictions.reason(_contradicting(dropped, pairs))
+
+
+@MOTION_TESTS.doubtful_above(
+    3.0, NO_TURN, "write motion: {model: homography}, or find the lens with camera: {distortion: {k1: find}}"
+)
+def _no_turn(run: TestedRun) -> Found | None:
+    if not run.levels or run.levels[-1].located.solution.rotations is None:
+        return None
+    located = run.levels[-1].located
+    evidence, name = located.evidence, located.solution.model.name
+    if evidence is None or not {name, "homography"} <= evidence.rivals.keys():
+        return None
+    residual, free = np.sqrt([evidence.rivals[each].chi2 for each in (name, "homography")]).tolist()
+    where = f"residuals in units of their noise; those of any homographies are {free:.2g}"
+    return Found(residual, where, doubtful=not evidence.suffices(name))
+
+
+@MOTION_TESTS.doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")
+def _ambiguous(run: TestedRun) -> Found | None:
+    def found() -> Iterator[Found]:
+        for result in run.levels:
+            ambiguity, n_edges = result.located.ambiguity, len(result.located.edges)
+            # One or two pairs may be ambiguous by their noise.
+            if ambiguity is not None and len(ambiguity.pairs) > 2:
+                of_level = f"{len(ambiguity.pairs)} of {n_edges} pairs of level {result.level.number}"
+                yield Found(len(ambiguity.pairs) / max(n_edges, 1), f"{of_level}, {ambiguity.alternative_px:.0f} px away")
+
+    return max(found(), key=lambda each: each.figure > 0.05, default=None)
+
+
+@MOTION_TESTS.doubtful_above(
+    0.5,
+    "more than half of the frame stands still while the rest moves",
+    "mask what stands in the frame (corrections: mask); the motion may be that of either part",
+)
+def _standing(run: TestedRun) -> Found | None:
+    return run.decided("standing_share", "share of the parts that show motion or rest")
+
+
+@MOTION_TESTS.doubtful_above(
+    0.5,
+    "more than half of what the frames show does not follow one turn of the camera, as where it travels past near things",
+    "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
+)
+def _layers(run: TestedRun) -> Found | None:
+    # Later levels leave out what is near.
+    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
+    where = "share of the frames that is left out, on average"
+    if parallax:
+        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
+    return run.decided("movers", where)
+
+
+@MOTION_TESTS.doubtful_above(
+    0.35,
+    "the background of much of the panorama was never seen, as where one thing fills the middle of all frames",
+    "record so that each place is seen without what hides it; the motion may be that of what fills the frames",
+)
+def _never_seen(run: TestedRun) -> Found | None:
+    return run.decided("background_never_seen", "share of the panorama")
+
+
+@MOTION_TESTS.doubtful_above(
+    0,
+    "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
+    "leave these frames out, or keep the light on",
+)
+def _jump_in_the_dark(run: TestedRun) -> Found:
+    found = [str(each.value) for each in run.decisions if each.what == DARK_JUMP]
+    return Found(len(found), ", ".join(found))

@@ -1,0 +1,146 @@
+"""Tests of the residuals: what the photons show that the motion and the panorama do not explain."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
+from photonpano.residuals.lens import deformation_px, lens_distortion
+from photonpano.residuals.measure import Residuals
+from photonpano.residuals.reasons import Found, TestedRun, Tests
+from photonpano.values import BoolArray
+
+# Contrast of the residuals, as a share of the light, beyond which a large reduced chi-square counts.
+MAX_CONTRAST = 0.02
+_STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
+_MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
+
+RESIDUAL_TESTS = Tests()
+
+
+@RESIDUAL_TESTS.doubtful_above(
+    2.0,
+    "the image moves within groups by more than the motion that was found",
+    "use the refiner short-spans, or smaller groups (resample.with.group_size)",
+)
+def _fast_motion(run: TestedRun) -> Found:
+    return Found(run.explained.ratio, "scatter of the shifts of short spans over their noise")
+
+
+@RESIDUAL_TESTS.doubtful_above(
+    0.1,
+    "frames shake faster than the motion that was found can follow",
+    "use the refiner short-spans; if it was used, the photons do not carry this motion: use more light, or damp what shakes",
+)
+def _shaking(run: TestedRun) -> Found | None:
+    shaking = run.explained.residuals.shaking
+    where = f"px within spans, most with a period of {shaking.period_frames:.3g} frames"
+    return Found(shaking.size_px, where) if shaking.size_px else None
+
+
+@RESIDUAL_TESTS.doubtful_above(
+    1.1,
+    "the panorama does not explain the photons: they differ from its prediction by more than their noise",
+    "look at the maps of the report; the motion may be wrong, or the scene changes",
+)
+def _photons(run: TestedRun) -> Found | None:
+    residuals = run.explained.residuals
+    reduced_chi2 = float(residuals.reduced_chi2.mean())
+    sums = residuals.blocks.sum(axis=(0, 1))
+    per_span = sums / max(len(residuals.spans), 1)
+    n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
+    # The squared residual of a block beyond its variance, as a part of its photons.
+    contrast = float(np.sqrt(max(reduced_chi2 - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
+    return Found(reduced_chi2, f"on average by {contrast:.0%} of the light") if contrast > MAX_CONTRAST else None
+
+
+def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
+    """Return the share of the panorama that changes over time by more than noise explains, and its squares of 16 px: (h, w)."""
+    counted = residuals.cell_count >= _MIN_BLOCKS
+    expected = 1 + _STANDARD_DEVIATIONS * np.sqrt(2 / np.maximum(residuals.cell_count, 1))
+    contrast = np.sqrt(np.maximum(residuals.cell_chi2 - 1, 0) * residuals.cell_noise)
+    changing = counted & (residuals.cell_chi2 > np.maximum(expected, 1.5)) & (contrast > 0.05)
+    return float(changing.sum() / max(counted.sum(), 1)), changing
+
+
+@RESIDUAL_TESTS.doubtful_above(
+    0.03,
+    "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
+    "mask what moves (corrections: mask); the motion may be that of the thing instead of the scene",
+)
+def _moving(run: TestedRun) -> Found | None:
+    share, changing = changing_places(run.explained.residuals)
+    return Found(share, _box(changing, "px of the panorama")) if share else None
+
+
+@RESIDUAL_TESTS.doubtful_above(0.03, "the light changes over time", "keep the light steady, or shorten the capture")
+def _light(run: TestedRun) -> Found:
+    residuals = run.explained.residuals
+    # Relative to the mean light: in the dark between two flickers, an error of the gain matters little.
+    gains, stds = (each * residuals.light for each in residuals.gains())
+    change = float(np.sqrt(max(float(np.mean(gains**2 - stds**2)), 0)))
+    return Found(change, f"most at {residuals.spans[int(np.argmax(np.abs(gains) / np.maximum(stds, 1e-9)))]}")
+
+
+@RESIDUAL_TESTS.doubtful_above(
+    0.03,
+    "parts of the sensor count more or fewer photons than others, as with a vignette, dirt or a window in front of it",
+    "mask these pixels (corrections: mask), or divide by a flat field (corrections: flat-field)",
+)
+def _sensor(run: TestedRun) -> Found | None:
+    sums = run.explained.residuals.blocks
+    seen = sums[..., M] > 0
+    if not seen.any():
+        return None
+    gain = np.divide(sums[..., R], sums[..., M], out=np.zeros(seen.shape), where=seen)
+    noise = np.divide(sums[..., V], sums[..., M] ** 2, out=np.zeros(seen.shape), where=seen)
+    change = float(np.sqrt(max(np.mean((gain**2 - noise)[seen]), 0)))
+    y, x = (int(index) * BLOCK_PX + BLOCK_PX // 2 for index in np.unravel_index(np.argmax(np.abs(gain)), gain.shape))
+    return Found(change, f"most at pixel ({x}, {y}) of the frame")
+
+
+@RESIDUAL_TESTS.doubtful_above(
+    0.005,
+    "single pixels count far more, or far fewer, photons than the panorama predicts",
+    "mask them (corrections: hot-pixels)",
+)
+def _hot_pixels(run: TestedRun) -> Found:
+    predicted = run.explained.residuals.pixel_mean
+    known = predicted > 0
+    excess = np.abs(run.explained.residuals.pixel_gain - 1) * predicted
+    outlier = known & (excess > _STANDARD_DEVIATIONS * np.sqrt(predicted) + 5) & (excess > 0.5 * predicted)
+    return Found(float(outlier.sum() / max(known.sum(), 1)), f"{int(outlier.sum())} pixels")
+
+
+@RESIDUAL_TESTS.doubtful_above(
+    0.002,
+    "the lens distorts the frames, which bends the motion",
+    "write motion: {model: rotation} and camera: {distortion: {k1: find}} for a camera that only turns; or undistort the "
+    "frames before, or use their middle only (corrections: crop)",
+)
+def _lens(run: TestedRun) -> Found | None:
+    residuals, motion = run.explained.residuals, run.explained.motion
+    # Half of the threshold is seen without a lens; even a small distortion bends a long path.
+    found = lens_distortion(*residuals.block_shifts(), motion.homographies[motion.located], residuals.frame_shape)
+    # What else is not explained, such as a tremor, moves blocks by more than photon noise.
+    misfit = max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
+    if found is None or found.sigmas <= 5 * misfit:
+        return None
+    return Found(abs(found.k1), f"about {found.k1:.1%} at the corners")
+
+
+@RESIDUAL_TESTS.doubtful_above(
+    0.05,
+    "frames are deformed as no motion of the whole frame explains",
+    "look at the arrows in the report; correct the lens or the rolling shutter before",
+)
+def _deformation(run: TestedRun) -> Found | None:
+    size = deformation_px(*run.explained.residuals.block_shifts())
+    return None if size is None else Found(size, "px, over the frame")
+
+
+def _box(cells: BoolArray, unit: str) -> str:
+    y, x = np.nonzero(cells)
+    low, high = (int(np.quantile(y, q) * BLOCK_PX) for q in (0.05, 0.95))
+    left, right = (int(np.quantile(x, q) * BLOCK_PX) for q in (0.05, 0.95))
+    return f"mostly x {left} to {right + BLOCK_PX}, y {low} to {high + BLOCK_PX} in {unit}"
