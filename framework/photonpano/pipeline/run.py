@@ -20,6 +20,7 @@ from photonpano.pipeline.obstacles import naming_obstacles
 from photonpano.pipeline.pose_run import find_poses
 from photonpano.pipeline.refiners import build_refiners, refine
 from photonpano.pipeline.rendering import render_into
+from photonpano.pipeline.rival import beside_rival
 from photonpano.pipeline.run_steps import BegunRun, begun_run
 from photonpano.pipeline.shots import run_others
 from photonpano.record.run_json import record_of
@@ -121,6 +122,8 @@ def make_panorama(run: BegunRun) -> None:
         with naming_obstacles(run.source, journal):
             state = estimate(plan, run.source, journal, context)
         state, explained = refine(state, build_refiners(plan, state.view.source, journal))
+        explained, rivals = beside_rival(state, explained)
+        journal += rivals
         if (background := capture_of(state.source).background) is not None:
             journal.append(decision_of(background))
         source, context = state.view

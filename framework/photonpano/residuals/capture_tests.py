@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from photonpano.motion.timeline import SHOTS
-from photonpano.residuals.reasons import Found, TestedRun, Tests
+from photonpano.residuals.reasons import RIVAL, Found, TestedRun, Tests
 
 CAPTURE_TESTS = Tests()
 
@@ -30,3 +30,13 @@ def _given_camera(run: TestedRun) -> Found | None:
     what, unit = [("a focal length", " px"), ("k1", "")][freed.number]
     where = f"{what} of {freed.found:.4g} ± {freed.std:.2g}{unit} fits, {freed.given:.4g}{unit} is given; in expected errors"
     return Found(abs(freed.found - freed.given) / freed.std, where)
+
+
+@CAPTURE_TESTS.doubtful_above(
+    1.0,
+    "parts of the frame follow another motion than the one that was found",
+    "mask what does not belong to the scene (corrections: mask); the motion may be that of either part",
+)
+def _two_motions(run: TestedRun) -> Found | None:
+    found = next((each for each in run.decisions if each.what == RIVAL), None)
+    return Found(float(found.value), found.reason) if found else None

@@ -8,7 +8,7 @@ import numpy as np
 
 from photonpano.geometry import corners, jacobian
 from photonpano.motion.timeline import DARK_JUMP
-from photonpano.residuals.reasons import Found, Reason, TestedRun, Tests
+from photonpano.residuals.reasons import RIVAL, Found, Reason, TestedRun, Tests
 from photonpano.values import Located
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
@@ -51,7 +51,8 @@ def _one_direction(run: TestedRun) -> Found | None:
 def _uncertain(run: TestedRun) -> Found | None:
     motion = run.explained.motion
     known = motion.std_px[motion.located]
-    if not len(known) or not np.isfinite(known).all():
+    # Where two motions are possible, no light tells which.
+    if not len(known) or not np.isfinite(known).all() or run.decided(RIVAL, ""):
         return None
     worst = int(np.argmax(np.where(motion.located, motion.std_px, 0)))
     return Found(float(known.mean()), f"px on average, most at frame {worst}")

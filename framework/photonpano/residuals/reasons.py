@@ -10,6 +10,8 @@ from photonpano.motion.loop import LevelResult
 from photonpano.residuals.refinement import Explained
 from photonpano.values import Decision
 
+RIVAL = "rival_motion"  # name of the decision on a part of the frame that moves otherwise
+
 
 @dataclass(frozen=True, slots=True)
 class Reason:

@@ -94,7 +94,7 @@ def test_motion_is_unknown_beyond_the_windows_with_a_significant_peak_and_withou
 
 def test_start_is_a_path_of_shifts_that_agrees_with_its_motion_between_frames() -> None:
     instants, velocities = np.array([10.0, 30.0, 60.0]), np.array([[1.0, 0.0], [2.0, -1.0], [0.0, 1.0]])
-    start = StartingMotion(instants, velocities, np.full((3, 2), np.nan), 100.0)
+    start = StartingMotion(instants, velocities, *np.full((2, 3, 2), np.nan), 100.0)
     for moving, fixed in ((30.0, 10.0), (52.5, 20.0), (90.0, 60.0), (5.0, -4.0)):
         there, here = start.at([fixed, moving])
         expected = start.between(moving, fixed)

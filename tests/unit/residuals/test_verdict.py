@@ -17,6 +17,7 @@ from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
+from photonpano.residuals.reasons import RIVAL
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.shaking import Shaking
 from photonpano.residuals.verdict import NO_TURN, TESTS, Reason, contradictions, judge
@@ -329,6 +330,7 @@ def test_contradicting_pairs_are_doubtful_above_a_tenth() -> None:
     ("decisions", "figure", "where"),
     [
         ([Decision("standing_share", 0.6, "")], 0.6, "share of the parts that show motion or rest"),
+        ([Decision(RIVAL, 40.0, "px between both")], 40, "px between both"),
         (
             [Decision(DARK_JUMP, "frames 3 to 5", ""), Decision(DARK_JUMP, "frames 9 to 12", "")],
             2,

@@ -72,6 +72,7 @@ class StartingMotion:
     instants: FloatArray  # (N,) centres of the windows in which the velocity was found
     velocities: FloatArray  # (N, 2) of the image there, in px of a frame per frame period
     alternatives: FloatArray  # (N, 2) velocities that are as likely; NaN where there is none
+    rivals: FloatArray  # (N, 2) velocities of another part of the image, if less likely; NaN where none was found
     reach: float  # frames from the nearest of these instants within which the motion is known
     timeline: Timeline | None = None  # where the image jumps; None if it is not known to
 
@@ -130,10 +131,10 @@ def starting_motion(
     known = [(start + (length - 1) / 2, each) for start, each in zip(starts, found, strict=True) if each is not None]
     if not known:
         return None
-    velocities, alternatives = _continuous([each for _, each in known])
+    velocities, alternatives, rivals = _continuous([each for _, each in known])
     instants, px_per_frame = np.array([instant for instant, _ in known]), max(each.px_per_frame for _, each in known)
     steady = _steady(velocities, px_per_frame)
-    return StartingMotion(instants[steady], velocities[steady], alternatives[steady], 1.5 * length, timeline)
+    return StartingMotion(instants[steady], velocities[steady], alternatives[steady], rivals[steady], 1.5 * length, timeline)
 
 
 def _hypotheses(source: Source, length: int, start: int, offered: Sequence[FloatArray] = ()) -> Hypotheses | None:
@@ -243,13 +244,13 @@ def _summed_in_twos(spectra: Spectrum) -> Spectrum:
     return np.asarray(spectra[:even:2] + spectra[1:even:2])
 
 
-def _continuous(windows: Sequence[Hypotheses]) -> tuple[FloatArray, FloatArray]:
+def _continuous(windows: Sequence[Hypotheses]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Choose one hypothesis of each window, so that together they are the likeliest (Viterbi 1967).
 
     A hypothesis is the likelier the higher its peak, and the nearer it is to that of the next window. Of the first window, slow
     ones are likelier, by the square of the speed: before it is known, its order of magnitude may be any.
 
-    Return (N, 2) velocities, and the (N, 2) velocities that are as likely; NaN where there is none.
+    Return (N, 2) velocities, those that are as likely, and the likeliest of all others; NaN where there is none.
     """
     scores = [np.log(each.heights) for each in windows]
     scores[0] = scores[0] - 2 * np.log(np.maximum(np.linalg.norm(windows[0].velocities, axis=1), windows[0].px_per_frame))
@@ -259,13 +260,16 @@ def _continuous(windows: Sequence[Hypotheses]) -> tuple[FloatArray, FloatArray]:
         forward.append(score + (forward[-1][:, None] + link).max(axis=0))
     for link, score in zip(reversed(links), reversed(scores[1:]), strict=True):
         backward.append((link + score + backward[-1]).max(axis=1))
-    velocities, alternatives = np.empty((len(windows), 2)), np.full((len(windows), 2), np.nan)
+    velocities = np.empty((len(windows), 2))
+    alternatives, rivals = np.full((2, len(windows), 2), np.nan)
     for index, (each, total) in enumerate(zip(windows, map(np.add, forward, reversed(backward)), strict=True)):
         best, *others = np.argsort(-total, kind="stable")
         velocities[index] = each.velocities[best]
         if others and total[best] - total[others[0]] < _TIE:
             alternatives[index] = each.velocities[others[0]]
-    return velocities, alternatives
+        if others:
+            rivals[index] = each.velocities[others[0]]
+    return velocities, alternatives, rivals
 
 
 def _steady(velocities: FloatArray, px_per_frame: float) -> NDArray[np.integer]:

@@ -1,0 +1,53 @@
+"""A rival of the motion that was found: that of parts of the frame which it does not explain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from photonpano.capture import before
+from photonpano.contracts.protocols import Trajectory
+from photonpano.geometry import corners, inverse, transform_points
+from photonpano.motion.tracking import starting_motion
+from photonpano.pipeline.state import State
+from photonpano.residuals.reasons import RIVAL
+from photonpano.residuals.refinement import Explained
+from photonpano.values import Decision, FloatArray
+
+_MISFIT = 1.5  # reduced chi-square from which the motion does not explain a block of the sensor
+_LEAST = 0.2  # least share of the frame that is not explained
+_KNOWN = 0.5  # least share of the windows of a capture in which the rival must show
+
+
+def beside_rival(state: State, explained: Explained) -> tuple[Explained, list[Decision]]:
+    """Look for a second motion in short spans of frames, where the motion does not explain parts of the frame.
+
+    Nobody can know from the frames which motion is that of the scene: the expected error then contains the distance between
+    the two.
+    """
+    share = float((np.nan_to_num(explained.residuals.block_chi2) > _MISFIT).mean())
+    start = starting_motion(before(state.source, None), state.results[0].groups, state.context) if share > _LEAST else None
+    if start is None:
+        return explained, []
+    motion, shape = explained.motion, explained.motion.frame_shape
+    ours = _velocities(motion.trajectory, start.instants, start.reach, shape)
+    apart = np.stack([start.velocities, start.rivals]) - ours
+    other = np.take_along_axis(apart, np.nanargmax(np.linalg.norm(apart, axis=-1), axis=0)[None, :, None], axis=0)[0]
+    known = np.isfinite(start.rivals).all(axis=1)
+    if known.mean() < _KNOWN:
+        return explained, []
+    travelled = replace(start, instants=start.instants[known], velocities=other[known]).at(np.arange(len(motion.std_px)))
+    away = travelled[:, :2, 2] - travelled[motion.located][:, :2, 2].mean(axis=0)
+    distances_px = np.linalg.norm(away, axis=1)
+    mean_px = float(distances_px[motion.located].mean())
+    reason = f"px on average between both; {share:.0%} of the frame is not explained by the motion that was found"
+    either = replace(motion, std_px=np.hypot(motion.std_px, distances_px))
+    return replace(explained, motion=either), [Decision(RIVAL, mean_px, reason)]
+
+
+def _velocities(trajectory: Trajectory, instants: FloatArray, frames: float, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return the velocities of the image at N instants, over some frames: (N, 2) in px per frame."""
+    first, last = (trajectory.at(instants + sign * frames / 2) for sign in (-1, 1))
+    middle = corners(frame_shape).mean(axis=0)
+    return np.asarray((transform_points(inverse(last) @ first, middle[None])[:, 0] - middle) / frames)

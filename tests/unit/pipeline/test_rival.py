@@ -1,0 +1,56 @@
+"""Two motions in one capture: where a large part of the frame is not explained, the other motion is named, and its distance."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonpano import parse_spec, run, simulate
+from photonpano.capture.writing import truth_path
+from photonpano.evaluation import corner_errors, load_truth
+from photonpano.residuals.reasons import RIVAL
+
+SHAPE, N_FRAMES = (128, 192), 1000
+MOVES_PX = (0.02, 0.006)
+
+
+@pytest.fixture
+def run_with(tmp_path: Path) -> Callable:
+    """Return what runs a pan past a street behind objects, and the errors of its frames."""
+
+    def of(objects: list[dict]) -> tuple:
+        keys = {
+            "scene": {"kind": "street", "seed": 1},
+            "path": {"kind": "pan", "length_px": 150},
+            "frame_shape": SHAPE,
+            "n_frames": N_FRAMES,
+            "flux": 0.5,
+            "objects": objects,
+            "seed": 1,
+        }
+        cube = tmp_path / "capture.npy"
+        simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": keys}}), cube)
+        spec = {"version": 1, "source": {"use": "packed-npy", "with": {"path": str(cube)}}}
+        result = run(parse_spec(spec, output=tmp_path / "run"))
+        with np.load(tmp_path / "run" / "trajectory.npz") as found:
+            arrays = dict(found)
+        truth = load_truth(truth_path(cube))
+        errors = corner_errors(arrays["homographies"], truth.homographies, SHAPE, arrays["located"])
+        return result, errors.errors_px, arrays["std_px"]
+
+    return of
+
+
+def test_motion_of_a_thing_that_fills_half_of_the_frame_has_a_rival(run_with: Callable) -> None:
+    result, errors_px, std_px = run_with([{"size": (0.7, 0.7), "at": (0.4, 0.45), "moves_px": MOVES_PX, "seed": 1}])
+    assert result.verdict is not None
+    assert result.verdict.reasons[0].what == "parts of the frame follow another motion than the one that was found"
+    assert [each["what"] for each in result.record["decisions"]].count(RIVAL) == 1
+    assert (errors_px <= 3 * std_px).mean() > 0.95
+
+
+def test_pan_has_no_rival(run_with: Callable) -> None:
+    result, _, std_px = run_with([])
+    assert RIVAL not in [each["what"] for each in result.record["decisions"]]
+    assert std_px.mean() < 0.2
