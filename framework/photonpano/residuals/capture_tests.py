@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from photonpano.motion.timeline import SHOTS
+from photonpano.motion.timeline import INTERLACED, SHOTS, SHUFFLED
 from photonpano.residuals.reasons import RIVAL, Found, TestedRun, Tests
 
 CAPTURE_TESTS = Tests()
@@ -16,6 +16,24 @@ CAPTURE_TESTS = Tests()
 def _shots(run: TestedRun) -> Found | None:
     shots = next((str(each.value) for each in run.decisions if each.what == SHOTS), "")
     return Found(shots.count("frame"), shots) if shots else None
+
+
+@CAPTURE_TESTS.doubtful_above(
+    0.5,
+    "odd and even frames show two different images, as where two captures are interlaced",
+    "write each capture to a file of its own",
+)
+def _interlaced(run: TestedRun) -> Found | None:
+    return run.decided(INTERLACED, "share of the image in which they differ")
+
+
+@CAPTURE_TESTS.doubtful_above(
+    0.05,
+    "the image jumps back and forth from one frame to the next, as where frames are out of order",
+    "sort the frames by the time at which they were taken",
+)
+def _shuffled(run: TestedRun) -> Found | None:
+    return run.decided(SHUFFLED, "share of the width of a frame, the median of the jumps")
 
 
 @CAPTURE_TESTS.doubtful_above(

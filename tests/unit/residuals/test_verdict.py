@@ -14,7 +14,7 @@ from photonpano.motion.evidence import Evidence, Rival
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.graph import Freed
 from photonpano.motion.model import MotionModel
-from photonpano.motion.timeline import DARK_JUMP
+from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.reasons import RIVAL
@@ -331,6 +331,8 @@ def test_contradicting_pairs_are_doubtful_above_a_tenth() -> None:
     [
         ([Decision("standing_share", 0.6, "")], 0.6, "share of the parts that show motion or rest"),
         ([Decision(RIVAL, 40.0, "px between both")], 40, "px between both"),
+        ([Decision(INTERLACED, 0.7, "")], 0.7, "share of the image in which they differ"),
+        ([Decision(SHUFFLED, 0.2, "")], 0.2, "share of the width of a frame, the median of the jumps"),
         (
             [Decision(DARK_JUMP, "frames 3 to 5", ""), Decision(DARK_JUMP, "frames 9 to 12", "")],
             2,
