@@ -57,6 +57,7 @@ class Capture(Closing):
         colour: what the filters of a filter array show; None for a grey capture.
         background: which parts of frames show the background; None if all do. Others are left out of merging, and of what is
             compared with the panorama.
+        copies: (T,) True for frames that are copies of the one before; None if there are none.
         decisions: what was decided because of what the frames show.
     """
 
@@ -71,6 +72,7 @@ class Capture(Closing):
     camera: Camera | None = None
     colour: Colours | None = None
     background: Background | None = None
+    copies: BoolArray | None = None
     decisions: tuple[Decision, ...] = ()
 
     @property
@@ -142,6 +144,16 @@ class Capture(Closing):
         """Return the spans that hold no frame that is left out, such as one without light: its gain is 0."""
         return [span for span in spans if self.light is None or self.light.shown[span.start : span.stop].all()]
 
+    def times_counted(self, span: FrameSpan) -> float:
+        """Return how often the photons of a span are counted, where frames are copies: the factor of the variance of its sum.
+
+        A frame that occurs k times adds k squared times the variance of one.
+        """
+        if self.copies is None:
+            return 1.0
+        first = np.flatnonzero(~self.copies[span.start + 1 : span.stop]) + 1
+        return float((np.diff([0, *first, len(span)]) ** 2).sum() / len(span))
+
     def masking_movers(self, span: FrameSpan) -> Capture:
         """Return the capture with a mask of the pixels in which something hides the background at any time of a span."""
         shown = None if self.background is None else self.background.pixels(span)
@@ -155,7 +167,7 @@ class Capture(Closing):
         """Return a capture for each colour, see `Colours`; none for a grey capture."""
         parts = {} if self.colour is None else self.colour.parts
         seen = {"info": self.info, "first": self.first, "light": self.light, "camera": self.camera}
-        seen["background"] = self.background
+        seen |= {"background": self.background, "copies": self.copies}
         return {name: replace(part, **seen) for name, part in parts.items()}  # type: ignore[arg-type]  # mixed values
 
     def clear_mix(self) -> FloatArray:
@@ -258,8 +270,9 @@ def part_of(source: Source, span: FrameSpan) -> Capture:
     whole = capture_of(source)
     light = None if whole.light is None else whole.light.part(span)
     background = None if whole.background is None else whole.background.part(span)
-    info = replace(whole.info, n_frames=len(span))
-    return replace(whole, info=info, first=whole.first + span.start, light=light, background=background)
+    copies = None if whole.copies is None else whole.copies[span.start : span.stop]
+    info, first = replace(whole.info, n_frames=len(span)), whole.first + span.start
+    return replace(whole, info=info, first=first, light=light, background=background, copies=copies)
 
 
 def _capture_of(source: PluginSource) -> Capture:

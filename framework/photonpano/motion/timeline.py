@@ -80,6 +80,12 @@ class Timeline:
         return cls(np.cumsum(~repeated).astype(np.float64) - 1.0, dark=dark)
 
     @property
+    def copies(self) -> BoolArray | None:
+        """(T,) True for frames that are copies of the one before; None if there are none."""
+        copies = np.diff(self.taken, prepend=-1.0) == 0
+        return copies if copies.any() else None
+
+    @property
     def shown(self) -> BoolArray:
         """(T,) whether each frame shows the scene of the panorama, neither darkness nor another shot."""
         frames = np.arange(len(self.taken))

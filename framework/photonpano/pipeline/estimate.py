@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -53,7 +54,7 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
 
 def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decision], context: Context, started: bool) -> State:
     """Estimate the motion of the frames that a timeline shows, from a constant velocity if it is `started`."""
-    source = leaving_out(source, timeline.shown)
+    source = replace(leaving_out(source, timeline.shown), copies=timeline.copies)
     reference, levels = _reference_frame(plan, timeline.shot), build_levels(plan, source, journal)
     start = _start(plan, source, reference, journal, context) if started else None
     state = State(plan, source, context, reference, levels, timeline, model_of(plan), start).located(levels[:1], start)

@@ -33,7 +33,7 @@ _MOST_PEAKS = 200  # most peaks that are compared
 _REACH = 1 / 3  # largest shift that is looked at, as a share of the frame
 _FILTER_BLUR_PX = 1.0  # standard deviation of the Gaussian that blurs a colour filter array
 _STANDING = 0.3  # share of the frame from which what stands still is named
-_BLOCK_FRAMES = 256  # frames that are compared at a time
+_BLOCK_FRAMES, _FEW_FRAMES = 256, 16  # frames that are compared at a time, if they are packed and if not
 _ROW_STRIDE = 16  # frames are compared on every 16th row first
 # Frames that are repeated differ from the frame before by this many newly lit pixels, and as many that went dark: dark frames
 # are alike by chance, and so are saturated ones.
@@ -152,12 +152,16 @@ def repetition_px(first: NDArray[Any], second: NDArray[Any]) -> float | None:
 def timeline_of(source: Source, context: Context) -> Timeline:
     """Return the timeline of a capture, in which repeated frames take no time, and frames without light are left out.
 
-    Raise an `InputError` if all frames are copies. Only packed frames are compared: others would have to be read twice.
+    Raise an `InputError` if all frames are copies. Frames that are not packed have to be read twice: they are compared only if
+    some at five places are copies, and frames without light are not looked for.
     """
     capture, n_frames = capture_of(source), source.info.n_frames
-    if not capture.is_packed:
+    if not capture.is_packed and not any(
+        _compared(capture, span)[0].any() for span in source.info.spread(_PLACES, _FEW_FRAMES)
+    ):
         return Timeline.regular(n_frames)
-    spans = [FrameSpan(max(0, span.start - 1), span.stop) for span in source.info.span.blocks(_BLOCK_FRAMES)]
+    length = _BLOCK_FRAMES if capture.is_packed else _FEW_FRAMES
+    spans = [FrameSpan(max(0, span.start - 1), span.stop) for span in source.info.span.blocks(length)]
     same, photons = np.zeros(n_frames, dtype=bool), np.zeros(n_frames)
     for span, (found, lit) in zip(spans, context.in_order(partial(_compared, capture), spans), strict=True):
         same[span.start + 1 : span.stop], photons[span.start : span.stop] = found, lit
@@ -165,9 +169,9 @@ def timeline_of(source: Source, context: Context) -> Timeline:
         raise InputError(f"all {n_frames} frames are copies of the first one; check that the camera went on recording")
     for run in true_spans(same):
         original = run.start - 1
-        if original and not _differ(*capture.packed(FrameSpan(original - 1, original + 1))):
+        if original and not _differ(*_frames(capture, FrameSpan(original - 1, original + 1))):
             same[run.start : run.stop] = False
-    return Timeline.with_repeats(same, _dark_spans(capture, photons))
+    return Timeline.with_repeats(same, _dark_spans(capture, photons) if capture.is_packed else ())
 
 
 def _dark_spans(capture: Capture, photons: FloatArray) -> tuple[FrameSpan, ...]:
@@ -191,15 +195,22 @@ def _is_shapeless(capture: Capture, span: FrameSpan) -> bool:
 
 def _compared(capture: Capture, span: FrameSpan) -> tuple[BoolArray, NDArray[np.integer]]:
     """Return whether each frame of a span but the first equals the one before it, and the photons of some rows of each."""
-    packed = capture.packed(span)
-    some = packed[:, ::_ROW_STRIDE]
-    usable = np.packbits(capture.valid[::_ROW_STRIDE], axis=-1)
+    frames = _frames(capture, span)
+    some = frames[:, ::_ROW_STRIDE]
     same = (some[1:] == some[:-1]).all(axis=(1, 2))
     for index in np.flatnonzero(same):
-        same[index] = np.array_equal(packed[index], packed[index + 1])
+        same[index] = np.array_equal(frames[index], frames[index + 1])
+    if not capture.is_packed:
+        return np.asarray(same), np.zeros(len(span), np.int64)
+    usable = np.packbits(capture.valid[::_ROW_STRIDE], axis=-1)
     return np.asarray(same), np.bitwise_count(some & usable).sum(axis=(1, 2), dtype=np.int64)
 
 
-def _differ(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> bool:
-    """Return whether photons make two packed frames differ, so that others that are equal are copies."""
-    return all(int(np.unpackbits(new).sum()) >= _FEWEST_NEW for new in (first & ~second, second & ~first))
+def _frames(capture: Capture, span: FrameSpan) -> NDArray[np.integer]:
+    """Return the frames of a span, packed if the source gives them so."""
+    return capture.packed(span) if capture.is_packed else capture.frames(span)
+
+
+def _differ(first: NDArray[np.integer], second: NDArray[np.integer]) -> bool:
+    """Return whether photons make two frames differ, so that others that are equal are copies."""
+    return all(int(np.bitwise_count(new).sum()) >= _FEWEST_NEW for new in (first & ~second, second & ~first))

@@ -18,7 +18,7 @@ from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.loop import LevelResult, converges
 from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
 from photonpano.record.fingerprint import CaptureRecord
-from photonpano.record.run_warnings import left_out_warnings, level_warnings, motion_warnings, refinement_warnings
+from photonpano.record.run_warnings import level_warnings, motion_warnings, refinement_warnings, timeline_warnings
 from photonpano.record.schema import (
     CameraRecord,
     DecisionRecord,
@@ -61,7 +61,7 @@ def record_of(
         "refinements": [refinement_record(each) for each in explained.refinements],
         "verdict": judged,
         "warnings": [
-            *left_out_warnings(timeline, plan.output.directory),
+            *timeline_warnings(timeline, plan.output.directory),
             *level_warnings(levels),
             *motion_warnings(motion, timeline),
             *refinement_warnings(explained.refinements),

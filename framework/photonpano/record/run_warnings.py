@@ -20,6 +20,7 @@ SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst fir
 
 
 DOUBTFUL = "doubtful: "  # begins the warnings that are doubts
+_MANY_COPIES = 0.25  # share of the frames from which a warning names them
 _SHOWN_LOST = 3  # spans of lost frames that a warning names
 
 
@@ -60,8 +61,8 @@ def other_shots(shots: Sequence[FrameSpan], directory: Path) -> dict[Path, Frame
     return {place.with_name(f"{place.name}.panorama-{number}"): shot for number, shot in enumerate(others, start=2)}
 
 
-def left_out_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
-    """Warn of shots and of dark frames, which are left out of the panorama."""
+def timeline_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
+    """Warn of shots and of dark frames, which are left out of the panorama, and of many copies."""
     warnings: list[str] = []
     if timeline is not None and timeline.shots:
         shots = timeline.shots
@@ -75,6 +76,12 @@ def left_out_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
         warnings.append(
             f"{listed(map(str, timeline.dark))} show no light, as behind a closed shutter: they are not located, and left out "
             "of the panorama. If the shutter was meant to be open, check it, and the gate of the sensor"
+        )
+    if timeline is not None and timeline.copies is not None and timeline.copies.mean() > _MANY_COPIES:
+        n_copies, n_frames = np.count_nonzero(timeline.copies), len(timeline.copies)
+        warnings.append(
+            f"{n_copies:,} of {n_frames:,} frames are copies of the frame before: they add no light, and the motion stands "
+            "still in them. Check how the capture was written, and its frame rate"
         )
     return warnings
 

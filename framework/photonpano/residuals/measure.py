@@ -284,12 +284,14 @@ class _Colour:
         found: NDArray[np.float32] | NDArray[np.uint8] = counts if self.masked is None else counts + self.masked
         return found
 
-    def noise_beside(self, mean: FluxImage) -> FluxImage:
-        """Return the variance of the count of a frame beside that of its photons: (H, W)."""
-        if self.slope is None:
-            return self.extra
-        lit = np.clip((mean + self.dark) / self.slope, 0, 1)
-        return np.asarray(np.maximum(self.slope**2 * lit * (1 - lit) - mean * (1 - mean), 0), np.float32)
+    def noise_beside(self, mean: FluxImage, variance: FluxImage, span: FrameSpan) -> FluxImage:
+        """Return the variance of the count of a frame beside that of its photons, which copies of frames raise: (H, W)."""
+        extra = self.extra
+        if self.slope is not None:
+            lit = np.clip((mean + self.dark) / self.slope, 0, 1)
+            extra = np.asarray(np.maximum(self.slope**2 * lit * (1 - lit) - mean * (1 - mean), 0), np.float32)
+        times = np.float32(self.capture.times_counted(span))
+        return extra if times == 1 else times * extra + (times - 1) * variance
 
 
 def _measured(
@@ -318,7 +320,8 @@ def _measured(
         for colour in colours:
             counts = colour.counted(raw, span)
             colour.prediction.view(homography, images, span)
-            add_block_sums(counts, colour.noise_beside(images[0]), float(len(span)), images[0], images[1], sums)
+            noise = colour.noise_beside(images[0], images[1], span)
+            add_block_sums(counts, noise, float(len(span)), images[0], images[1], sums)
             if index % _PIXEL_STRIDE == 0:
                 add_pixel_sums(counts, float(len(span)), images[0], images[1], total.pixel_residual, total.pixel_mean)
         # The photons of the span are part of the panorama, so that the residual is less than their noise.

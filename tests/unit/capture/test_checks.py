@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from photonpano import (
     run,
     simulate,
 )
+from photonpano.capture import capture_of, part_of
 from photonpano.capture.writing import truth_path
 from photonpano.errors import LocationError
 from photonpano.execution.context import Context
@@ -127,10 +129,24 @@ def test_independent_and_dark_and_saturated_frames_are_no_copies(tmp_path: Path)
     assert repeated(tmp_path, frames) == []
 
 
-def test_source_without_packed_frames_is_taken_as_regular() -> None:
-    frames = taken(10)
-    frames[5] = frames[4]
-    np.testing.assert_array_equal(timeline_of(MemorySource(frames), Context()).taken, np.arange(10))
+def test_copies_are_found_in_frames_that_are_not_packed() -> None:
+    frames = taken(50)
+    np.testing.assert_array_equal(timeline_of(MemorySource(frames), Context()).taken, np.arange(50))
+    timeline = timeline_of(MemorySource(np.repeat(frames, 2, axis=0)), Context())
+    np.testing.assert_array_equal(timeline.taken, np.repeat(np.arange(50), 2))
+    grey = MemorySource(np.repeat(RNG.integers(0, 256, (20, 40, 64)), 2, axis=0))
+    assert timeline_of(grey, Context()).taken[-1] == 19
+
+
+def test_copies_raise_the_variance_of_a_sum() -> None:
+    order = np.array([0, 0, 1, 2, 2, 2])
+    timeline = timeline_of(MemorySource(taken(3)[order]), Context())
+    capture = replace(capture_of(MemorySource(taken(3)[order])), copies=timeline.copies)
+    # Two times one frame and three times another one add as much variance as 4 + 1 + 9 frames.
+    assert capture.times_counted(FrameSpan(0, 6)) == pytest.approx(14 / 6)
+    assert capture.times_counted(FrameSpan(1, 3)) == 1
+    assert part_of(capture, FrameSpan(2, 5)).times_counted(FrameSpan(1, 3)) == 2
+    assert capture_of(MemorySource(taken(3))).times_counted(FrameSpan(0, 3)) == 1
 
 
 SHAPE = 96, 128

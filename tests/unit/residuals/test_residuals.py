@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, open_source, parse_spec
-from photonpano.capture import seen_through
+from photonpano.capture import capture_of, seen_through
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging.canvas_plan import View, plan_canvas
@@ -61,6 +61,22 @@ def test_measure_finds_photon_noise_along_true_motion() -> None:
     assert chi2.mean() == pytest.approx(1, abs=0.2)
     assert (found.spans[0].start, found.spans[-1].stop) == (0, FRAMES)
     assert all(one.stop == two.start for one, two in pairwise(found.spans))
+
+
+def test_copies_of_frames_have_the_noise_of_one() -> None:
+    twice, span = np.arange(FRAMES) // 2, FrameSpan(0, FRAMES)
+    source = MemorySource(capture().frames(span)[twice])
+    trajectory = FrameTrajectory(np.array([shaken(frame, 0) for frame in twice]))
+    canvas = plan_canvas(trajectory, span, SHAPE, 1.0, 2**30)
+    panorama = render(source, trajectory, span, canvas, 0.25, Context())
+
+    def chi2(copies: np.ndarray | None) -> float:
+        of_copies = replace(capture_of(source), copies=copies)
+        predictions = Predictions.of(of_copies, panorama, canvas, trajectory, SHAPE)
+        return float(measure(span, predictions, Context()).reduced_chi2.mean())
+
+    assert chi2(None) == pytest.approx(2, abs=0.2)
+    assert chi2(np.arange(FRAMES) % 2 == 1) == pytest.approx(1, abs=0.1)
 
 
 def test_steps_are_the_tremor_that_the_motion_lacks() -> None:
