@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from photonpano.api.command import command, require_trust, verdict_line, warn
+from photonpano.api.command import command, require_trust, verdict_lines, warn
 from photonpano.api.opened_run import opened_run
+from photonpano.capture import capture_of
 from photonpano.execution.context import Context, Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
+from photonpano.motion.timeline import REPEATED
+from photonpano.pipeline.obstacles import timeline_of
 from photonpano.plugins.registry import Catalog
 from photonpano.residuals.refinement import MotionFit
 from photonpano.residuals.verdict import NO_TURN, REPEATS, Reason, Verdict, contradictions, judge
@@ -30,7 +33,7 @@ class RunCheck:
 
 
 def _lines(found: RunCheck, *, strict: bool = False) -> Iterator[str]:
-    yield verdict_line(found.verdict)
+    yield from verdict_lines(found.verdict)
     for sentence in found.unknown:
         warn(sentence)
     ratio = found.verdict.residual_ratio
@@ -57,7 +60,10 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
     with opened_run(Path(run_folder), catalog) as opened, one_thread_inside():
         record, plan = opened.record, opened.plan
         context = Context(thread_count(plan.run.threads), usual(progress))
-        fit = MotionFit(opened.source, opened.motion, int(plan.run.memory), context)
+        copied = any(each["what"] == REPEATED for each in record.get("decisions", ()))
+        copies = timeline_of(opened.source, context).copies if copied else None
+        source = replace(capture_of(opened.source), copies=copies)
+        fit = MotionFit(source, opened.motion, int(plan.run.memory), context)
         explained = fit.explained()
     verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
     reasons, unknown = list(verdict.reasons), []
@@ -73,5 +79,5 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
             reasons.append(reason)
     recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
     reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NO_TURN)]
-    judged = Verdict("doubtful" if reasons else "trusted", tuple(reasons), verdict.residual_ratio)
+    judged = replace(verdict, status="doubtful" if reasons else "trusted", reasons=tuple(reasons))
     return RunCheck(judged, tuple(unknown))

@@ -96,11 +96,11 @@ def json_lines(data: Any) -> list[str]:
     return [json.dumps(data, indent=2)]
 
 
-def verdict_line(verdict: Verdict) -> str:
-    """Return the line with the status; each reason of a doubtful one is a sentence on standard error."""
+def verdict_lines(verdict: Verdict) -> list[str]:
+    """Return the status, and what was not tested; each reason of a doubtful one is a sentence on standard error."""
     for reason in verdict.reasons:
         typer.echo(f"doubtful: {reason}", err=True)
-    return f"verdict   {verdict.status}"
+    return [f"verdict   {verdict.status}", *([f"untested  {'; '.join(verdict.untested)}"] if verdict.untested else [])]
 
 
 def require_trust(verdict: Verdict, files: str) -> None:

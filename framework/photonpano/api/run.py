@@ -16,7 +16,7 @@ from photonpano.api.command import (
     command,
     logger,
     require_trust,
-    verdict_line,
+    verdict_lines,
     warn,
 )
 from photonpano.execution.context import Progress
@@ -42,7 +42,7 @@ def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
     if result.followed is not None:
         yield f"followed  {_delays(result.followed)}"
     if result.verdict is not None:
-        yield verdict_line(result.verdict)
+        yield from verdict_lines(result.verdict)
     for warning in record["warnings"]:
         warn(warning)
     for decision in record["decisions"]:

@@ -11,10 +11,10 @@ from photonpano.motion.timeline import INTERLACED, SHUFFLED
 from photonpano.motion.tracking.spans import Spectrum, shifts_between, spectra_of
 from photonpano.values import Decision, FluxImage, FrameSpan
 
-_PLACES, _FRAMES = 6, 64  # spans all over the capture, and the frames of each
+_PLACES, _SHORTEST, _FRAMES = 6, 8, 64  # spans all over the capture, and fewest and most frames of each
 _UNLIKE = 0.5  # most similarity of two images, relative to that of each with itself
 _REACH_PX = 6.0  # a tremor may move every second frame by this much
-_SURE = 5.0  # standard deviations by which an image resembles itself
+_SURE = 4.0  # standard deviations by which an image resembles itself
 _LONGEST_WAVE = 1 / 4  # of the frame: longer waves are alike in many scenes
 _TOLERANCE_PX = 1.5  # by which three shifts between three frames agree, in binned px
 _FEWEST = 0.1  # share of the shifts that agree; those of noise do so once in 1,000
@@ -29,8 +29,8 @@ def interlaced(source: Source) -> list[Decision]:
     even frames. All four see the same motion, so that it blurs them alike.
     """
     found = []
-    for span in source.info.spread(_PLACES, _FRAMES):
-        images = _frames(source, FrameSpan(span.start, min(span.stop, span.start + _FRAMES)))
+    for span in _spans(source, _FRAMES):
+        images = _frames(source, span)
         used = len(images) // 4 * 4
         if used:
             phases = np.asarray(images[:used].reshape(-1, 4, *images.shape[1:]).mean(axis=0), np.float32)
@@ -47,8 +47,8 @@ def shuffled(source: Source) -> list[Decision]:
     Only frames that are bright enough one by one show that.
     """
     steps = []
-    for span in source.info.spread(_PLACES, _FRAMES):
-        images = _frames(source, FrameSpan(span.start, min(span.stop, span.start + _FRAMES // 2)))
+    for span in _spans(source, _FRAMES // 2):
+        images = _frames(source, span)
         spectra, shape = spectra_of(images), images.shape[1:]
         single, double = shifts_between(spectra, spectra[1:], shape), shifts_between(spectra, spectra[2:], shape)
         steps += [each for each in zip(single, single[1:], double, strict=False) if not any(shift is None for shift in each)]
@@ -61,6 +61,10 @@ def shuffled(source: Source) -> list[Decision]:
     if jump < _FAR or (first * second)[agree].sum() > _BACK * (sizes * next_sizes).sum():
         return []
     return [Decision(SHUFFLED, round(jump, 3), "of the width of a frame: so far the image jumps back and forth between frames")]
+
+
+def _spans(source: Source, most: int) -> list[FrameSpan]:
+    return source.info.spread(_PLACES, min(most, max(_SHORTEST, source.info.n_frames // _PLACES - 1)))
 
 
 def _frames(source: Source, span: FrameSpan) -> FluxImage:

@@ -225,7 +225,8 @@ def motion_record(std_px: FloatArray) -> MotionRecord | None:
 def verdict_of(found: VerdictRecord) -> Verdict:
     """Return the verdict that a record describes."""
     status: Literal["trusted", "doubtful"] = "trusted" if found["status"] == "trusted" else "doubtful"
-    return Verdict(status, tuple(Reason(**reason) for reason in found["reasons"]), found["residual_ratio"])
+    reasons, untested = tuple(Reason(**reason) for reason in found["reasons"]), tuple(found.get("untested", ()))
+    return Verdict(status, reasons, found["residual_ratio"], untested)
 
 
 def refinement_record(refinement: Refinement) -> RefinementRecord:

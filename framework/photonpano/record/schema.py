@@ -173,12 +173,14 @@ class VerdictRecord(TypedDict):
     """Whether motion and panorama explain the photons.
 
     `status` is "trusted" or "doubtful". `residual_ratio` is the scatter of the shifts of short spans of frames, in units of
-    what noise explains: about 1 if nothing is left. None if there are too few frames to tell.
+    what noise explains: about 1 if nothing is left. None if there are too few frames to tell. `untested` lists the tests that
+    could not be made, and why, in clauses that begin with "whether".
     """
 
     status: str
     reasons: Sequence[ReasonRecord]
     residual_ratio: float | None
+    untested: NotRequired[Sequence[str]]
 
 
 class LostFramesRecord(TypedDict):

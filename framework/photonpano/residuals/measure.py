@@ -45,6 +45,7 @@ _BATCH = 64  # spans that a thread measures at a time
 # fewest in a row.
 _SINGLE_FRAMES, _SINGLE_SHARE, _WINDOW_FRAMES = 512, 1 / 8, 32
 _PIXEL_STRIDE = 4  # one span in 4 is added to the sums of single pixels, which no other sum needs
+FEWEST_FRAMES = 3  # frames of the shortest span within which single frames show shaking
 _DARK = 1e-6  # least weight of a frame in the mean motion of a span
 _PROBES = 8  # instants at which the noise of a shift is predicted
 # Information that keeps the equations of a span regular: a shift is below 10 px, a roll or a zoom below 0.1, and the light
@@ -179,7 +180,7 @@ def _shaking(spans: Sequence[FrameSpan], size: int, predictions: Predictions, co
             runs.append(FrameSpan(spans[first].start, each.stop))
             first = index + 1
     starts = [start for run in runs for start in range(run.start, run.stop - length + 1, length)]
-    if size < 3 or not starts:
+    if size < FEWEST_FRAMES or not starts:
         return Shaking(0.0, float("nan"), size)
     frames_taken = min(_SINGLE_FRAMES, _SINGLE_SHARE * (spans[-1].stop - spans[0].start))
     taken = np.unique(np.linspace(0, len(starts) - 1, max(1, int(frames_taken) // length)).astype(int))

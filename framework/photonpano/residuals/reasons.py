@@ -51,7 +51,10 @@ class TestedRun:
 
 
 class Found(NamedTuple):
-    """Figure of a test and where it occurs; `doubtful` overrides the threshold."""
+    """Figure of a test and where it occurs; `doubtful` overrides the threshold.
+
+    Where the test could not be made, the figure is NaN, and `where` says why.
+    """
 
     figure: float
     where: str
@@ -60,12 +63,16 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Test:
-    """A row of the table: `find` returns what it found, or None where that is trusted or not known."""
+    """A row of the table: `find` returns what it found, or None where nothing is to be found."""
 
     what: str
     threshold: float
     what_to_do: str
     find: Callable[[TestedRun], Found | None]
+
+    def untested(self, found: Found | None) -> str | None:
+        """Return a clause on what was not tested, and why; None if it was."""
+        return f"whether {self.what} ({found.where})" if found is not None and found.figure != found.figure else None
 
     def reason(self, found: Found | None) -> Reason | None:
         """Judge what was found; None if it is trusted, or not known."""

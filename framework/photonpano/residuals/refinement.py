@@ -26,6 +26,7 @@ from photonpano.residuals.prediction import Predictions
 from photonpano.values import FloatArray, Panorama
 
 _SMOOTH_SPANS = 25  # the ratio is that of motion faster than this many spans
+FEWEST_SPANS = 2 * _SMOOTH_SPANS  # for the ratio
 _LOCAL_SPANS = 33  # the size is averaged over this many spans
 # Motion is taken to be left where the mean square exceeds that of the noise by this many of its standard deviations.
 _SIGNIFICANT = 3.0
@@ -51,7 +52,7 @@ def residual_ratio(residuals: Residuals) -> float:
     steps, variances = _series(residuals)
     shifts, expected = steps[:, :2], variances[:, :2]
     known = np.isfinite(expected).all(axis=1)
-    if known.sum() < 2 * _SMOOTH_SPANS:
+    if known.sum() < FEWEST_SPANS:
         return float("nan")
     ratios = shifts[known] / np.sqrt(expected[known])
     kernel = np.ones(_SMOOTH_SPANS) / _SMOOTH_SPANS

@@ -6,8 +6,9 @@ import numpy as np
 
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import deformation_px, lens_distortion
-from photonpano.residuals.measure import Residuals
+from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
 from photonpano.residuals.reasons import Found, TestedRun, Tests
+from photonpano.residuals.refinement import FEWEST_SPANS
 from photonpano.values import BoolArray
 
 # Contrast of the residuals, as a share of the light, beyond which a large reduced chi-square counts.
@@ -19,11 +20,25 @@ RESIDUAL_TESTS = Tests()
 
 
 @RESIDUAL_TESTS.doubtful_above(
+    0,
+    "no test of the motion can be made, since the capture is too short",
+    "record more frames, or compare the panorama with what you know of the scene",
+)
+def _untested_motion(run: TestedRun) -> Found:
+    residuals, ratio = run.explained.residuals, run.explained.ratio
+    known = np.isfinite(ratio) or max(map(len, residuals.spans)) >= FEWEST_FRAMES
+    where = f"spans that are missing: the scatter of shifts needs {FEWEST_SPANS} spans, and {len(residuals.spans)} are there"
+    return Found(0 if known else max(FEWEST_SPANS - len(residuals.spans), 1), where)
+
+
+@RESIDUAL_TESTS.doubtful_above(
     2.0,
     "the image moves within groups by more than the motion that was found",
     "use the refiner short-spans, or smaller groups (resample.with.group_size)",
 )
 def _fast_motion(run: TestedRun) -> Found:
+    if not np.isfinite(run.explained.ratio):
+        return Found(np.nan, f"{len(run.explained.residuals.spans)} spans are too few: {FEWEST_SPANS} are needed")
     return Found(run.explained.ratio, "scatter of the shifts of short spans over their noise")
 
 
@@ -33,7 +48,9 @@ def _fast_motion(run: TestedRun) -> Found:
     "use the refiner short-spans; if it was used, the photons do not carry this motion: use more light, or damp what shakes",
 )
 def _shaking(run: TestedRun) -> Found | None:
-    shaking = run.explained.residuals.shaking
+    shaking, longest = run.explained.residuals.shaking, max(map(len, run.explained.residuals.spans))
+    if longest < FEWEST_FRAMES and not np.isfinite(run.explained.ratio):  # spans of a frame or two show all shaking themselves
+        return Found(np.nan, f"spans of {FEWEST_FRAMES} frames are needed")
     where = f"px within spans, most with a period of {shaking.period_frames:.3g} frames"
     return Found(shaking.size_px, where) if shaking.size_px else None
 
@@ -69,6 +86,8 @@ def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
     "mask what moves (corrections: mask); the motion may be that of the thing instead of the scene",
 )
 def _moving(run: TestedRun) -> Found | None:
+    if run.explained.residuals.cell_count.max(initial=0) < _MIN_BLOCKS:
+        return Found(np.nan, f"no place was seen {_MIN_BLOCKS} times")
     share, changing = changing_places(run.explained.residuals)
     return Found(share, _box(changing, "px of the panorama")) if share else None
 

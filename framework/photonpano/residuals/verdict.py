@@ -41,11 +41,14 @@ class Verdict:
     status: Literal["trusted", "doubtful"]  # "trusted" or "doubtful"
     reasons: tuple[Reason, ...]  # why it is doubtful, the most telling first
     residual_ratio: float | None  # scatter of the shifts of short spans, in units of what noise explains; None if it is unknown
+    untested: tuple[str, ...] = ()  # which tests could not be made, and why: clauses that begin with "whether"
 
 
 def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
     """Test the result of a run; `levels` are empty if they are not known, `decisions` hold the share that stands still."""
     run = TestedRun(explained, levels, decisions)
-    reasons = tuple(reason for test in TESTS if (reason := test.reason(test.find(run))) is not None)
+    found = [(test, test.find(run)) for test in TESTS]
+    reasons = tuple(reason for test, each in found if (reason := test.reason(each)) is not None)
+    untested = tuple(clause for test, each in found if (clause := test.untested(each)) is not None)
     ratio = explained.ratio if np.isfinite(explained.ratio) else None
-    return Verdict("doubtful" if reasons else "trusted", reasons, ratio)
+    return Verdict("doubtful" if reasons else "trusted", reasons, ratio, untested)

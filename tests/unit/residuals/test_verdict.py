@@ -18,7 +18,7 @@ from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.reasons import RIVAL
-from photonpano.residuals.refinement import Explained
+from photonpano.residuals.refinement import Explained, residual_ratio
 from photonpano.residuals.shaking import Shaking
 from photonpano.residuals.verdict import NO_TURN, TESTS, Reason, contradictions, judge
 from photonpano.values import Ambiguity, Decision, Edge, Located
@@ -221,6 +221,30 @@ def test_scatter_of_shifts_beyond_noise_is_doubtful_and_an_unknown_one_is_not(ex
     assert (reason.what, reason.figure) == ("the image moves within groups by more than the motion that was found", 24)
     verdict = judge(replace(explained, ratio=float("nan")), ())
     assert (verdict.status, verdict.residual_ratio) == ("trusted", None)
+
+
+@pytest.mark.parametrize(("n_spans", "doubtful"), [(20, True), (60, False)])
+def test_motion_of_a_capture_that_is_too_short_for_any_test_is_doubtful(
+    explained: Explained, n_spans: int, doubtful: bool
+) -> None:
+    spans = tuple(FrameSpan(frame, frame + 1) for frame in range(n_spans))
+    few = {"instants": np.arange(n_spans), "light": np.ones(n_spans), "shaking": Shaking(0.0, float("nan"), 1)}
+    of_spans = {name: getattr(explained.residuals, name)[:n_spans] for name in ("normal", "gradient", "reduced_chi2")}
+    residuals = replace(explained.residuals, spans=spans, **few, **of_spans)
+    verdict = judge(replace(explained, residuals=residuals, ratio=residual_ratio(residuals)), ())
+    assert [(each.figure, each.threshold) for each in verdict.reasons] == [(30, 0)] * doubtful
+    assert [each.partition(" than")[0] for each in verdict.untested] == [
+        "whether the image moves within groups by more",
+        "whether frames shake faster",
+    ] * doubtful
+
+
+def test_scene_that_no_block_saw_often_is_not_tested(explained: Explained) -> None:
+    residuals = replace(explained.residuals, cell_count=np.full_like(explained.residuals.cell_count, 15))
+    verdict = judge(replace(explained, residuals=residuals), ())
+    assert (verdict.status, len(verdict.untested)) == ("trusted", 1)
+    assert verdict.untested[0].endswith("(no place was seen 16 times)")
+    assert judge(explained, ()).untested == ()
 
 
 @pytest.mark.parametrize(

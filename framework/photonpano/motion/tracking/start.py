@@ -125,6 +125,8 @@ def starting_motion(
     """
     n_frames = source.info.n_frames
     length = min(n_frames, max(2 * SHORTEST[source.info.kind], round(float(np.median(lengths_of(groups))))))
+    if length < SHORTEST[source.info.kind]:
+        return None
     starts = np.rint(np.linspace(0, n_frames - length, max(1, n_frames // length))).astype(int).tolist()
     found = list(context.in_order(partial(_hypotheses, source, length), starts))
     found = list(context.in_order(partial(_with_those_near, source, length, starts, found), range(len(starts))))
