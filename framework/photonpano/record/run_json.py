@@ -51,7 +51,8 @@ def record_of(
     """Return the record of a finished run; `rendered` are the decisions of renderer and exporters."""
     motion, timeline = explained.motion, levels[-1].exposures.timeline
     decisions = [levels_decision(levels), *rendered] if plan.until_converged else rendered
-    judged: VerdictRecord = _fields(verdict) | {"reasons": [_fields(reason) for reason in verdict.reasons]}
+    reasons = [_fields(reason) for reason in verdict.reasons]
+    judged: VerdictRecord = _fields(verdict) | {"reasons": reasons, "untested": list(verdict.untested)}
     return {
         **started,
         "decisions": [*started["decisions"], *decision_records(decisions)],
