@@ -54,6 +54,14 @@ CAUSES: dict[str, tuple[str, ...]] = {
     "vibration": ("within groups",),
     "shake": ("within groups",),
     "shaking": ("shake",),
+    **dict.fromkeys(("acceleration", "jerks", "kicks", "taps", "sine"), ("within groups", "shake", "expected error")),
+    **dict.fromkeys(("sudden stop", "drops"), ("within groups", "shake", "jump", "missing")),
+    "horizon": ("one direction", "repeat"),
+    **dict.fromkeys(("afterpulsing", "crosstalk"), ("does not explain the photons",)),
+    "half black": ("expected error",),
+    "turn": ("lens", "expected error"),
+    "in reverse": (),
+    "gain 5 %": ("the sensor", "still", "a sensor"),
     "out of order": ("order",),
     "any order": ("order",),
     "every frame doubled": ("copies", "doubled"),
@@ -279,8 +287,8 @@ def table(results: Sequence[Result]) -> str:
 def summary_of(results: Sequence[Result]) -> Iterator[str]:
     """Yield sentences on all runs."""
     doubts = doubted(results)
-    yield f"{sum(map(is_honest, results))} of {len(results)} runs are honest;"
-    yield f"{sum(map(names_its_cause, doubts))} of {len(doubts)} that are doubtful or refused name the cause."
+    right = f"{sum(map(names_its_cause, doubts))} of {len(doubts)} that are doubtful or refused name the cause"
+    yield f"{sum(map(is_honest, results))} of {len(results)} runs are honest; {right}."
     scored = [result for result in results if "mean_px" in result]
     for says in ("trusted", "doubtful"):
         said = [result for result in scored if status(result) == says]
@@ -288,9 +296,9 @@ def summary_of(results: Sequence[Result]) -> Iterator[str]:
             shares = " / ".join(f"{np.mean([each[key] for each in said]):.1%}" for key in ("within_2", "within_3"))
             ratio = np.median([each["std_px"] / each["rms_px"] for each in said])
             wrong = [result["row"] for result in said if is_wrong(result)]
-            yield f"{len(said)} are {says}, {len(wrong)} of them wrong; {shares} of their frames are within 2 / 3 std_px,"
-            yield f"which is {ratio:.2f} times the rms error (median)."
-            yield f"Wrong: {', '.join(wrong)}." if wrong and says == "trusted" else ""
+            named = f" ({', '.join(wrong)})" if wrong and says == "trusted" else ""
+            within = f"{shares} of their frames are within 2 / 3 std_px, which is {ratio:.2f} times the rms error (median)"
+            yield f"{len(said)} are {says}, {len(wrong)} of them wrong{named}; {within}."
 
 
 def is_wrong(result: Result) -> bool:

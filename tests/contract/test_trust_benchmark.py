@@ -111,7 +111,8 @@ def test_table_has_a_row_for_each_kind_of_capture(trust: ModuleType) -> None:
         "| vignette 80% | 0.250 (0.90) | 0.150 | 50% / 60% | 0.60 | 4.00 | 0.25 dB | 1 doubtful, 1 - | 1 of 1 | 1 of 2 | 5 s |"
     )
     assert lines[5:] == [
-        "2 of 3 runs are honest; 1 of 1 that are doubtful or refused name the cause.",
+        "2 of 3 runs are honest; 1 of 1 that are doubtful or refused name the cause. 1 are doubtful, 0 of them wrong; "
+        "100.0% / 100.0% of their frames are within 2 / 3 std_px, which is 0.50 times the rms error (median).",
         "",
         "- vignette 80%, seed 0: parts of the sensor are dark",
     ]

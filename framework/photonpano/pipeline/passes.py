@@ -28,7 +28,7 @@ from photonpano.geometry import Camera, lenses_apart_px
 from photonpano.motion.diagnosis import UntiedError
 from photonpano.motion.loop import converges
 from photonpano.motion.model import SAME_LENS_PX
-from photonpano.motion.timeline import Cut
+from photonpano.motion.timeline import UNCUT_JUMP, Cut
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.shots import ApartError, shots_of
 from photonpano.pipeline.state import State, within
@@ -56,6 +56,7 @@ class Proposal:
             to accept the new state without comparison, so that its errors end the run.
         settle: completes the new state once it is accepted.
         rejection: begins the message about a proposal that is rejected, of this severity.
+        refused: completes the state that is kept then.
     """
 
     make: Callable[[], State | None]
@@ -64,6 +65,7 @@ class Proposal:
     rejection: str = ""
     severity: int = logging.DEBUG
     summary: str = ""
+    refused: Callable[[State], State] = lambda state: state
 
 
 Pass: TypeAlias = Callable[[State], Proposal | None]
@@ -97,7 +99,7 @@ def tried(state: State, propose: Pass) -> Trial:
         if not worse:
             return Trial(proposal.settle(proposed), accepted=True, summary=proposal.summary)
     logger.log(proposal.severity, "%s: %s", proposal.rejection, worse)
-    return Trial(state, worse=worse)
+    return Trial(proposal.refused(state), worse=worse)
 
 
 def through_found_lens(state: State) -> Proposal | None:
@@ -313,7 +315,14 @@ def cut_at_jumps(state: State) -> Proposal | None:
     dark = any(each.dark is not None for each in cuts)
     places = ", ".join(f"frame {each.frame}" for each in cuts)
     rejection = f"the image seems to jump before {places}, but the motion is not cut there"
-    return Proposal(make, (lambda *_: "") if dark else MotionFit.worse_than, rejection=rejection, severity=logging.WARNING)
+
+    def refused(state: State) -> State:
+        largest = max(cuts, key=lambda each: each.size_px)
+        found = Decision(UNCUT_JUMP, largest.size_px, f"px before frame {largest.frame}; cut there, the motion explains less")
+        return replace(state, decisions=(*state.decisions, found))
+
+    worse = (lambda *_: "") if dark else MotionFit.worse_than
+    return Proposal(make, worse, refused=refused, rejection=rejection, severity=logging.WARNING)
 
 
 def _located_anew(state: State) -> State:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from photonpano.geometry import corners, jacobian
-from photonpano.motion.timeline import DARK_JUMP
+from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
 from photonpano.residuals.reasons import RIVAL, Found, Reason, TestedRun, Tests
 from photonpano.values import Located
 
@@ -144,3 +144,13 @@ def _never_seen(run: TestedRun) -> Found | None:
 def _jump_in_the_dark(run: TestedRun) -> Found:
     found = [str(each.value) for each in run.decisions if each.what == DARK_JUMP]
     return Found(len(found), ", ".join(found))
+
+
+@MOTION_TESTS.doubtful_above(
+    1.0,
+    "the image seems to jump, but the photons contradict a cut of the motion there",
+    "look at the path in the report around this frame; use a slower motion, or smaller groups",
+)
+def _uncut_jump(run: TestedRun) -> Found | None:
+    found = next((each for each in run.decisions if each.what == UNCUT_JUMP), None)
+    return Found(float(found.value), found.reason) if found else None

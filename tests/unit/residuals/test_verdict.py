@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from photonpano import FrameSpan
 from photonpano.geometry import Canvas, FrameTrajectory
@@ -14,7 +15,7 @@ from photonpano.motion.evidence import Evidence, Rival
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.graph import Freed
 from photonpano.motion.model import MotionModel
-from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED
+from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED, UNCUT_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.reasons import RIVAL
@@ -355,6 +356,7 @@ def test_contradicting_pairs_are_doubtful_above_a_tenth() -> None:
     [
         ([Decision("standing_share", 0.6, "")], 0.6, "share of the parts that show motion or rest"),
         ([Decision(RIVAL, 40.0, "px between both")], 40, "px between both"),
+        ([Decision(UNCUT_JUMP, 5.0, "px before frame 3")], 5, "px before frame 3"),
         ([Decision(INTERLACED, 0.7, "")], 0.7, "share of the image in which they differ"),
         ([Decision(SHUFFLED, 0.2, "")], 0.2, "share of the width of a frame, the median of the jumps"),
         (
@@ -368,6 +370,20 @@ def test_decisions_are_doubtful(explained: Explained, decisions: list[Decision],
     [reason] = judge(explained, (), decisions).reasons
     assert (reason.figure, reason.where) == (figure, where)
     assert not judge(explained, (), [Decision("standing_share", 0.4, "")]).reasons
+
+
+@pytest.mark.parametrize(("grain", "moves_px", "doubtful"), [(1, 0, True), (0, 0, False), (1, 3, False)])
+def test_image_that_stands_still_is_doubtful_if_it_has_the_grain_of_a_sensor(
+    explained: Explained, grain: float, moves_px: float, doubtful: bool
+) -> None:
+    rng = np.random.default_rng(1)
+    pattern = grain * rng.normal(0, 0.1, SHAPE) + 3 * ndimage.gaussian_filter(rng.normal(0, 0.3, SHAPE), 3)
+    homographies = explained.motion.homographies.copy()
+    homographies[:, 0, 2] = np.linspace(0, moves_px, N_FRAMES)
+    residuals = replace(explained.residuals, pixel_mean=np.float32(1000 * np.clip(1 + pattern, 0.1, 2)))
+    still = replace(explained, motion=replace(explained.motion, homographies=homographies), residuals=residuals)
+    whats = [reason.what for reason in judge(still, ()).reasons]
+    assert ("the image stands still, and has the fine grain of a sensor whose pixels differ" in whats) is doubtful
 
 
 def test_several_reasons_are_listed_in_the_order_of_the_table(explained: Explained) -> None:
