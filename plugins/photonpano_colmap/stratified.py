@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,6 +30,7 @@ from photonpano_colmap.posing.path import Path, PoseSpline, positions_of
 _CONTRADICTION, _CONTRADICTION_PX = 10.0, 0.5
 _LARGEST_EXCESS = 1.0  # residuals relative to photon noise; of right poses it was below a half
 _MISSED = 0.5  # expected next pose update, as a fraction of the last one
+_LOST = "too few patches of other exposures were found in theirs"
 
 
 class StratifiedEstimator:
@@ -47,7 +47,7 @@ class StratifiedEstimator:
         instants = np.array([view.instant for view in first.views])
         spline = PoseSpline(instants, np.array([view.camera_from_world for view in first.views]))
         path = Path(spline.at(_frames(source)))
-        scene, levels = Scene(path, first.located, first.points.positions), list(first.levels)
+        scene, levels, lost = Scene(path, first.located, first.points.positions), list(first.levels), list(first.lost)
         with ThreadPoolExecutor(self._context.threads) as pool:
             for number in range(2, self._config.levels + 1):
                 before = scene.path.poses
@@ -56,6 +56,8 @@ class StratifiedEstimator:
                     advance(1)
                 camera = Camera(camera_matrix(level.adjusted.focal_px, camera.centre_px), camera.distortion)
                 scene = level.scene
+                # A level merges the frames that the one before located, so each level has its own to name.
+                lost += [LostFrames(group.span, _LOST) for group in level.left_out]
                 levels.append(
                     {
                         "group_frames": len(level.groups[0].span),
@@ -66,7 +68,8 @@ class StratifiedEstimator:
                         "std_position": relative_std(level.adjusted.std_position, level.adjusted.poses),
                     }
                 )
-        return with_focal_judged(_Assembly(source, camera, first, level, before, tuple(levels)).estimate(), self._context)
+        first = replace(first, levels=tuple(levels), lost=tuple(sorted(lost, key=lambda each: each.span.start)))
+        return with_focal_judged(_Assembly(source, camera, first, level, before).estimate(), self._context)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,10 +78,9 @@ class _Assembly:
 
     source: Source
     camera: Camera
-    first: PoseEstimate
+    first: PoseEstimate  # of the averages; with the records of all levels, and the frames that any of them lost
     level: PosedLevel
     before: FloatArray
-    levels: tuple[Mapping[str, float | int | str | None], ...]
 
     def estimate(self) -> PoseEstimate:
         level, frames, std_focal = self.level, _frames(self.source), self.level.adjusted.std_focal_px
@@ -106,8 +108,6 @@ class _Assembly:
             std_rotation_deg=np.rad2deg(std_rotation),
             points=ScenePoints(level.adjusted.points, flux_of_points(views, len(level.adjusted.points))),
             views=views,
-            lost=self._lost(),
-            levels=self.levels,
             doubts=(*self.first.doubts, *self._contradictions()),
         )
 
@@ -131,12 +131,6 @@ class _Assembly:
             f"{given:.4g}, which moves the corners of a frame by {moved_px:.2g} px and is {off:.0f} standard errors; calibrate "
             "the camera, and give camera.focal_px and camera.distortion"
         ]
-
-    def _lost(self) -> tuple[LostFrames, ...]:
-        reason = "too few patches of other exposures were found in theirs"
-        groups = zip(self.level.groups, self.level.is_located, strict=True)
-        lost = [LostFrames(group.span, reason) for group, is_located in groups if not is_located]
-        return tuple(sorted([*self.first.lost, *lost], key=lambda each: each.span.start))
 
     def _views(self) -> tuple[PosedView, ...]:
         level, views = self.level, []

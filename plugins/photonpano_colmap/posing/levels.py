@@ -64,6 +64,11 @@ class PosedLevel:
     tremor: Tremor | None  # the last one before the exposures were located
 
     @property
+    def left_out(self) -> list[Group]:
+        """The groups that were not located."""
+        return [group for group, is_located in zip(self.groups, self.is_located, strict=True) if not is_located]
+
+    @property
     def scene(self) -> Scene:
         """Path, located frames and points for the next level."""
         located = np.zeros(len(self.path.poses), np.bool_)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
 
 from photonpano import CameraGuess, FrameSpan, Group, LocationError, StageContext
+from photonpano.contracts.results import POSES
 from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
 from photonpano.geometry import Camera, rotation_matrices
@@ -18,10 +20,12 @@ pytest.importorskip("pycolmap")
 pytest.importorskip("gtsam")
 
 from photonpano_colmap.configs import StratifiedPoseConfig
+from photonpano_colmap.posing import levels
 from photonpano_colmap.posing.adjustment import Observations, adjust
 from photonpano_colmap.posing.lens import imaged, lens_of
 from photonpano_colmap.posing.levels import Merged, Scene, interpolate, locate, merge, resample
 from photonpano_colmap.posing.merging import inverse_depth_of, merge_through_depth
+from photonpano_colmap.posing.patches import Found, Patches, find_patches
 from photonpano_colmap.posing.path import Path, PoseSpline, between, moves, posed, positions_of, projected
 from photonpano_colmap.posing.tremor import _beyond_noise, find_tremor
 from photonpano_colmap.stratified import StratifiedEstimator
@@ -304,6 +308,21 @@ def test_frames_that_show_nothing_are_lost_and_the_others_refined() -> None:
     assert score.turns_deg < 0.3
     assert score.honest_shares is not None
     assert score.honest_shares[2] > 0.9
+
+
+def test_frames_that_an_early_level_does_not_locate_are_lost_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def found(patches: Patches, here: Any, there: Any, camera: Camera) -> Found:
+        each = find_patches(patches, here, there, camera)
+        span = there[0].exposure.group.span
+        return Found(*(part[:0] for part in each)) if span.start <= 150 < span.stop else each
+
+    monkeypatch.setattr(levels, "find_patches", found)
+    source, config = capture(), StratifiedPoseConfig(group_size=20, levels=3)
+    context = StageContext(source.info, source.response, 0, 2)
+    estimate = StratifiedEstimator(config, context).estimate(source, CameraGuess(FOCAL_PX), Quiet())
+    assert POSES.require(estimate, source.info) is estimate
+    assert [each.span for each in estimate.lost] == [FrameSpan(140, 160)]
+    np.testing.assert_array_equal(np.flatnonzero(~estimate.located), np.arange(140, 160))
 
 
 def _seen_points() -> np.ndarray:
