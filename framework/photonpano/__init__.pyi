@@ -123,11 +123,13 @@ from .values import PanoramaRows as PanoramaRows
 from .values import Patches as Patches
 from .values import PosedView as PosedView
 from .values import PoseEstimate as PoseEstimate
+from .values import Reason as Reason
 from .values import Refined as Refined
 from .values import Response as Response
 from .values import ScenePoints as ScenePoints
 from .values import SpanResiduals as SpanResiduals
 from .values import StreamInfo as StreamInfo
+from .values import Verdict as Verdict
 from .values import VirtualExposure as VirtualExposure
 
 __version__: str

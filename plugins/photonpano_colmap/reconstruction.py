@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from photonpano import CameraGuess, FloatArray
 from photonpano_colmap.configs import FIRST_CENTRE, SEEDS, ColmapAveragesConfig
+from photonpano_colmap.halves import Halves, compared_halves
 from photonpano_colmap.reversal import Readings, likelier_reading
 
 _USUAL_FOCAL = 1.2  # initial focal length where none is given, in longer sides of a frame
@@ -36,6 +37,7 @@ class Piece:
     observed: tuple[tuple[NDArray[np.intp], FloatArray], ...]
     focal_px: float
     readings: Readings  # how well this reading of the depth, and the other one, explain the images
+    halves: Halves  # what half of the points tell
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,6 +180,7 @@ def _piece(found: pycolmap.Reconstruction, finds_focal: bool) -> Piece:
         tuple(observed),
         float(camera.params[0]),
         readings,
+        compared_halves(found, finds_focal),
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from photonpano import FloatArray
+from photonpano import FloatArray, Reason
 from photonpano_colmap.posing.path import positions_of
 
 _NEAREST = 0.1  # minimum distance of reversed points, in median depths
@@ -29,18 +29,36 @@ class Readings:
     found_px: float  # median distance of a point from where images show it, adjusted from the reading that COLMAP found
     reversed_px: float  # the same, adjusted from near and far exchanged
     is_reversed: bool = False  # whether the likelier one is not what COLMAP found
-    is_unsure: bool = False  # whether both differ, and explain the images alike
+    differ: bool = True  # whether they are two readings: where perspective is strong, adjustment leads from either to one
+
+    @property
+    def doubt(self) -> Reason | None:
+        """Why the depth may be reversed; None if one reading explains the images better than the other."""
+        ratio = min(self.found_px, self.reversed_px) / max(self.found_px, self.reversed_px)
+        if not self.differ or ratio <= _ALIKE:
+            return None
+        return Reason(
+            "the depth of the scene may be reversed: near and far exchanged explain the averages as well",
+            ratio,
+            _ALIKE,
+            f"ratio of the residuals of both; {self}",
+            "move farther, or nearer to the scene, so that perspective tells them apart",
+        )
+
+    def __str__(self) -> str:
+        return (
+            f"points are {self.found_px:.2f} px from where averages show them as COLMAP found them, and "
+            f"{self.reversed_px:.2f} px with near and far exchanged"
+        )
 
 
 def likelier_reading(found: pycolmap.Reconstruction, finds_focal: bool) -> tuple[pycolmap.Reconstruction, Readings]:
     """Return a reconstruction, or a copy with its depth reversed if that explains the images better; and how well each does."""
     adjusted, other = copy.deepcopy(found), _reversed(found)
-    found_px, reversed_px = _adjust(adjusted, finds_focal), _adjust(other, finds_focal)
-    # Where perspective is strong, adjustment leads from the wrong reading to the right one.
-    is_unsure = not _agree(adjusted, other) and min(found_px, reversed_px) > _ALIKE * max(found_px, reversed_px)
+    found_px, reversed_px = adjust_model(adjusted, finds_focal), adjust_model(other, finds_focal)
     likelier = adjusted if found_px <= reversed_px else other
-    is_reversed = not is_unsure and not _agree(found, likelier)
-    readings = Readings(found_px, reversed_px, is_reversed, is_unsure)
+    is_reversed = not _agree(found, likelier)
+    readings = Readings(found_px, reversed_px, is_reversed, not _agree(adjusted, other))
     if not is_reversed:
         return found, readings
     for identifier, point in list(likelier.points3D.items()):
@@ -78,7 +96,7 @@ def _reversed(found: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return other
 
 
-def _adjust(model: pycolmap.Reconstruction, finds_focal: bool) -> float:
+def adjust_model(model: pycolmap.Reconstruction, finds_focal: bool) -> float:
     """Adjust a reconstruction to its images, and return the median distance of a point from where they show it, px."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.refine_focal_length = finds_focal

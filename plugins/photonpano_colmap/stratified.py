@@ -16,19 +16,19 @@ from photonpano import (
     PosedView,
     PoseEstimate,
     Progress,
+    Reason,
     ScenePoints,
     Source,
     StageContext,
 )
 from photonpano.geometry import Camera, camera_matrix, corners
-from photonpano_colmap.averages import FOCAL_BIAS, AveragesEstimator, flux_of_points, relative_std, with_focal_judged
+from photonpano_colmap.averages import FOCAL_BIAS, AveragesEstimator, flux_of_points, relative_std, tilt, with_focal_judged
 from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
 from photonpano_colmap.posing.path import Path, PoseSpline, positions_of
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
 _CONTRADICTION, _CONTRADICTION_PX = 10.0, 0.5
-_LARGEST_EXCESS = 1.0  # residuals relative to photon noise; of right poses it was below a half
 _MISSED = 0.5  # expected next pose update, as a fraction of the last one
 _LOST = "too few patches of other exposures were found in theirs"
 
@@ -87,6 +87,7 @@ class _Assembly:
         poses = level.path.poses.copy()
         instants = np.array([group.reference for group in level.groups])[level.is_located]
         stds = [np.interp(frames, instants, std) for std in (level.adjusted.std_position, level.adjusted.std_rotation)]
+        stds[1] = np.hypot(stds[1], tilt(level.adjusted.poses, level.adjusted.std_position))
         if level.tremor is not None:
             stds = [np.hypot(stds[0], level.tremor.shift), np.hypot(stds[1], level.tremor.std)]
         moved = _left(positions_of(poses) - positions_of(self.before), frames, instants)
@@ -109,16 +110,11 @@ class _Assembly:
             points=ScenePoints(level.adjusted.points, flux_of_points(views, len(level.adjusted.points))),
             views=views,
             doubts=(*self.first.doubts, *self._contradictions()),
+            residual_ratio=level.adjusted.excess,
         )
 
-    def _contradictions(self) -> list[str]:
-        """Doubt poses, and a lens, that the exposures contradict."""
-        if self.level.adjusted.excess > _LARGEST_EXCESS:
-            return [
-                f"points are {self.level.adjusted.residual_px:.2f} px from where exposures show them (the median), "
-                f"{self.level.adjusted.excess:.2g} times as far as photon noise explains, so that the poses are likely wrong; "
-                "choose another pose.with.group_size, or move farther"
-            ]
+    def _contradictions(self) -> list[Reason]:
+        """Doubt a lens that the exposures contradict."""
         adjusted, camera, given = self.level.adjusted, self.camera, float(self.camera.distortion[0])
         corner = camera.ideal(corners(self.source.info.frame_shape)) - camera.centre_px
         farthest = float(np.nanmax(np.linalg.norm(corner, axis=1))) / camera.focal_px
@@ -126,11 +122,12 @@ class _Assembly:
         off = abs(adjusted.missed_k1) / adjusted.std_k1
         if off < _CONTRADICTION or moved_px < _CONTRADICTION_PX:
             return []
-        return [
-            f"the exposures contradict the lens: they ask for a k1 of about {given + adjusted.missed_k1:.2f} instead of "
-            f"{given:.4g}, which moves the corners of a frame by {moved_px:.2g} px and is {off:.0f} standard errors; calibrate "
-            "the camera, and give camera.focal_px and camera.distortion"
-        ]
+        where = (
+            f"a k1 of about {given + adjusted.missed_k1:.2f} fits, {given:.4g} is given, which moves the corners of a frame by "
+            f"{moved_px:.2g} px; in expected errors"
+        )
+        todo = "calibrate the camera, and give camera.focal_px and camera.distortion"
+        return [Reason("the exposures contradict the lens", off, _CONTRADICTION, where, todo)]
 
     def _views(self) -> tuple[PosedView, ...]:
         level, views = self.level, []

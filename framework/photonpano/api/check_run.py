@@ -15,8 +15,8 @@ from photonpano.motion.timeline import REPEATED
 from photonpano.pipeline.obstacles import timeline_of
 from photonpano.plugins.registry import Catalog
 from photonpano.residuals.refinement import MotionFit
-from photonpano.residuals.verdict import NO_TURN, REPEATS, Reason, Verdict, contradictions, judge
-from photonpano.values import Decision
+from photonpano.residuals.verdict import NO_TURN, REPEATS, contradictions, judge
+from photonpano.values import Decision, Reason, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,5 +79,5 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
             reasons.append(reason)
     recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
     reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NO_TURN)]
-    judged = replace(verdict, status="doubtful" if reasons else "trusted", reasons=tuple(reasons))
+    judged = Verdict.of(reasons, verdict.residual_ratio, verdict.untested)
     return RunCheck(judged, tuple(unknown))

@@ -17,7 +17,7 @@ import typer
 from photonpano.errors import PhotonpanoError
 
 if TYPE_CHECKING:
-    from photonpano.residuals.verdict import Verdict
+    from photonpano.values.verdict import Verdict
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 logger = logging.getLogger("photonpano")

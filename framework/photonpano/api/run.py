@@ -11,7 +11,6 @@ import typer
 from photonpano.api.command import (
     CHANGES,
     SPEC,
-    DoubtfulError,
     WrongArgumentError,
     command,
     logger,
@@ -66,8 +65,6 @@ def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
         yield from _lines(other)
     if strict and result.verdict is not None:
         require_trust(result.verdict, "all files of the run folder are written")
-    if strict and poses and poses["doubts"]:
-        raise DoubtfulError("the poses are doubtful, and --strict accepts only trusted ones; all files of the run are written")
 
 
 @command(

@@ -22,7 +22,7 @@ from photonpano.contracts.rules import (
     text,
 )
 from photonpano.geometry import Canvas
-from photonpano.values import BoolArray, FloatArray, Panorama, PosedView, PoseEstimate, Refined, StreamInfo
+from photonpano.values import BoolArray, FloatArray, Panorama, PosedView, PoseEstimate, Reason, Refined, StreamInfo
 
 _ORTHONORMAL = 1e-6  # largest element of R R^T - I of a rotation
 
@@ -160,6 +160,11 @@ def _no_points(found: PoseEstimate, _: StreamInfo) -> object:
     return not (right and np.shape(found.points.flux) == (count,)) and (count,)
 
 
+def _no_reason(found: PoseEstimate, _: StreamInfo) -> object:
+    given: tuple[object, ...] = found.doubts
+    return next(((shown(each),) for each in given if not isinstance(each, Reason)), None)
+
+
 def _unexplained(found: PoseEstimate, _: StreamInfo) -> object:
     known = np.array(found.located)
     for each in found.lost:
@@ -231,5 +236,6 @@ POSES: Contract[PoseEstimate] = Contract(
         ),
         _of_views("xy of the view of {} must be finite", lambda view, _: not np.isfinite(view.xy).all()),
         ("frame {} is not located, and no entry of lost says why", _unexplained),
+        ("expected each of the doubts as a Reason, got {}", _no_reason),
     ]
 )

@@ -18,10 +18,11 @@ from photonpano.pipeline.estimate import require_centre
 from photonpano.pipeline.obstacles import naming_obstacles
 from photonpano.pipeline.run_steps import BegunRun
 from photonpano.record.poses import Poses, centres, colmap, in_standard_world, nerfstudio, ply, tum
-from photonpano.record.run_json import poses_record
+from photonpano.record.run_json import poses_record, verdict_record
 from photonpano.record.run_warnings import poses_warnings
 from photonpano.record.schema import RunRecord
 from photonpano.report import render_pose_report
+from photonpano.residuals.pose_verdict import judge_poses
 from photonpano.specs.plan import Plan
 from photonpano.values import CameraGuess, FluxImage, PoseEstimate, StreamInfo
 
@@ -35,12 +36,14 @@ def find_poses(run: BegunRun) -> None:
         estimate = _estimated(run)
     run.observers.posed(estimate, time.perf_counter() - start)
     files = write_pose_files(run.folder.staging, estimate, source.info, plan.output.exposures)
+    verdict = judge_poses(estimate)
     record: RunRecord = {
         **run.started_record(),
-        "poses": poses_record(estimate),
+        "poses": poses_record(estimate, verdict),
+        "verdict": verdict_record(verdict),
         "warnings": [*poses_warnings(estimate), *files],
     }
-    run.end(record, lambda record: render_pose_report(record, estimate))
+    run.end(record, lambda record: render_pose_report(record, estimate), verdict)
 
 
 def camera_guess(plan: Plan) -> CameraGuess:

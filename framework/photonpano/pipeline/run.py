@@ -27,8 +27,9 @@ from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import LiveFigures, OpenCapture, render_report
 from photonpano.report.notebook import run_html
-from photonpano.residuals.verdict import Verdict, judge
+from photonpano.residuals.verdict import judge
 from photonpano.specs.plan import Plan
+from photonpano.values import Verdict
 
 END_AFTER_S = 5.0  # default time without a new frame after which a followed capture is complete
 
@@ -40,7 +41,7 @@ class RunResult:
     Attributes:
         directory: the run folder.
         record: the content of its `run.json`.
-        verdict: whether motion and panorama explain the photons; None for poses, whose doubts are in the record.
+        verdict: whether motion and panorama, or the poses, explain the photons.
         was_finished: whether `resume` found that nothing was left to do.
         followed: how fast the frames of a capture were located that was followed.
         others: the runs of the other shots of the capture, longer ones first; those that failed are missing.

@@ -31,9 +31,8 @@ from photonpano.record.fingerprint import CaptureRecord, capture_files, fingerpr
 from photonpano.record.run_json import level_record, started_record, verdict_of
 from photonpano.record.schema import RunRecord
 from photonpano.report import loading_figures, render_failure
-from photonpano.residuals.verdict import Verdict
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision
+from photonpano.values import Decision, Verdict
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +49,7 @@ class BegunRun:
         levels: the levels so far; one that was located again is there more than once.
         was_finished: whether the run was finished before, so that nothing is left to do.
         record: of the finished run.
-        verdict: whether motion and panorama explain the photons; None for poses.
+        verdict: whether the results explain the photons.
     """
 
     plan: Plan

@@ -34,9 +34,8 @@ from photonpano.record.schema import (
     VerdictRecord,
 )
 from photonpano.residuals.refinement import Explained, Refinement
-from photonpano.residuals.verdict import Reason, Verdict
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, PoseEstimate, StreamInfo
+from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, PoseEstimate, Reason, StreamInfo, Verdict
 
 
 def record_of(
@@ -51,8 +50,6 @@ def record_of(
     """Return the record of a finished run; `rendered` are the decisions of renderer and exporters."""
     motion, timeline = explained.motion, levels[-1].exposures.timeline
     decisions = [levels_decision(levels), *rendered] if plan.until_converged else rendered
-    reasons = [_fields(reason) for reason in verdict.reasons]
-    judged: VerdictRecord = _fields(verdict) | {"reasons": reasons, "untested": list(verdict.untested)}
     return {
         **started,
         "decisions": [*started["decisions"], *decision_records(decisions)],
@@ -60,7 +57,7 @@ def record_of(
         "panorama": panorama_record(plan, panorama, rendered),
         "motion": motion_record(motion.std_px),
         "refinements": [refinement_record(each) for each in explained.refinements],
-        "verdict": judged,
+        "verdict": verdict_record(verdict),
         "warnings": [
             *timeline_warnings(timeline, plan.output.directory),
             *level_warnings(levels),
@@ -223,6 +220,13 @@ def motion_record(std_px: FloatArray) -> MotionRecord | None:
     return {"std_px": float(std_px[known].mean()), "worst_std_px": float(std_px[worst]), "worst_frame": worst}
 
 
+def verdict_record(verdict: Verdict) -> VerdictRecord:
+    """Describe a verdict."""
+    reasons = [_fields(reason) for reason in verdict.reasons]
+    judged: VerdictRecord = _fields(verdict) | {"reasons": reasons, "untested": list(verdict.untested)}
+    return judged
+
+
 def verdict_of(found: VerdictRecord) -> Verdict:
     """Return the verdict that a record describes."""
     status: Literal["trusted", "doubtful"] = "trusted" if found["status"] == "trusted" else "doubtful"
@@ -270,8 +274,8 @@ def _number(value: float) -> float | None:
     return plain if np.isfinite(plain) else None
 
 
-def poses_record(estimate: PoseEstimate) -> PosesRecord:
-    """Describe an estimate, in a world in which the path has the length 1."""
+def poses_record(estimate: PoseEstimate, verdict: Verdict) -> PosesRecord:
+    """Describe an estimate and the doubts of its verdict, in a world in which the path has the length 1."""
     camera = Camera(estimate.camera_matrix, estimate.distortion)
     return {
         "camera": {
@@ -288,7 +292,7 @@ def poses_record(estimate: PoseEstimate) -> PosesRecord:
         "exposures": len(estimate.views),
         "lost": [{"frames": [each.span.start, each.span.stop], "reason": each.reason} for each in estimate.lost],
         "levels": [dict(level) for level in estimate.levels],
-        "doubts": list(estimate.doubts),
+        "doubts": [str(reason) for reason in verdict.reasons],
     }
 
 

@@ -1,4 +1,4 @@
-"""Warnings of a run: exposures that were not located, outliers, frames with a large expected error, doubtful poses."""
+"""Warnings of a run: exposures that were not located, outliers, frames with a large expected error, frames without a pose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from photonpano.values import FloatArray, FrameSpan, PoseEstimate, true_spans
 # Expected corner error above which a warning names the frames: it is likely to be visible.
 UNCERTAIN_PX = 0.5
 SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst first
-
 
 DOUBTFUL = "doubtful: "  # begins the warnings that are doubts
 _MANY_COPIES = 0.25  # share of the frames from which a warning names them
@@ -150,11 +149,10 @@ def refinement_warnings(refinements: Sequence[Refinement]) -> list[str]:
 
 
 def poses_warnings(estimate: PoseEstimate) -> list[str]:
-    """Warn of doubts, and of frames without a pose."""
-    warnings = [f"{DOUBTFUL}{doubt}" for doubt in estimate.doubts]
-    if not estimate.located.all():
-        lost, frames = int((~estimate.located).sum()), len(estimate.located)
-        spans = "; ".join(f"{each.span}: {each.reason}" for each in estimate.lost[:_SHOWN_LOST])
-        more = f"; and {len(estimate.lost) - _SHOWN_LOST} more spans" if len(estimate.lost) > _SHOWN_LOST else ""
-        warnings.append(f"{lost} of {frames} frames have no pose ({spans}{more})")
-    return warnings
+    """Warn of frames without a pose."""
+    if estimate.located.all():
+        return []
+    lost, frames = int((~estimate.located).sum()), len(estimate.located)
+    spans = "; ".join(f"{each.span}: {each.reason}" for each in estimate.lost[:_SHOWN_LOST])
+    more = f"; and {len(estimate.lost) - _SHOWN_LOST} more spans" if len(estimate.lost) > _SHOWN_LOST else ""
+    return [f"{lost} of {frames} frames have no pose ({spans}{more})"]

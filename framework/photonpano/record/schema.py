@@ -170,11 +170,12 @@ class ReasonRecord(TypedDict):
 
 
 class VerdictRecord(TypedDict):
-    """Whether motion and panorama explain the photons.
+    """Whether motion and panorama, or poses, explain the photons.
 
     `status` is "trusted" or "doubtful". `residual_ratio` is the scatter of the shifts of short spans of frames, in units of
-    what noise explains: about 1 if nothing is left. None if there are too few frames to tell. `untested` lists the tests that
-    could not be made, and why, in clauses that begin with "whether".
+    what noise explains: about 1 if nothing is left. None if there are too few frames to tell. Of poses it is the median
+    distance of points from where exposures show them, in units of what photon noise explains, None where the pose estimator
+    does not know that noise. `untested` lists the tests that could not be made, and why, in clauses that begin with "whether".
     """
 
     status: str
@@ -195,7 +196,7 @@ class PosesRecord(TypedDict):
 
     `located` counts frames. `std_position` and `std_rotation_deg` are the expected errors of the located frames, root mean
     square; the length of the path is 1. They are None where the estimator knows none. `points` and `exposures` count those of
-    `sparse`; `levels` is what the pose estimator records, and `doubts` are reasons why the poses may be wrong.
+    `sparse`; `levels` is what the pose estimator records, and `doubts` are the reasons of the verdict as sentences.
     """
 
     camera: CameraRecord
@@ -219,9 +220,9 @@ class FileContent(TypedDict):
 class RunRecord(TypedDict):
     """The content of `run.json`.
 
-    `created` is an ISO 8601 time. `motion`, `verdict` and `panorama` are None where a run has none, as one of poses, which has
-    `poses` instead; that is None elsewhere. `peak_memory_bytes` is None where the
-    system does not report it. `capture` is the fingerprint of what was read; `files` lists the other files of the run folder.
+    `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none, as one of poses, which has `poses`
+    instead; that is None elsewhere. `peak_memory_bytes` is None where the system does not report it.
+    `capture` is the fingerprint of what was read; `files` lists the other files of the run folder.
     `rendered_from` is the run folder whose motion was rendered again, None where the motion was estimated.
     """
 

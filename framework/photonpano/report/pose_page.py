@@ -13,7 +13,6 @@ import numpy as np
 
 from photonpano.photometry import linear_to_srgb
 from photonpano.record.poses import centres
-from photonpano.record.run_warnings import DOUBTFUL
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import INK, MUTED, SERIES, WIDTH_IN, Margins, add_axes, add_time_axis, plain_figure, svg_of
 from photonpano.report.environment import filled
@@ -32,7 +31,7 @@ def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
     shape = record["source"]["height"], record["source"]["width"]
     return filled(
         "poses.html",
-        **(head_of(record) | {"warnings": [each for each in record["warnings"] if not each.startswith(DOUBTFUL)]}),
+        **head_of(record),
         poses=record["poses"],
         path_views=path_views(estimate, shape),
         scene_views=scene_views(estimate, shape) if len(estimate.points.positions) else (),

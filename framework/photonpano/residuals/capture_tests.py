@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from photonpano.motion.timeline import INTERLACED, SHOTS, SHUFFLED
-from photonpano.residuals.reasons import RIVAL, Found, TestedRun, Tests
+from photonpano.residuals.reasons import RIVAL, TestedRun, Tests
+from photonpano.values.verdict import Found
 
 CAPTURE_TESTS = Tests()
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from photonpano.geometry import corners, jacobian
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
-from photonpano.residuals.reasons import RIVAL, Found, Reason, TestedRun, Tests
-from photonpano.values import Located
+from photonpano.residuals.reasons import RIVAL, TestedRun, Tests
+from photonpano.values import Located, Reason
+from photonpano.values.verdict import Found
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
 NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"

@@ -9,9 +9,10 @@ from photonpano.geometry import corners, transform_points
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import deformation_px, lens_distortion
 from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
-from photonpano.residuals.reasons import Found, TestedRun, Tests
+from photonpano.residuals.reasons import TestedRun, Tests
 from photonpano.residuals.refinement import FEWEST_SPANS
 from photonpano.values import BoolArray
+from photonpano.values.verdict import Found
 
 # Contrast of the residuals, as a share of the light, beyond which a large reduced chi-square counts.
 MAX_CONTRAST = 0.02

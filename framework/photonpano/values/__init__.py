@@ -8,6 +8,7 @@ from photonpano.values.frames import FrameSpan, Group, true_spans
 from photonpano.values.light import Light
 from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated, Patches, Refined, SpanResiduals
 from photonpano.values.poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
+from photonpano.values.verdict import Reason, Verdict
 
 __all__ = [
     "CELL_PX",
@@ -36,11 +37,13 @@ __all__ = [
     "Patches",
     "PoseEstimate",
     "PosedView",
+    "Reason",
     "Refined",
     "Response",
     "ScenePoints",
     "SpanResiduals",
     "StreamInfo",
+    "Verdict",
     "VirtualExposure",
     "true_spans",
 ]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano.values.arrays import BoolArray, FloatArray, FluxImage
 from photonpano.values.frames import FrameSpan
+from photonpano.values.verdict import Reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +99,9 @@ class PoseEstimate:
         views: the exposures whose poses were found, in order of their instants.
         lost: the frames that are not located, with reasons.
         levels: a record for each level: numbers and texts by name.
-        doubts: sentences that say why the poses may be wrong, each with what to do; empty if they are trusted.
+        doubts: why the poses may be wrong, as far as the estimator can tell; empty if it trusts them.
+        residual_ratio: median distance of the points from where the views show them, in units of what photon noise explains;
+            None if that is not known.
     """
 
     camera_matrix: FloatArray
@@ -112,4 +115,5 @@ class PoseEstimate:
     views: tuple[PosedView, ...] = ()
     lost: tuple[LostFrames, ...] = ()
     levels: tuple[Mapping[str, float | int | str | None], ...] = ()
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Reason, ...] = ()
+    residual_ratio: float | None = None

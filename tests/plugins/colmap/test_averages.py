@@ -21,6 +21,7 @@ pytest.importorskip("pycolmap")
 
 from photonpano_colmap.averages import AveragesEstimator, chosen_size
 from photonpano_colmap.configs import ColmapAveragesConfig
+from photonpano_colmap.halves import Halves
 from photonpano_colmap.pose_noise import pose_noise
 from photonpano_colmap.posing.path import PoseSpline, positions_of
 from photonpano_colmap.reconstruction import Piece, Reconstruction, _apart
@@ -93,7 +94,7 @@ def pieces(monkeypatch: pytest.MonkeyPatch) -> None:
         for pose in poses[list(images)]:
             seen = (points @ pose[:, :3].T + pose[:, 3]) @ MATRIX.T
             observed.append((np.arange(len(points)), seen[:, :2] / seen[:, 2:]))
-        return Piece(np.array(images), poses[list(images)], points, tuple(observed), FOCAL_PX, readings)
+        return Piece(np.array(images), poses[list(images)], points, tuple(observed), FOCAL_PX, readings, Halves(0, 0))
 
     found = Reconstruction((piece(range(8)), piece(range(9, 15))), np.full(16, 300), np.full(16, 40))
     monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
@@ -126,24 +127,17 @@ def test_little_parallax_is_refused() -> None:
 
 @pytest.mark.usefixtures("pieces")
 @pytest.mark.parametrize("is_unsure", [True, False])
-def test_reversed_depth_is_refused_or_recorded(is_unsure: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reversed_depth_is_recorded_and_an_undecided_one_is_doubted(is_unsure: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     from photonpano_colmap import averages
 
     found = averages.reconstruct(None)
-    readings = Readings(0.8, 0.78 if is_unsure else 0.5, is_reversed=not is_unsure, is_unsure=is_unsure)
+    readings = Readings(0.8, 0.78 if is_unsure else 0.5, is_reversed=True)
     pieces = tuple(replace(piece, readings=readings) for piece in found.pieces)
     monkeypatch.setattr(averages, "reconstruct", lambda *_: replace(found, pieces=pieces))
-    source = MemorySource(np.zeros((N_FRAMES, *SHAPE)))
-    if is_unsure:
-        with pytest.raises(LocationError) as caught:
-            estimated(source, disconnected="largest")
-        assert str(caught.value) == (
-            "the depth of the scene may be reversed: points are 0.80 px from where averages show them as COLMAP found them, "
-            "and 0.78 px with near and far exchanged. Move farther, so that perspective tells them apart"
-        )
-        return
-    _, [decision] = estimated(source, disconnected="largest")
+    estimate, [decision] = estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))), disconnected="largest")
     assert decision[:2] == ("depth_reversed", True)
+    assert [round(doubt.figure, 3) for doubt in estimate.doubts] == ([0.975] if is_unsure else [])
+    assert Readings(0.8, 0.8, differ=False).doubt is None
 
 
 @pytest.mark.usefixtures("pieces")

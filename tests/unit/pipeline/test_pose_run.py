@@ -24,6 +24,7 @@ from photonpano import (
     PosedView,
     PoseEstimate,
     PoseEstimatorContribution,
+    Reason,
     ScenePoints,
     discover,
     hookimpl,
@@ -229,16 +230,20 @@ def test_commands_of_panoramas_refuse_a_run_of_poses(finished: RunResult, tmp_pa
 def test_doubts_and_lost_frames_are_in_record_report_and_warnings(
     plan_of: Callable[..., Plan], tmp_path: Path, with_report: None
 ) -> None:
-    doubt = "the points lie on a plane; move more"
-    record = run(plan_of(lambda it: replace(it, doubts=(doubt,)))).record
-    assert record["poses"]["doubts"] == [doubt]
+    doubt = Reason("the points lie on a plane", 120.0, 100.0, "width over depth", "move more")
+    result = run(plan_of(lambda it: replace(it, doubts=(doubt,), residual_ratio=0.4)))
+    record = result.record
+    assert result.verdict is not None
+    assert (result.verdict.status, result.verdict.reasons[0]) == ("doubtful", doubt)
+    assert record["verdict"] is not None
+    assert (record["verdict"]["status"], record["verdict"]["residual_ratio"]) == ("doubtful", 0.4)
+    assert record["poses"]["doubts"] == [str(reason) for reason in result.verdict.reasons]
     assert record["poses"]["lost"] == [{"frames": [280, 300], "reason": "the exposure shows 3 points, fewer than 12"}]
     assert record["warnings"] == [
-        f"doubtful: {doubt}",
         "20 of 300 frames have no pose (frames 280 to 299: the exposure shows 3 points, fewer than 12)",
     ]
     page = (tmp_path / "run" / "report.html").read_text()
-    assert page.count(doubt) == 1
+    assert page.count("The points lie on a plane") == 1
     assert all(text in page for text in ("280 to 299", "median parallax (°)", "from above", "doubtful", "pose-errors-"))
 
 

@@ -21,8 +21,8 @@ from photonpano.residuals.measure import Residuals
 from photonpano.residuals.reasons import RIVAL
 from photonpano.residuals.refinement import Explained, residual_ratio
 from photonpano.residuals.shaking import Shaking
-from photonpano.residuals.verdict import NO_TURN, TESTS, Reason, contradictions, judge
-from photonpano.values import Ambiguity, Decision, Edge, Located
+from photonpano.residuals.verdict import NO_TURN, TESTS, contradictions, judge
+from photonpano.values import Ambiguity, Decision, Edge, Located, Reason
 
 SHAPE, N_SPANS, SPAN = (128, 192), 200, 10
 N_FRAMES = N_SPANS * SPAN

@@ -75,7 +75,7 @@ def _attempted(job: Job) -> BatchRow:
 def _finished(row: BatchRow, result: RunResult) -> BatchRow:
     """Describe what a run has found."""
     record, poses, motion = result.record, result.record["poses"], result.record["motion"]
-    doubts = [str(each) for each in (poses["doubts"] if poses else result.verdict.reasons if result.verdict else ())]
+    doubts = [str(each) for each in (result.verdict.reasons if result.verdict else ())]
     return replace(
         row,
         status="done",

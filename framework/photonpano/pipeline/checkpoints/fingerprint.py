@@ -87,8 +87,7 @@ def finished_run(plan: Plan, capture: CaptureRecord) -> RunRecord | None:
             and not changed_files(plan.output.directory)
             and (plan.output.keep is None or record["spec"]["output"].get("keep") == plan.output.keep)
         )
-        result = record["verdict"] if plan.pose is None else record["poses"]
-        return record if same and result is not None else None
+        return record if same and record["verdict"] is not None else None
     except (InputError, KeyError, TypeError, AttributeError):
         return None
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import BatchRow, Location, LocationError, Url
+from photonpano import BatchRow, Location, LocationError, Reason, Url, Verdict
 from photonpano.api.batching import running
 from photonpano.api.batching.processes import rows_of
 from photonpano.api.batching.running import run_job
@@ -185,11 +185,11 @@ def test_poses_have_doubts_and_errors_of_positions(
     found: Callable[[Any], None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    poses = {"std_position": 0.01, "doubts": ["the path is straight"]}
-    found(RunResult(Path("nowhere"), small_run.record | {"poses": poses, "motion": None}, None))
+    verdict = Verdict.of([Reason("the path is straight", 2, 1, "", "turn")], None)
+    found(RunResult(Path("nowhere"), small_run.record | {"poses": {"std_position": 0.01}, "motion": None}, verdict))
     monkeypatch.setattr(running, "evaluate_poses", lambda *_: SimpleNamespace(ate_share=0.02))
     row = run_job(job_of(small_capture))
-    assert (row.verdict, row.reason) == ("doubtful", "the path is straight")
+    assert (row.verdict, row.reason) == ("doubtful", "the path is straight: 2, trusted up to 1; turn")
     assert (row.expected_position_error, row.true_position_error) == (0.01, 0.02)
     assert (row.expected_error_px, row.true_error_px, row.thumbnail) == (None, None, None)
 

@@ -17,8 +17,8 @@ from PIL import Image
 from ruamel.yaml import YAML
 
 from photonpano.photometry import srgb_to_linear
-from photonpano.residuals.verdict import Reason
 from photonpano.specs import load_spec, parse_spec
+from photonpano.values import Reason
 from photonpano_simulator.travel.truth import read_truth, sharp_view
 
 SPEC = "version: 1\nsource: {use: packed-npy, with: {path: covered.npy}}\n"

@@ -41,7 +41,7 @@ from photonpano.pipeline.run import RunResult
 from photonpano.plugins.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin
 from photonpano.plugins.registry.catalog import make_entry
 from photonpano.plugins.registry.plugins import observation_of
-from photonpano.residuals.verdict import Reason, Verdict
+from photonpano.values import Reason, Verdict
 
 TRANSCRIPTS = sorted((Path(__file__).parent / "transcripts").glob("*.txt"))
 TREMBLING = Reason("the image moves within groups", 24.1, 2.0, "scatter of the shifts over their noise", "use smaller groups")

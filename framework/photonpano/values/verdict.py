@@ -1,0 +1,95 @@
+"""The verdict on a run, and the reasons of a doubtful one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Generic, Literal, NamedTuple, TypeVar
+
+Facts = TypeVar("Facts")
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why a run is doubtful.
+
+    Attributes:
+        what: what was found, in a clause.
+        figure: the number that decided.
+        threshold: the largest number that is trusted.
+        where: the frames, pixels or places, in a clause; empty if it is everywhere.
+        what_to_do: advice, in a clause.
+    """
+
+    what: str
+    figure: float
+    threshold: float
+    where: str
+    what_to_do: str
+
+    def __str__(self) -> str:
+        where = f" ({self.where})" if self.where else ""
+        return f"{self.what}{where}: {self.figure:.3g}, trusted up to {self.threshold:g}; {self.what_to_do}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether the results of a run explain the photons.
+
+    Attributes:
+        status: "trusted" or "doubtful".
+        reasons: why it is doubtful, the most telling first.
+        residual_ratio: in units of what noise explains, for a panorama the scatter of the shifts of short spans, and for poses
+            the residuals of points in exposures; None if it is unknown.
+        untested: which tests could not be made, and why: clauses that begin with "whether".
+    """
+
+    status: Literal["trusted", "doubtful"]
+    reasons: tuple[Reason, ...]
+    residual_ratio: float | None
+    untested: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, reasons: Iterable[Reason], residual_ratio: float | None, untested: Iterable[str] = ()) -> Verdict:
+        """Return the verdict that has these reasons: doubtful if there is one."""
+        reasons = tuple(reasons)
+        return cls("doubtful" if reasons else "trusted", reasons, residual_ratio, tuple(untested))
+
+
+class Found(NamedTuple):
+    """Figure of a test and where it occurs; `doubtful` overrides the threshold.
+
+    Where the test could not be made, the figure is NaN, and `where` says why.
+    """
+
+    figure: float
+    where: str = ""
+    doubtful: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Test(Generic[Facts]):
+    """A row of a table of tests: `find` returns what it found, or None where nothing is to be found."""
+
+    what: str
+    threshold: float
+    what_to_do: str
+    find: Callable[[Facts], Found | None]
+
+    def untested(self, found: Found | None) -> str | None:
+        """Return a clause on what was not tested, and why; None if it was."""
+        return f"whether {self.what} ({found.where})" if found is not None and found.figure != found.figure else None
+
+    def reason(self, found: Found | None) -> Reason | None:
+        """Judge what was found; None if it is trusted, or not known."""
+        if found is None or not (found.doubtful or found.figure > self.threshold):
+            return None
+        return Reason(self.what, found.figure, self.threshold, found.where, self.what_to_do)
+
+
+def judged(tests: Iterable[Test[Facts]], facts: Facts, residual_ratio: float | None, doubts: Iterable[Reason] = ()) -> Verdict:
+    """Return the verdict of a table of tests, in its order, after the doubts that are there already."""
+    found = [(test, test.find(facts)) for test in tests]
+    reasons = (reason for test, each in found if (reason := test.reason(each)) is not None)
+    untested = (clause for test, each in found if (clause := test.untested(each)) is not None)
+    return Verdict.of((*doubts, *reasons), residual_ratio, untested)
