@@ -232,6 +232,7 @@ class _Assembly:
             "keypoints": float(np.median(self.found.n_keypoints)),
             "parallax_deg": float(np.rad2deg(np.median(parallax(self.piece)))),
             "residual_px": noise.residual_px,
+            "depth_readings": self.piece.readings.ratio,
             "std_position": relative_std(noise.std_position, self.piece.poses),
         }
 
@@ -282,10 +283,12 @@ def tilt(poses: FloatArray, std_position: FloatArray) -> float:
     """Return the angle by which errors of positions tilt the aligned world about the principal axis of the path, in radians.
 
     The axis is near to all of the (N, 3, 4) poses, so that small errors, if they change slowly along the path, turn it far.
+    It is 0 for a path that is straight but for these errors, about which an alignment leaves rotations as they are.
     """
     centred = positions_of(poses) - positions_of(poses).mean(axis=0)
     away = float(np.sqrt(np.sum(np.linalg.svd(centred, compute_uv=False)[1:] ** 2) / len(poses)))
-    return _TILT_SHARE * float(np.sqrt(np.mean(std_position**2))) / away if away else math.inf
+    error = float(np.sqrt(np.mean(std_position**2)))
+    return _TILT_SHARE * error / away if error < away else 0.0
 
 
 def chosen_size(capture: CaptureSummary, n_frames: int) -> tuple[int, str]:

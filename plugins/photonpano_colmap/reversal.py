@@ -32,10 +32,14 @@ class Readings:
     differ: bool = True  # whether they are two readings: where perspective is strong, adjustment leads from either to one
 
     @property
+    def ratio(self) -> float | None:
+        """The smaller of both residuals over the larger; None if they are those of one reading."""
+        return min(self.found_px, self.reversed_px) / max(self.found_px, self.reversed_px) if self.differ else None
+
+    @property
     def doubt(self) -> Reason | None:
         """Why the depth may be reversed; None if one reading explains the images better than the other."""
-        ratio = min(self.found_px, self.reversed_px) / max(self.found_px, self.reversed_px)
-        if not self.differ or ratio <= _ALIKE:
+        if (ratio := self.ratio) is None or ratio <= _ALIKE:
             return None
         return Reason(
             "the depth of the scene may be reversed: near and far exchanged explain the averages as well",

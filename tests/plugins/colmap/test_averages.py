@@ -19,7 +19,7 @@ from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, captur
 
 pytest.importorskip("pycolmap")
 
-from photonpano_colmap.averages import AveragesEstimator, chosen_size
+from photonpano_colmap.averages import AveragesEstimator, chosen_size, tilt
 from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.halves import Halves
 from photonpano_colmap.pose_noise import pose_noise
@@ -176,6 +176,15 @@ def test_spline_is_exact_for_a_smooth_path_and_keeps_its_velocity_beyond() -> No
     np.testing.assert_allclose(places[2] - places[1], places[1] - places[0], atol=1e-12)
     turns = Rotation.from_matrix(found[1:5, :, :3] @ np.swapaxes(found[:4, :, :3], 1, 2)).magnitude()
     np.testing.assert_allclose(turns, turns[0], rtol=1e-6)
+
+
+def test_errors_of_positions_tilt_a_path_the_less_the_more_it_bends() -> None:
+    times = np.linspace(-1, 1, 21)
+    bent, straight = np.tile(np.eye(3, 4), (2, 21, 1, 1))
+    bent[:, 0, 3] = straight[:, 0, 3] = times
+    bent[:, 1, 3] = 0.1 * np.sqrt(2) * np.cos(np.pi * times)
+    assert tilt(bent, np.full(21, 0.01)) == pytest.approx(0.5 * 0.01 / 0.1, rel=0.1)
+    assert tilt(straight, np.full(21, 0.01)) == 0
 
 
 def seen(x: np.ndarray, n_poses: int) -> np.ndarray:

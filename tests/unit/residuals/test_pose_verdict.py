@@ -36,7 +36,7 @@ def test_good_poses_are_trusted() -> None:
     [
         ({"residual_ratio": 1.5}, "the poses do not explain the photons", 1.5),
         ({"std_position": np.full(N_FRAMES, 0.01)}, "the expected error of the positions", 1),
-        ({"std_rotation_deg": np.full(N_FRAMES, 3.0)}, "the expected error of the rotations", 3),
+        ({"std_rotation_deg": np.full(N_FRAMES, 6.0)}, "the expected error of the rotations", 6),
         ({"located": REST}, "many frames have no pose", 25 / 40),
     ],
 )
