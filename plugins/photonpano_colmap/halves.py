@@ -25,6 +25,9 @@ class Halves:
     std_rotation: float  # in radians
 
 
+_UNKNOWN = Halves(np.inf, np.inf)
+
+
 def compared_halves(found: pycolmap.Reconstruction, finds_focal: bool) -> Halves:
     """Adjust the images of a reconstruction to every second point, and to the others; compare both, aligned."""
     halves = [copy.deepcopy(found) for _ in range(2)]
@@ -32,11 +35,13 @@ def compared_halves(found: pycolmap.Reconstruction, finds_focal: bool) -> Halves
         for identifier in sorted(half.points3D)[number::2]:
             half.delete_point3D(identifier)
         adjust_model(half, finds_focal)
+        if not half.num_points3D():  # as of a camera that only turns, whose points lie anywhere
+            return _UNKNOWN
     images = sorted(set(halves[0].reg_image_ids()) & set(halves[1].reg_image_ids()))
     first, second = (np.array([half.images[each].cam_from_world().matrix() for each in images]) for half in halves)
     aligned = pycolmap.estimate_sim3d(positions_of(first), positions_of(second))
     if aligned is None:
-        return Halves(np.inf, np.inf)
+        return _UNKNOWN
     apart = positions_of(first) @ aligned.rotation.matrix().T * aligned.scale + aligned.translation - positions_of(second)
     turned = Rotation.from_matrix(first[:, :, :3] @ aligned.rotation.matrix().T @ np.swapaxes(second[:, :, :3], 1, 2))
     # Both halves err, by chance.

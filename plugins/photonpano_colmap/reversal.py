@@ -115,7 +115,7 @@ def adjust_model(model: pycolmap.Reconstruction, finds_focal: bool) -> float:
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
-    return float(np.median([point.error for point in model.points3D.values()]))
+    return float(np.median([point.error for point in model.points3D.values()] or [np.inf]))
 
 
 def _agree(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction) -> bool:

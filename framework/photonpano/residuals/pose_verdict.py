@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from photonpano.values import PoseEstimate, Verdict
+from photonpano.values import FloatArray, PoseEstimate, Verdict
 from photonpano.values.verdict import Found, Test, judged
 
 
@@ -25,9 +25,13 @@ def _rotation(estimate: PoseEstimate) -> Found | None:
     return _expected(estimate.std_rotation_deg[estimate.located], "degrees, root mean square")
 
 
-def _expected(std: np.ndarray, unit: str) -> Found | None:
-    # An estimator that knows no expected errors says so by infinite ones.
+def _expected(std: FloatArray, unit: str) -> Found | None:
     return Found(float(np.sqrt(np.mean(std**2))), unit) if np.isfinite(std).all() else None
+
+
+def _unknown(estimate: PoseEstimate) -> Found:
+    known = np.isfinite(estimate.std_position) & np.isfinite(estimate.std_rotation_deg)
+    return Found(float((~known[estimate.located]).mean()), "share of the frames with a pose")
 
 
 def _lost(estimate: PoseEstimate) -> Found:
@@ -45,5 +49,6 @@ TESTS: tuple[Test[PoseEstimate], ...] = (
     ),
     Test("the expected error of the positions is large", 0.4, _MORE_LIGHT, _position),
     Test("the expected error of the rotations is large", 5.0, _MORE_LIGHT, _rotation),
+    Test("the expected errors are not known", 0, "use a pose estimator that knows them, or more light", _unknown),
     Test("many frames have no pose", 0.5, "see the reasons under `lost`; choose another pose.with.group_size", _lost),
 )

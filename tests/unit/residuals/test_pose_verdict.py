@@ -26,9 +26,7 @@ REST = np.arange(N_FRAMES) < 15
 def test_good_poses_are_trusted() -> None:
     verdict = judge_poses(GOOD)
     assert (verdict.status, verdict.reasons, verdict.residual_ratio) == ("trusted", (), 0.5)
-    # an estimator may know neither its residuals nor its errors
-    unknown = np.full(N_FRAMES, np.inf)
-    assert judge_poses(replace(GOOD, residual_ratio=None, std_position=unknown, std_rotation_deg=unknown)).status == "trusted"
+    assert judge_poses(replace(GOOD, residual_ratio=None)).status == "trusted"
 
 
 @pytest.mark.parametrize(
@@ -37,6 +35,7 @@ def test_good_poses_are_trusted() -> None:
         ({"residual_ratio": 1.5}, "the poses do not explain the photons", 1.5),
         ({"std_position": np.full(N_FRAMES, 0.01)}, "the expected error of the positions", 1),
         ({"std_rotation_deg": np.full(N_FRAMES, 6.0)}, "the expected error of the rotations", 6),
+        ({"std_position": np.full(N_FRAMES, np.inf)}, "the expected errors are not known", 1),
         ({"located": REST}, "many frames have no pose", 25 / 40),
     ],
 )
