@@ -29,7 +29,7 @@ from photonpano.api.cli.app import app, commands
 from photonpano.capture.writing import truth_path
 from photonpano.corrections import CORRECTIONS
 from photonpano.plugins import hookspecs
-from photonpano.residuals import verdict
+from photonpano.residuals import pose_verdict, verdict
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -313,6 +313,13 @@ def test_trust_page_shows_thresholds_of_verdict():
     limits = [test.threshold for test in verdict.TESTS if test.what != "no motion is known"]
     assert shown == [f"{limit:g}" for limit in limits]
     assert f"more than {100 * verdict.MAX_CONTRAST:g} % of the light" in page
+
+
+def test_poses_page_shows_thresholds_of_verdict():
+    page = (ROOT / "docs" / "how-to" / "poses.md").read_text(encoding="utf-8")
+    _, _, table = page.partition("## The verdict")
+    shown = re.findall(r"^\|[^|]+\|[^|]+\| ([\d.]+) \|$", table.partition("\n## ")[0], re.MULTILINE)
+    assert shown[-len(pose_verdict.TESTS) :] == [f"{test.threshold:g}" for test in pose_verdict.TESTS]
 
 
 @pytest.fixture(scope="module")

@@ -250,6 +250,7 @@ BROKEN: Mapping[str, Mapping[str, Change]] = {
         "one NaN": answer("estimate", camera_from_world=lambda it: one_nan(it.camera_from_world)),
         "mirrored": answer("estimate", camera_from_world=lambda it: it.camera_from_world * [-1, 1, 1, 1]),
         "frames that are skipped": around("estimate", skipped),
+        "doubts that are sentences": answer("estimate", doubts=lambda _: ("the path is straight",)),
         "frames that are not located with a pose": answer("estimate", located=lambda it: np.arange(len(it.located)) < 100),
         "no frame": answer("estimate", located=lambda it: np.zeros_like(it.located)),
         "fewer frames": answer("estimate", camera_from_world=lambda it: it.camera_from_world[1:]),
