@@ -241,7 +241,9 @@ class _Assembly:
         extents = np.linalg.svd(self.piece.points - np.median(self.piece.points, axis=0), compute_uv=False)
         if self.guess.focal_px is None and extents[2] < _PLANE * extents[0]:
             flat = "the points lie in a plane, from which no focal length can be found"
-            doubts.append(Reason(flat, extents[0] / extents[2], 1 / _PLANE, "width over depth of the points", _GIVE_FOCAL))
+            doubts.append(
+                Reason(flat, 1 - extents[2] / extents[0], 1 - _PLANE, "1 less their depth over their width", _GIVE_FOCAL)
+            )
         return doubts
 
 

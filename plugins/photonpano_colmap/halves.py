@@ -22,9 +22,10 @@ class Halves:
     """
 
     std_position: float  # in units of the world
-    std_rotation: float  # in radians
+    std_rotation: float  # in radians, after the best common rotation
 
 
+_FEWEST = 3  # positions that determine a similarity
 _UNKNOWN = Halves(np.inf, np.inf)
 
 
@@ -39,10 +40,11 @@ def compared_halves(found: pycolmap.Reconstruction, finds_focal: bool) -> Halves
             return _UNKNOWN
     images = sorted(set(halves[0].reg_image_ids()) & set(halves[1].reg_image_ids()))
     first, second = (np.array([half.images[each].cam_from_world().matrix() for each in images]) for half in halves)
-    aligned = pycolmap.estimate_sim3d(positions_of(first), positions_of(second))
+    aligned = pycolmap.estimate_sim3d(positions_of(first), positions_of(second)) if len(images) >= _FEWEST else None
     if aligned is None:
         return _UNKNOWN
     apart = positions_of(first) @ aligned.rotation.matrix().T * aligned.scale + aligned.translation - positions_of(second)
-    turned = Rotation.from_matrix(first[:, :, :3] @ aligned.rotation.matrix().T @ np.swapaxes(second[:, :, :3], 1, 2))
+    worlds = Rotation.from_matrix(np.swapaxes(first[:, :, :3], 1, 2) @ second[:, :, :3])
+    turned = (worlds * worlds.mean().inv()).magnitude()
     # Both halves err, by chance.
-    return Halves(*(float(np.sqrt(np.mean(each**2) / 2)) for each in (np.linalg.norm(apart, axis=1), turned.magnitude())))
+    return Halves(*(float(np.sqrt(np.mean(each**2) / 2)) for each in (np.linalg.norm(apart, axis=1), turned)))

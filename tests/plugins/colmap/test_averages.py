@@ -141,6 +141,22 @@ def test_reversed_depth_is_recorded_and_an_undecided_one_is_doubted(is_unsure: b
 
 
 @pytest.mark.usefixtures("pieces")
+def test_errors_are_no_smaller_than_those_of_half_of_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    from photonpano_colmap import averages
+
+    found = averages.reconstruct(None)
+    source, halves = MemorySource(np.zeros((N_FRAMES, *SHAPE))), Halves(0.02, 0.03)
+    before, _ = estimated(source, disconnected="largest")
+    pieces = tuple(replace(piece, halves=halves) for piece in found.pieces)
+    monkeypatch.setattr(averages, "reconstruct", lambda *_: replace(found, pieces=pieces))
+    after, _ = estimated(source, disconnected="largest")
+    for name, least in (("std_position", 0.02), ("std_rotation_deg", np.rad2deg(0.03))):
+        own, larger = (np.sqrt(np.nanmean(getattr(each, name) ** 2)) for each in (before, after))
+        assert own < 0.5 * least
+        assert 0.9 * least < larger
+
+
+@pytest.mark.usefixtures("pieces")
 def test_focal_length_that_was_found_is_a_decision() -> None:
     estimate, [decision] = estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))), CameraGuess(), disconnected="largest")
     assert decision[:2] == ("focal_px", FOCAL_PX)
