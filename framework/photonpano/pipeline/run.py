@@ -11,6 +11,7 @@ from photonpano.contracts.protocols import light_of
 from photonpano.corrections.movers import decision_of
 from photonpano.errors import InputError
 from photonpano.execution.context import Progress, usual
+from photonpano.pipeline.alternatives import beside_alternatives
 from photonpano.pipeline.checkpoints.work_folder import Continuation
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
@@ -20,7 +21,6 @@ from photonpano.pipeline.obstacles import naming_obstacles
 from photonpano.pipeline.pose_run import find_poses
 from photonpano.pipeline.refiners import build_refiners, refine
 from photonpano.pipeline.rendering import render_into
-from photonpano.pipeline.rival import beside_rival
 from photonpano.pipeline.run_steps import BegunRun, begun_run
 from photonpano.pipeline.shots import run_others
 from photonpano.record.run_json import record_of
@@ -123,8 +123,8 @@ def make_panorama(run: BegunRun) -> None:
         with naming_obstacles(run.source, journal):
             state = estimate(plan, run.source, journal, context)
         state, explained = refine(state, build_refiners(plan, state.view.source, journal))
-        explained, rivals = beside_rival(state, explained)
-        journal += rivals
+        explained, others = beside_alternatives(state, explained)
+        journal += others
         if (background := capture_of(state.source).background) is not None:
             journal.append(decision_of(background))
         source, context = state.view

@@ -53,7 +53,8 @@ def _uncertain(run: TestedRun) -> Found | None:
     motion = run.explained.motion
     known = motion.std_px[motion.located]
     # Where two motions are possible, no light tells which.
-    if not len(known) or not np.isfinite(known).all() or run.decided(RIVAL, ""):
+    alternatives = {RIVAL, UNCUT_JUMP} & {each.what for each in run.decisions}
+    if not len(known) or not np.isfinite(known).all() or alternatives:
         return None
     worst = int(np.argmax(np.where(motion.located, motion.std_px, 0)))
     return Found(float(known.mean()), f"px on average, most at frame {worst}")

@@ -1,4 +1,4 @@
-"""A rival of the motion that was found: that of parts of the frame which it does not explain."""
+"""Other motions that are as possible as the one that was found, by which the expected error grows."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from photonpano.capture import before
 from photonpano.contracts.protocols import Trajectory
 from photonpano.geometry import corners, inverse, transform_points
+from photonpano.motion.timeline import UNCUT_JUMP
 from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
 from photonpano.residuals.reasons import RIVAL
@@ -20,11 +21,24 @@ _LEAST = 0.2  # least share of the frame that is not explained
 _KNOWN = 0.5  # least share of the windows of a capture in which the rival must show
 
 
-def beside_rival(state: State, explained: Explained) -> tuple[Explained, list[Decision]]:
+def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, list[Decision]]:
+    """Let the expected error of a motion contain the distance to others, where the frames do not tell which one is right.
+
+    These are a motion that jumps where the image seems to, and that of parts of the frame which the motion does not explain.
+    """
+    jump_px = sum(float(each.value) for each in state.decisions if each.what == UNCUT_JUMP)
+    return _beside_rival(state, _apart(explained, np.full(len(explained.motion.std_px), jump_px)))
+
+
+def _apart(explained: Explained, distances_px: FloatArray) -> Explained:
+    std_px = np.hypot(explained.motion.std_px, distances_px)
+    return replace(explained, motion=replace(explained.motion, std_px=std_px))
+
+
+def _beside_rival(state: State, explained: Explained) -> tuple[Explained, list[Decision]]:
     """Look for a second motion in short spans of frames, where the motion does not explain parts of the frame.
 
-    Nobody can know from the frames which motion is that of the scene: the expected error then contains the distance between
-    the two.
+    Nobody can know from the frames which motion is that of the scene.
     """
     share = float((np.nan_to_num(explained.residuals.block_chi2) > _MISFIT).mean())
     start = starting_motion(before(state.source, None), state.results[0].groups, state.context) if share > _LEAST else None
@@ -42,8 +56,7 @@ def beside_rival(state: State, explained: Explained) -> tuple[Explained, list[De
     distances_px = np.linalg.norm(away, axis=1)
     mean_px = float(distances_px[motion.located].mean())
     reason = f"px on average between both; {share:.0%} of the frame is not explained by the motion that was found"
-    either = replace(motion, std_px=np.hypot(motion.std_px, distances_px))
-    return replace(explained, motion=either), [Decision(RIVAL, mean_px, reason)]
+    return _apart(explained, distances_px), [Decision(RIVAL, mean_px, reason)]
 
 
 def _velocities(trajectory: Trajectory, instants: FloatArray, frames: float, frame_shape: tuple[int, int]) -> FloatArray:
