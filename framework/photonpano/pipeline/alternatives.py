@@ -14,6 +14,7 @@ from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
 from photonpano.residuals.reasons import RIVAL
 from photonpano.residuals.refinement import Explained
+from photonpano.residuals.residual_tests import LEAST_K1, distorting_lens
 from photonpano.values import Decision, FloatArray
 
 _MISFIT = 1.5  # reduced chi-square from which the motion does not explain a block of the sensor
@@ -24,8 +25,14 @@ _KNOWN = 0.5  # least share of the windows of a capture in which the rival must 
 def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, list[Decision]]:
     """Let the expected error of a motion contain the distance to others, where the frames do not tell which one is right.
 
-    These are a motion that jumps where the image seems to, and that of parts of the frame which the motion does not explain.
+    These are a motion that jumps where the image seems to, one that a lens does not bend, and that of parts of the frame which
+    the motion does not explain.
     """
+    located = np.flatnonzero(explained.motion.located)
+    if (lens := distorting_lens(explained)) is not None and abs(lens.k1) > LEAST_K1:
+        frames = np.linspace(located[0], located[-1], len(lens.bend_px))
+        bend_px = np.interp(np.arange(len(explained.motion.std_px)), frames, abs(lens.k1) * lens.bend_px)
+        explained = _apart(explained, bend_px)
     jump_px = sum(float(each.value) for each in state.decisions if each.what == UNCUT_JUMP)
     return _beside_rival(state, _apart(explained, np.full(len(explained.motion.std_px), jump_px)))
 

@@ -23,6 +23,8 @@ class LensDistortion:
     # distortion is found too small.
     k1: float
     std: float  # its standard deviation
+    # (N,) shifts in px by which frames, spread evenly over those located, follow a distortion of 1, and err
+    bend_px: FloatArray
 
     @property
     def sigmas(self) -> float:
@@ -42,18 +44,18 @@ def lens_distortion(
     known = information[..., 0, 0] > 0
     if known.sum() < _INSTANTS // 4 or len(homographies) < 2:
         return None
-    pattern = _pattern(known, homographies, frame_shape)
+    pattern, bend_px = _pattern(known, homographies, frame_shape)
     covariance = np.linalg.inv(information[known]) + SYSTEMATIC_PX**2 * np.eye(2)
     weighted = np.linalg.solve(covariance, pattern[..., None])[..., 0]
     energy = float((pattern * weighted).sum())
     if energy < 1:
         return None
     # Shifts point from what the motion predicts to what the photons show.
-    return LensDistortion(-float((weighted * shifts[known]).sum()) / energy, energy**-0.5)
+    return LensDistortion(-float((weighted * shifts[known]).sum()) / energy, energy**-0.5, bend_px)
 
 
-def _pattern(known: np.ndarray, homographies: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
-    """Return the mean shifts of blocks, in px, that a distortion of 1 would leave: (N, 2)."""
+def _pattern(known: np.ndarray, homographies: FloatArray, frame_shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Return the mean shifts of blocks, in px, that a distortion of 1 would leave, (N, 2), and `bend_px`."""
     rows, columns = np.nonzero(known)
     height, width = frame_shape
     x = (columns * BLOCK_PX + np.minimum((columns + 1) * BLOCK_PX, width) - 1) / 2
@@ -84,7 +86,8 @@ def _pattern(known: np.ndarray, homographies: FloatArray, frame_shape: tuple[int
     absorbed = motions @ np.linalg.lstsq(normal, right, rcond=1e-7)[0]
     left = observed - absorbed
     left -= averages @ (averages.T @ left)
-    return np.asarray(left.reshape(len(instants), 2, -1).mean(axis=0).T)
+    bend_px = np.linalg.norm(absorbed.reshape(len(instants), 2, -1).mean(axis=2), axis=1)
+    return left.reshape(len(instants), 2, -1).mean(axis=0).T, bend_px
 
 
 def deformation_px(shifts: FloatArray, information: FloatArray) -> float | None:

@@ -7,15 +7,16 @@ from scipy import ndimage
 
 from photonpano.geometry import corners, transform_points
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
-from photonpano.residuals.lens import deformation_px, lens_distortion
+from photonpano.residuals.lens import LensDistortion, deformation_px, lens_distortion
 from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
 from photonpano.residuals.reasons import TestedRun, Tests
-from photonpano.residuals.refinement import FEWEST_SPANS
+from photonpano.residuals.refinement import FEWEST_SPANS, Explained
 from photonpano.values import BoolArray
 from photonpano.values.verdict import Found
 
 # Contrast of the residuals, as a share of the light, beyond which a large reduced chi-square counts.
 MAX_CONTRAST = 0.02
+LEAST_K1 = 0.002  # radial distortion from which a run is doubtful
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 _STILL_PX = 1.0  # an image that moves by less over the capture stands still
@@ -160,21 +161,25 @@ def _grain(run: TestedRun) -> Found | None:
     return Found(max(fine, 0.0) / max(coarse, 1e-9), "power of waves of 2 to 3 px, relative to those of 6 to 10 px")
 
 
+def distorting_lens(explained: Explained) -> LensDistortion | None:
+    """Return the distortion that the residuals of a run show; None if it is not significant."""
+    residuals, motion = explained.residuals, explained.motion
+    found = lens_distortion(*residuals.block_shifts(), motion.homographies[motion.located], residuals.frame_shape)
+    # What else is not explained, such as a tremor, moves blocks by more than photon noise.
+    misfit = max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
+    return None if found is None or found.sigmas <= 5 * misfit else found
+
+
 @RESIDUAL_TESTS.doubtful_above(
-    0.002,
+    # Half of this is seen without a lens; even a small distortion bends a long path.
+    LEAST_K1,
     "the lens distorts the frames, which bends the motion",
     "write motion: {model: rotation} and camera: {distortion: {k1: find}} for a camera that only turns; or undistort the "
     "frames before, or use their middle only (corrections: crop)",
 )
 def _lens(run: TestedRun) -> Found | None:
-    residuals, motion = run.explained.residuals, run.explained.motion
-    # Half of the threshold is seen without a lens; even a small distortion bends a long path.
-    found = lens_distortion(*residuals.block_shifts(), motion.homographies[motion.located], residuals.frame_shape)
-    # What else is not explained, such as a tremor, moves blocks by more than photon noise.
-    misfit = max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
-    if found is None or found.sigmas <= 5 * misfit:
-        return None
-    return Found(abs(found.k1), f"about {found.k1:.1%} at the corners")
+    found = distorting_lens(run.explained)
+    return None if found is None else Found(abs(found.k1), f"about {found.k1:.1%} at the corners")
 
 
 @RESIDUAL_TESTS.doubtful_above(

@@ -245,6 +245,9 @@ def test_lens_distortion_is_found_with_its_sign(k1: float) -> None:
     assert distortion.sigmas > 5
     # The motion is the true one, which has not followed the distortion as an estimated one does.
     assert 0.7 < distortion.k1 / k1 < 2.2
+    # A distortion bends the ends of a path most.
+    start, *_, end = distortion.bend_px
+    assert min(start, end) > 2 * distortion.bend_px.min()
 
 
 def test_lens_distortion_is_not_significant_without_a_lens() -> None:
