@@ -18,6 +18,7 @@ _SURE = 4.0  # standard deviations by which an image resembles itself
 _LONGEST_WAVE = 1 / 4  # of the frame: longer waves are alike in many scenes
 _TOLERANCE_PX = 1.5  # by which three shifts between three frames agree, in binned px
 _FEWEST = 0.1  # share of the shifts that agree; those of noise do so once in 1,000
+_FEWEST_PHOTONS = 200.0  # of a frame: between two single photons, any shift fits
 _FAR = 0.05  # of the width of a frame: a jump from one frame to the next
 _BACK = -0.2  # mean cosine between two jumps: 1 if the motion goes on, -0.5 where the order is random
 
@@ -49,6 +50,8 @@ def shuffled(source: Source) -> list[Decision]:
     steps = []
     for span in _spans(source, _FRAMES // 2):
         images = _frames(source, span)
+        if images.mean() * source.info.height * source.info.width < _FEWEST_PHOTONS:
+            continue
         spectra, shape = spectra_of(images), images.shape[1:]
         single, double = shifts_between(spectra, spectra[1:], shape), shifts_between(spectra, spectra[2:], shape)
         steps += [each for each in zip(single, single[1:], double, strict=False) if not any(shift is None for shift in each)]
