@@ -12,9 +12,9 @@ from photonpano.geometry import corners, inverse, transform_points
 from photonpano.motion.timeline import UNCUT_JUMP
 from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
-from photonpano.residuals.reasons import RIVAL
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.residual_tests import LEAST_K1, distorting_lens
+from photonpano.residuals.tested_run import RIVAL
 from photonpano.values import Decision, FloatArray
 
 _MISFIT = 1.5  # reduced chi-square from which the motion does not explain a block of the sensor

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from photonpano.motion.timeline import INTERLACED, SHOTS, SHUFFLED
-from photonpano.residuals.reasons import RIVAL, TestedRun, Tests
+from photonpano.residuals.tested_run import RIVAL, TestedRun, Tests
 from photonpano.values.verdict import Found
 
 CAPTURE_TESTS = Tests()
@@ -57,5 +57,4 @@ def _given_camera(run: TestedRun) -> Found | None:
     "mask what does not belong to the scene (corrections: mask); the motion may be that of either part",
 )
 def _two_motions(run: TestedRun) -> Found | None:
-    found = next((each for each in run.decisions if each.what == RIVAL), None)
-    return Found(float(found.value), found.reason) if found else None
+    return run.decided(RIVAL)

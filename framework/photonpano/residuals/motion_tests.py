@@ -8,7 +8,7 @@ import numpy as np
 
 from photonpano.geometry import corners, jacobian
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
-from photonpano.residuals.reasons import RIVAL, TestedRun, Tests
+from photonpano.residuals.tested_run import RIVAL, TestedRun, Tests
 from photonpano.values import Located, Reason
 from photonpano.values.verdict import Found
 
@@ -154,5 +154,4 @@ def _jump_in_the_dark(run: TestedRun) -> Found:
     "look at the path in the report around this frame; use a slower motion, or smaller groups",
 )
 def _uncut_jump(run: TestedRun) -> Found | None:
-    found = next((each for each in run.decisions if each.what == UNCUT_JUMP), None)
-    return Found(float(found.value), found.reason) if found else None
+    return run.decided(UNCUT_JUMP)

@@ -9,8 +9,8 @@ from photonpano.geometry import corners, transform_points
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import LensDistortion, deformation_px, lens_distortion
 from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
-from photonpano.residuals.reasons import TestedRun, Tests
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
+from photonpano.residuals.tested_run import TestedRun, Tests
 from photonpano.values import BoolArray
 from photonpano.values.verdict import Found
 

@@ -12,9 +12,9 @@ import numpy as np
 from photonpano.motion.loop import LevelResult
 from photonpano.residuals.capture_tests import CAPTURE_TESTS
 from photonpano.residuals.motion_tests import MOTION_TESTS, NO_TURN, REPEATS, contradictions
-from photonpano.residuals.reasons import TestedRun
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.residual_tests import MAX_CONTRAST, RESIDUAL_TESTS, changing_places
+from photonpano.residuals.tested_run import TestedRun
 from photonpano.values import Decision, Verdict
 from photonpano.values.verdict import Test, judged
 

@@ -9,7 +9,7 @@ import pytest
 from photonpano import parse_spec, run, simulate
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import corner_errors, load_truth
-from photonpano.residuals.reasons import RIVAL
+from photonpano.residuals.tested_run import RIVAL
 
 SHAPE, N_FRAMES = (128, 192), 1000
 MOVES_PX = (0.02, 0.006)

@@ -18,9 +18,9 @@ from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED, UNCUT_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.measure import Residuals
-from photonpano.residuals.reasons import RIVAL
 from photonpano.residuals.refinement import Explained, residual_ratio
 from photonpano.residuals.shaking import Shaking
+from photonpano.residuals.tested_run import RIVAL
 from photonpano.residuals.verdict import NO_TURN, TESTS, contradictions, judge
 from photonpano.values import Ambiguity, Decision, Edge, Located, Reason
 

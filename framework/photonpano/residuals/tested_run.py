@@ -1,4 +1,4 @@
-"""Tables of tests of a run."""
+"""What tests of a run look at, and the tables that they are listed in."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class TestedRun:
         located = self.levels[-1].located
         return len(located.solution.outliers), len(located.edges)
 
-    def decided(self, what: str, meaning: str) -> Found | None:
-        """Return the figure of the last decision of a name; None if there is none."""
-        figures = [float(each.value) for each in self.decisions if each.what == what]
-        return Found(figures[-1], meaning) if figures else None
+    def decided(self, what: str, meaning: str = "") -> Found | None:
+        """Return the figure of the last decision of a name, with its reason if no meaning is given; None if there is none."""
+        found = [each for each in self.decisions if each.what == what]
+        return Found(float(found[-1].value), meaning or found[-1].reason) if found else None
 
 
 _Finder: TypeAlias = Callable[[TestedRun], Found | None]
