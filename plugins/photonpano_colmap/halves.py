@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from photonpano_colmap.posing.path import positions_of
 from photonpano_colmap.reversal import adjust_model
 
+_FEWEST = 3  # positions that determine a similarity
+
 
 @dataclass(frozen=True, slots=True)
 class Halves:
@@ -25,7 +27,6 @@ class Halves:
     std_rotation: float  # in radians, after the best common rotation
 
 
-_FEWEST = 3  # positions that determine a similarity
 _UNKNOWN = Halves(np.inf, np.inf)
 
 

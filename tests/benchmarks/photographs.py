@@ -30,7 +30,8 @@ import numpy as np
 from harness import Study, chosen, command, simulator
 from harness import table as table_of
 from joint_bound import Model, joint_bound
-from trust import reasons, scored, status
+from trust import scored
+from trust_scores import reasons, status
 
 from photonpano import InputError, open_source, parse_spec
 from photonpano.capture.writing import truth_path

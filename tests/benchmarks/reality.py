@@ -27,7 +27,8 @@ import cv2
 import numpy as np
 from harness import Study, chosen, command, packed, rendered, simulator
 from harness import table as table_of
-from trust import is_honest, reasons, scored, status
+from trust import scored
+from trust_scores import is_honest, reasons, status
 
 from photonpano import evaluate, load_panorama, open_source, parse_spec
 from photonpano.api.opened_run import opened_run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,6 +29,12 @@ def trust() -> ModuleType:
         patch.syspath_prepend(str(SCRIPT.parent))  # as Python does for a script
         spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def scores(trust: ModuleType) -> ModuleType:
+    """What `trust.py` has imported: the scores of results."""
+    return sys.modules[trust.status.__module__]
 
 
 def result(**keys: Any) -> dict[str, Any]:
@@ -87,19 +94,19 @@ def test_trajectory_of_other_frames_has_no_figures(trust: ModuleType) -> None:
         ({"exit_code": None}, False),
     ],
 )
-def test_run_is_honest_if_its_claim_holds_or_is_doubted(trust: ModuleType, keys: dict[str, Any], honest: bool) -> None:
-    assert trust.is_honest(result(**keys)) is honest
+def test_run_is_honest_if_its_claim_holds_or_is_doubted(scores: ModuleType, keys: dict[str, Any], honest: bool) -> None:
+    assert scores.is_honest(result(**keys)) is honest
 
 
-def test_refused_run_is_honest_and_trusted_one_without_score_is_not(trust: ModuleType) -> None:
+def test_refused_run_is_honest_and_trusted_one_without_score_is_not(scores: ModuleType) -> None:
     refused = {key: value for key, value in result(exit_code=1).items() if not key.endswith(("_px", "_2", "_3"))}
-    assert trust.is_honest(refused)
-    assert not trust.is_honest(refused | {"exit_code": 0})
+    assert scores.is_honest(refused)
+    assert not scores.is_honest(refused | {"exit_code": 0})
 
 
-def test_table_has_a_row_for_each_kind_of_capture(trust: ModuleType) -> None:
+def test_table_has_a_row_for_each_kind_of_capture(scores: ModuleType) -> None:
     doubted = {"status": "doubtful", "reasons": [{"what": "parts of the sensor are dark"}]}
-    lines = trust.table(
+    lines = scores.table(
         [
             result(),
             result(row="vignette 80%", mean_px=0.4, max_px=0.9, std_px=0.2, rms_px=0.4, verdict=doubted),
@@ -127,14 +134,14 @@ def test_table_has_a_row_for_each_kind_of_capture(trust: ModuleType) -> None:
         ("clean pan", "the light changes", False),
     ],
 )
-def test_right_reason_has_a_word_of_the_cause(trust: ModuleType, row: str, reason: str, right: bool) -> None:
+def test_right_reason_has_a_word_of_the_cause(scores: ModuleType, row: str, reason: str, right: bool) -> None:
     doubt = result(row=row, verdict={"status": "doubtful", "reasons": [{"what": "something else"}, {"what": reason}]})
-    assert trust.names_its_cause(doubt) is right
-    assert trust.names_its_cause(result(row=row, exit_code=1, message=reason)) is right
+    assert scores.names_its_cause(doubt) is right
+    assert scores.names_its_cause(result(row=row, exit_code=1, message=reason)) is right
 
 
-def test_rows_that_are_disturbed_have_a_cause(trust: ModuleType) -> None:
-    without = [name for name in trust.ROWS if not any(part in name for part in trust.CAUSES)]
+def test_rows_that_are_disturbed_have_a_cause(scores: ModuleType) -> None:
+    without = [name for name in scores.ROWS if not any(part in name for part in scores.CAUSES)]
     assert [name for name in without if not name.startswith("clean")] == []
 
 
@@ -149,7 +156,7 @@ def test_results_are_kept_for_captures_of_one_size(trust: ModuleType, tmp_path: 
         trust.remembered(file, trust.FULL)
 
 
-def test_rows_are_captures_that_the_simulator_makes(trust: ModuleType) -> None:
+def test_rows_are_captures_that_the_simulator_makes(trust: ModuleType, scores: ModuleType) -> None:
     for size in (trust.FULL, trust.SMALL):
-        for row in trust.ROWS.values():
+        for row in scores.ROWS.values():
             SimulatorConfig.model_validate(trust.bases(size)[row.base] | row.changes(size))

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
-from photonpano.geometry import corners, transform_points
-from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.frame_motion import FrameMotion, frames_displaced
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import Timeline
 from photonpano.residuals.refinement import Refinement
@@ -22,8 +20,6 @@ SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst fir
 
 DOUBTFUL = "doubtful: "  # begins the warnings that are doubts
 _MANY_COPIES = 0.25  # share of the frames from which a warning names them
-_SMOOTH_FRAMES = 65  # over which the motion is averaged, to see frames jump back and forth beside it
-_BACK, _ALONG = 0.25, 4.0  # share of the frames that go backwards, and ratio of what they move along and across the motion
 _SHOWN_LOST = 3  # spans of lost frames that a warning names
 
 
@@ -100,25 +96,13 @@ def motion_warnings(motion: FrameMotion, timeline: Timeline | None = None) -> li
 
 
 def _out_of_order(motion: FrameMotion) -> list[str]:
-    """Warn of frames that jump back and forth along the motion only, as shuffled ones do: tremor has other directions, too."""
-    if len(motion.span) < 2 * _SMOOTH_FRAMES:
-        return []
-    middle = corners(motion.frame_shape).mean(axis=0)[None]
-    path = transform_points(motion.homographies[motion.span.start : motion.span.stop], middle)[:, 0]
-    smooth = uniform_filter1d(path, _SMOOTH_FRAMES, axis=0, mode="nearest")
-    inner = slice(_SMOOTH_FRAMES // 2, -_SMOOTH_FRAMES // 2)
-    velocity, beside = np.gradient(smooth, axis=0)[inner], (path - smooth)[inner]
-    speed = np.linalg.norm(velocity, axis=1)
-    x, y = (velocity / np.maximum(speed, 1e-9)[:, None]).T
-    turned = beside[:, 0] * x + beside[:, 1] * y, beside[:, 0] * y - beside[:, 1] * x
-    along, across = (float(np.sqrt(np.mean(each**2))) for each in turned)
-    back = float(np.mean((np.diff(path, axis=0, prepend=path[:1])[inner] * velocity).sum(axis=1) < 0))
-    by = along / max(float(np.median(speed)), 1e-9)
-    if back < _BACK or by < 1 or along < _ALONG * across or along < 2 * float(np.median(motion.std_px[motion.located])):
+    displaced = frames_displaced(motion)
+    if not displaced:
         return []
     return [
-        f"the image jumps back and forth along its motion, and hardly across it: frames seem to be out of order, by {by:.2g} "
-        "frames on average, unless the camera vibrates along its motion. Sort them by the time at which they were taken"
+        f"the image jumps back and forth along its motion, and hardly across it: frames seem to be out of order, by "
+        f"{displaced:.2g} frames on average, unless the camera vibrates along its motion. Sort them by the time at which they "
+        "were taken"
     ]
 
 

@@ -259,6 +259,8 @@ def test_page_says_verdict_in_words(record, text):
     assert "photonpano 0.1.0 done trusted corridor-pan" in unknown
     assert "Do not rely" not in unknown
     assert "scatter of short spans" not in unknown
+    assert "Not tested" not in unknown
+    assert "Not tested: whether it moves (20 spans)" in text(verdict=trusted | {"untested": ["whether it moves (20 spans)"]})
 
 
 def test_page_lists_a_folder_once(page):
