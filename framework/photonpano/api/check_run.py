@@ -79,5 +79,5 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
             reasons.append(reason)
     recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
     reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NO_TURN)]
-    judged = Verdict.of(reasons, verdict.residual_ratio, verdict.untested)
+    judged = Verdict.of(reasons, verdict.residual_ratio, verdict.untested, verdict.notes)
     return RunCheck(judged, tuple(unknown))

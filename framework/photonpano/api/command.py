@@ -97,10 +97,12 @@ def json_lines(data: Any) -> list[str]:
 
 
 def verdict_lines(verdict: Verdict) -> list[str]:
-    """Return the status, and what was not tested; each reason of a doubtful one is a sentence on standard error."""
+    """Return the status, notes, and what was not tested; each reason of a doubtful one is a sentence on standard error."""
     for reason in verdict.reasons:
         typer.echo(f"doubtful: {reason}", err=True)
-    return [f"verdict   {verdict.status}", *([f"untested  {'; '.join(verdict.untested)}"] if verdict.untested else [])]
+    notes = [f"note      {each.finding}" for each in verdict.notes]
+    untested = [f"untested  {'; '.join(verdict.untested)}"] if verdict.untested else []
+    return [f"verdict   {verdict.status}", *notes, *untested]
 
 
 def require_trust(verdict: Verdict, files: str) -> None:

@@ -78,18 +78,21 @@ def require_tied(
     contrasts: Mapping[int, Contrast],
     disconnected: Literal["error", "largest"],
     merged: Callable[[int], VirtualExposure] | None = None,
+    foreseen: BoolArray | None = None,
 ) -> None:
     """Raise an `UntiedError` for a level where too many exposures are not tied to the others.
 
     Up to two exposures in a row may be lost, since the motion is interpolated across them. A longer run is an error, unless
-    `disconnected` is "largest". Fewer than two located exposures are always an error. `parts` (N,) numbers the connected
-    component of each exposure, 0 for the largest; `merged` returns an exposure to whoever looks at those that are lost.
+    `disconnected` is "largest", or the level before has lost these frames, too: their exposures are not `foreseen` (N,). Fewer
+    than two located exposures are always an error. `parts` (N,) numbers the connected component of each exposure, 0 for the
+    largest; `merged` returns an exposure to whoever looks at those that are lost.
     """
     tied = parts == 0
     if len(groups) == 1:
         return
     runs = _runs(groups, ~tied)
-    longest = max(map(len, runs), default=0)
+    lost = [run for run in true_spans(~tied) if foreseen is None or foreseen[run.start : run.stop].any()]
+    longest = max(map(len, lost), default=0)
     if tied.sum() >= 2 and (longest <= TOLERATED_RUN or disconnected == "largest"):
         return
     reasons = [
@@ -102,10 +105,10 @@ def require_tied(
     if tied.sum() < 2:
         lines = [f"level {level}: none of the {len(edges)} pairs of exposures could be located", *lines]
     else:
-        lost = [_frames(run) for run in runs[:_SHOWN]] + ([f"{len(runs) - _SHOWN} more spans"] if len(runs) > _SHOWN else [])
+        spans = [_frames(run) for run in runs[:_SHOWN]] + ([f"{len(runs) - _SHOWN} more spans"] if len(runs) > _SHOWN else [])
         lines = [
             f"level {level}: {len(reasons)} of {len(edges)} pairs of exposures could not be located, "
-            f"so that {listed(lost)} cannot be tied to the rest",
+            f"so that {listed(spans)} cannot be tied to the rest",
             f"Parts that are tied together: {_tied_together(groups, parts)}.",
             *lines,
             "To go on with the largest part alone, set graph.disconnected to largest.",

@@ -177,6 +177,11 @@ class ExposureTasks:
         for index in (pair.moving, pair.fixed):
             if blank := known[index].contrast.blank:
                 return Edge(pair.moving, pair.fixed, NotLocated(f"{self.exposures.groups[index]}: {blank}"))
+        spans = self.exposures.groups[pair.moving].span, self.exposures.groups[pair.fixed].span
+        # The noise of shared frames alone confirms any motion that both exposures were merged along.
+        if shared_share(*spans) and not all(map(self.exposures.is_foreseen, (pair.moving, pair.fixed))):
+            shares = NotLocated("the exposures share frames, and were merged along a motion that is not known there")
+            return Edge(pair.moving, pair.fixed, shares)
         if pair.expected is not None and (reason := why_implausible(pair.expected, self.exposures.frame_shape)):
             return Edge(pair.moving, pair.fixed, NotLocated(f"by the motion known so far, {reason}"))
         return None

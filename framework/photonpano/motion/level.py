@@ -16,7 +16,7 @@ from photonpano.contracts.rules import attributing
 from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import Camera, rescaled
 from photonpano.motion.timeline import Timeline
-from photonpano.values import Decision, DecisionValue, FloatArray, Group, Located, VirtualExposure
+from photonpano.values import Decision, DecisionValue, FloatArray, FrameSpan, Group, Located, VirtualExposure
 
 # In pixels of frames, as in the motion graph and in trajectories.
 FrameHomography = NewType("FrameHomography", FloatArray)
@@ -127,11 +127,16 @@ class VirtualExposures:
     clock: Stopwatch  # adds up the time that merging takes
     timeline: Timeline | None = None  # where the image jumps; None if it is not known to
     start: Trajectory | None = None  # along which exposures are merged while no motion is known; None if nothing shows it
+    known: FrameSpan | None = None  # frames in which the motion known so far was located; None if it is nowhere extrapolated
 
     @property
     def frame_shape(self) -> tuple[int, int]:
         """Height and width of a frame."""
         return self.source.info.frame_shape
+
+    def is_foreseen(self, index: int) -> bool:
+        """Return whether the motion of an exposure, given by its index, is known so far and not extrapolated."""
+        return self.known is None or self.known.start <= self.groups[index].reference < self.known.stop
 
     def merged(self, index: int, clock: Stopwatch | None = None) -> VirtualExposure:
         """Merge a group, given by its index, along the motion known so far; a second call merges it again.

@@ -118,7 +118,9 @@ def locate(
         with exposures.clock("locate"), solving(level.number):
             edges = _checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
             labels = components(len(groups), edges)
-            require_tied(level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged)
+            foreseen = np.array([exposures.is_foreseen(index) for index in range(len(groups))])
+            tied = level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged, foreseen
+            require_tied(*tied)
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
             to_plane = registrar.to_plane

@@ -21,7 +21,7 @@ from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory
 from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking import starting_motion
 from photonpano.motion.uncertainty import Uncertainty
-from photonpano.values import FloatArray, Group
+from photonpano.values import FloatArray, FrameSpan, Group
 
 _SHRINKS = 0.75  # change of the motion by a level, over that by the level before, from which on it no longer converges
 
@@ -69,6 +69,7 @@ def estimate_motion(
     timeline: Timeline | None = None,
     model: MotionModel = HOMOGRAPHIES,
     corrects: bool = False,
+    known: FrameSpan | None = None,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level (paper, section 4).
 
@@ -78,7 +79,8 @@ def estimate_motion(
 
     The homography of the frame `reference` is the identity. With `until_converged`, the loop ends as soon as another level
     would gain nothing: see `converges`. `previous` is the motion known so far, which each level replaces; one that
-    `corrects` keeps its tremor. Without a timeline, no frame is missing or repeated.
+    `corrects` keeps its tremor, and one that is `known` in some frames alone was extrapolated to the others. Without a
+    timeline, no frame is missing or repeated.
 
     Raises:
         LocationError: too few exposures could be located.
@@ -97,14 +99,14 @@ def estimate_motion(
             with clock("locate"):
                 start = context.checkpoints.once("level-1-start", partial(starting_motion, seen, groups, context), groups)
             start = start and replace(start, timeline=timeline)
-        exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start)
+        exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start, known)
         located = locate(exposures, graph, context, model, start)
         trajectory = interpolate(level, located, timeline, reference, clock, previous if corrects else None)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
         context.progress.note(_summary(results[-1]))
         context.on_level(results[-1])
-        previous = trajectory
+        previous, known = trajectory, located.covered
         # A level at half size only prepares for one at full size.
         if until_converged and level.scale == levels[-1].scale and not converges(results):
             break

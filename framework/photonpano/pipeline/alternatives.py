@@ -2,39 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from photonpano.capture import before
-from photonpano.contracts.protocols import Trajectory
 from photonpano.geometry import corners, inverse, transform_points
+from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import UNCUT_JUMP
 from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
+from photonpano.residuals.motion_tests import of_either_part, second_place_px
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.residual_tests import LEAST_K1, distorting_lens
-from photonpano.residuals.tested_run import RIVAL
+from photonpano.residuals.tested_run import RIVAL, TestedRun
 from photonpano.values import Decision, FloatArray
 
 _MISFIT = 1.5  # reduced chi-square from which the motion does not explain a block of the sensor
 _LEAST = 0.2  # least share of the frame that is not explained
+_DIFFERENT_PX = 3.0  # least distance over a window and a half between two motions that are not the same
 _KNOWN = 0.5  # least share of the windows of a capture in which the rival must show
 
 
-def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, list[Decision]]:
+def beside_alternatives(state: State, explained: Explained, decisions: Sequence[Decision]) -> tuple[Explained, list[Decision]]:
     """Let the expected error of a motion contain the distance to others, where the frames do not tell which one is right.
 
-    These are a motion that jumps where the image seems to, one that a lens does not bend, and that of parts of the frame which
-    the motion does not explain.
+    These are a motion that jumps where the image seems to, one that a lens does not bend, one along a second place of a scene
+    that repeats, and that of parts of the frame which the motion does not explain. Where such a part is large and its motion is
+    not found, the error is infinite: not known.
     """
-    located = np.flatnonzero(explained.motion.located)
-    if (lens := distorting_lens(explained)) is not None and abs(lens.k1) > LEAST_K1:
+    run = TestedRun(explained, state.results, decisions)
+    n_frames, located = len(explained.motion.std_px), np.flatnonzero(explained.motion.located)
+    jumps_px = sum(float(each.value) for each in decisions if each.what == UNCUT_JUMP)
+    explained = _apart(explained, np.full(n_frames, np.hypot(jumps_px, second_place_px(run))))
+    if (lens := distorting_lens(explained)) is not None:
         frames = np.linspace(located[0], located[-1], len(lens.bend_px))
-        bend_px = np.interp(np.arange(len(explained.motion.std_px)), frames, abs(lens.k1) * lens.bend_px)
-        explained = _apart(explained, bend_px)
-    jump_px = sum(float(each.value) for each in state.decisions if each.what == UNCUT_JUMP)
-    return _beside_rival(state, _apart(explained, np.full(len(explained.motion.std_px), jump_px)))
+        # Half of the least distortion is seen without a lens.
+        beyond = max(abs(lens.k1) - LEAST_K1 / 2, 0)
+        explained = _apart(explained, np.interp(np.arange(n_frames), frames, beyond * lens.bend_px))
+    beside, rival = _beside_rival(state, explained)
+    return (beside if rival or not of_either_part(run) else _apart(beside, np.full(n_frames, np.inf))), rival
 
 
 def _apart(explained: Explained, distances_px: FloatArray) -> Explained:
@@ -45,29 +53,31 @@ def _apart(explained: Explained, distances_px: FloatArray) -> Explained:
 def _beside_rival(state: State, explained: Explained) -> tuple[Explained, list[Decision]]:
     """Look for a second motion in short spans of frames, where the motion does not explain parts of the frame.
 
-    Nobody can know from the frames which motion is that of the scene.
+    Nobody can know from the frames which motion is that of the scene. Where a span shows a single motion, that counts.
     """
     share = float((np.nan_to_num(explained.residuals.block_chi2) > _MISFIT).mean())
     start = starting_motion(before(state.source, None), state.results[0].groups, state.context) if share > _LEAST else None
     if start is None:
         return explained, []
-    motion, shape = explained.motion, explained.motion.frame_shape
-    ours = _velocities(motion.trajectory, start.instants, start.reach, shape)
-    apart = np.stack([start.velocities, start.rivals]) - ours
-    other = np.take_along_axis(apart, np.nanargmax(np.linalg.norm(apart, axis=-1), axis=0)[None, :, None], axis=0)[0]
-    known = np.isfinite(start.rivals).all(axis=1)
-    if known.mean() < _KNOWN:
-        return explained, []
-    travelled = replace(start, instants=start.instants[known], velocities=other[known]).at(np.arange(len(motion.std_px)))
+    motion = explained.motion
+    apart = np.stack([start.velocities, start.rivals]) - _velocities(motion, start.instants, start.reach)
+    speeds = np.nan_to_num(np.linalg.norm(apart, axis=-1))
+    farther = np.take_along_axis(apart, speeds.argmax(axis=0)[None, :, None], axis=0)[0]
+    differs = speeds.max(axis=0) * start.reach > _DIFFERENT_PX
+    travelled = replace(start, velocities=np.where(differs[:, None], farther, 0.0)).at(np.arange(len(motion.std_px)))
     away = travelled[:, :2, 2] - travelled[motion.located][:, :2, 2].mean(axis=0)
     distances_px = np.linalg.norm(away, axis=1)
+    explained = _apart(explained, distances_px)
+    if np.isfinite(start.rivals).all(axis=1).mean() < _KNOWN:
+        return explained, []
     mean_px = float(distances_px[motion.located].mean())
     reason = f"px on average between both; {share:.0%} of the frame is not explained by the motion that was found"
-    return _apart(explained, distances_px), [Decision(RIVAL, mean_px, reason)]
+    return explained, [Decision(RIVAL, mean_px, reason)]
 
 
-def _velocities(trajectory: Trajectory, instants: FloatArray, frames: float, frame_shape: tuple[int, int]) -> FloatArray:
+def _velocities(motion: FrameMotion, instants: FloatArray, frames: float) -> FloatArray:
     """Return the velocities of the image at N instants, over some frames: (N, 2) in px per frame."""
-    first, last = (trajectory.at(instants + sign * frames / 2) for sign in (-1, 1))
-    middle = corners(frame_shape).mean(axis=0)
-    return np.asarray((transform_points(inverse(last) @ first, middle[None])[:, 0] - middle) / frames)
+    first, last = (np.clip(instants + sign * frames / 2, 0, len(motion.std_px) - 1) for sign in (-1, 1))
+    middle = corners(motion.frame_shape).mean(axis=0)
+    moved = transform_points(inverse(motion.trajectory.at(last)) @ motion.trajectory.at(first), middle[None])[:, 0] - middle
+    return np.asarray(moved / np.maximum(last - first, 1)[:, None])

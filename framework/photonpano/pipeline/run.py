@@ -123,10 +123,10 @@ def make_panorama(run: BegunRun) -> None:
         with naming_obstacles(run.source, journal):
             state = estimate(plan, run.source, journal, context)
         state, explained = refine(state, build_refiners(plan, state.view.source, journal))
-        explained, others = beside_alternatives(state, explained)
-        journal += others
         if (background := capture_of(state.source).background) is not None:
             journal.append(decision_of(background))
+        explained, others = beside_alternatives(state, explained, journal)
+        journal += others
         source, context = state.view
         panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context)
         verdict = judge(explained, state.results, [*journal, *chosen])

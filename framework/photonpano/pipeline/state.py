@@ -70,7 +70,8 @@ class State:
             return self
         before = [each for each in self.results if each.level.number < levels[0].number]
         given = self.plan.graph, self.reference, self.context, self.plan.until_converged, previous, self.timeline, self.model
-        return replace(self, results=(*before, *estimate_motion(self.source, levels, *given, corrects)), outdated=False)
+        known = self.results[-1].located.covered if self.results else None
+        return replace(self, results=(*before, *estimate_motion(self.source, levels, *given, corrects, known)), outdated=False)
 
     def relocated(self) -> State:
         """Run the last level again along the refined motion, which it corrects: its exposures are then sharper.

@@ -222,16 +222,16 @@ def motion_record(std_px: FloatArray) -> MotionRecord | None:
 
 def verdict_record(verdict: Verdict) -> VerdictRecord:
     """Describe a verdict."""
-    reasons = [_fields(reason) for reason in verdict.reasons]
-    judged: VerdictRecord = _fields(verdict) | {"reasons": reasons, "untested": list(verdict.untested)}
+    reasons, notes = ([_fields(each) for each in listed] for listed in (verdict.reasons, verdict.notes))
+    judged: VerdictRecord = _fields(verdict) | {"reasons": reasons, "untested": list(verdict.untested), "notes": notes}
     return judged
 
 
 def verdict_of(found: VerdictRecord) -> Verdict:
     """Return the verdict that a record describes."""
     status: Literal["trusted", "doubtful"] = "trusted" if found["status"] == "trusted" else "doubtful"
-    reasons, untested = tuple(Reason(**reason) for reason in found["reasons"]), tuple(found.get("untested", ()))
-    return Verdict(status, reasons, found["residual_ratio"], untested)
+    reasons, notes = (tuple(Reason(**each) for each in listed) for listed in (found["reasons"], found.get("notes", ())))
+    return Verdict(status, reasons, found["residual_ratio"], tuple(found.get("untested", ())), notes)
 
 
 def refinement_record(refinement: Refinement) -> RefinementRecord:

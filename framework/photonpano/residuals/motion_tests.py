@@ -8,6 +8,7 @@ import numpy as np
 
 from photonpano.geometry import corners, jacobian
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
+from photonpano.residuals.residual_tests import changing_places, grain
 from photonpano.residuals.tested_run import RIVAL, TestedRun, Tests
 from photonpano.values import Located, Reason
 from photonpano.values.verdict import Found
@@ -15,6 +16,7 @@ from photonpano.values.verdict import Found
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
 NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
 _ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
+_EITHER = 0.25  # share of the frames that is left out, and of the panorama that changes, of which either may be the scene
 
 MOTION_TESTS = Tests()
 
@@ -22,7 +24,9 @@ MOTION_TESTS = Tests()
 @MOTION_TESTS.doubtful_above(1.0, "no motion is known", "use smaller groups, or more light")
 def _unknown(run: TestedRun) -> Found | None:
     known = run.explained.motion.std_px[run.explained.motion.located]
-    return None if len(known) and np.isfinite(known).all() else Found(0.0, "a single exposure was located", doubtful=True)
+    if of_either_part(run) or (len(known) and np.isfinite(known).all()):
+        return None
+    return Found(0.0, "a single exposure was located", doubtful=True)
 
 
 @MOTION_TESTS.doubtful_above(
@@ -117,7 +121,7 @@ def _standing(run: TestedRun) -> Found | None:
 
 @MOTION_TESTS.doubtful_above(
     0.5,
-    "more than half of what the frames show does not follow one turn of the camera, as where it travels past near things",
+    "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
     "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
 )
 def _layers(run: TestedRun) -> Found | None:
@@ -126,7 +130,11 @@ def _layers(run: TestedRun) -> Found | None:
     where = "share of the frames that is left out, on average"
     if parallax:
         where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
-    return run.decided("movers", where)
+    if (found := run.decided("movers", where)) is None:
+        return None
+    # Where little is left out, but much changes that is not, what is left out may be the scene.
+    changing_share, _ = changing_places(run.explained.residuals)
+    return found._replace(doubtful=min(found.figure, changing_share) > _EITHER)
 
 
 @MOTION_TESTS.doubtful_above(
@@ -155,3 +163,14 @@ def _jump_in_the_dark(run: TestedRun) -> Found:
 )
 def _uncut_jump(run: TestedRun) -> Found | None:
     return run.decided(UNCUT_JUMP)
+
+
+def of_either_part(run: TestedRun) -> bool:
+    """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
+    return any(test.judged(run) for test in (_standing, _layers, grain))
+
+
+def second_place_px(run: TestedRun) -> float:
+    """Return how far away the second place of a scene that repeats is, in px; 0 where pairs fit at one place."""
+    ambiguities = [each.located.ambiguity for each in run.levels]
+    return max(each.alternative_px for each in ambiguities if each) if _ambiguous.judged(run) else 0.0

@@ -16,6 +16,8 @@ from photonpano.values.verdict import Found
 
 # Contrast of the residuals, as a share of the light, beyond which a large reduced chi-square counts.
 MAX_CONTRAST = 0.02
+# Up to these, what is found is a note: what a change of the light moves is less than photon noise does.
+_HARMLESS_CONTRAST, _HARMLESS_SHARE = 0.05, 0.1
 LEAST_K1 = 0.002  # radial distortion from which a run is doubtful
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
@@ -75,7 +77,8 @@ def _photons(run: TestedRun) -> Found | None:
     n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
     # The squared residual of a block beyond its variance, as a part of its photons.
     contrast = float(np.sqrt(max(reduced_chi2 - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
-    return Found(reduced_chi2, f"on average by {contrast:.0%} of the light") if contrast > MAX_CONTRAST else None
+    where, harmless = f"on average by {contrast:.0%} of the light", contrast <= _HARMLESS_CONTRAST
+    return Found(reduced_chi2, where, harmless=harmless) if contrast > MAX_CONTRAST else None
 
 
 def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
@@ -96,7 +99,7 @@ def _moving(run: TestedRun) -> Found | None:
     if run.explained.residuals.cell_count.max(initial=0) < _MIN_BLOCKS:
         return Found(np.nan, f"no place was seen {_MIN_BLOCKS} times")
     share, changing = changing_places(run.explained.residuals)
-    return Found(share, _box(changing, "px of the panorama")) if share else None
+    return Found(share, _box(changing, "px of the panorama"), harmless=share <= _HARMLESS_SHARE) if share else None
 
 
 @RESIDUAL_TESTS.doubtful_above(0.03, "the light changes over time", "keep the light steady, or shorten the capture")
@@ -143,7 +146,8 @@ def _hot_pixels(run: TestedRun) -> Found:
     "the image stands still, and has the fine grain of a sensor whose pixels differ",
     "divide by a flat field (corrections: flat-field); what was found to stand still may be the sensor, and not the scene",
 )
-def _grain(run: TestedRun) -> Found | None:
+def grain(run: TestedRun) -> Found | None:
+    """Look for the sensor in an image that stands still."""
     residuals, motion = run.explained.residuals, run.explained.motion
     middle = corners(residuals.frame_shape).mean(axis=0)
     places = transform_points(motion.homographies[motion.located], middle[None])[:, 0]

@@ -11,7 +11,7 @@ Facts = TypeVar("Facts")
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why a run is doubtful.
+    """Why a run is doubtful, or what is worth a note.
 
     Attributes:
         what: what was found, in a clause.
@@ -27,9 +27,14 @@ class Reason:
     where: str
     what_to_do: str
 
-    def __str__(self) -> str:
+    @property
+    def finding(self) -> str:
+        """What was found, and where."""
         where = f" ({self.where})" if self.where else ""
-        return f"{self.what}{where}: {self.figure:.3g}, trusted up to {self.threshold:g}; {self.what_to_do}"
+        return f"{self.what}{where}: {self.figure:.3g}"
+
+    def __str__(self) -> str:
+        return f"{self.finding}, trusted up to {self.threshold:g}; {self.what_to_do}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,22 +47,30 @@ class Verdict:
         residual_ratio: in units of what noise explains, for a panorama the scatter of the shifts of short spans, and for poses
             the residuals of points in exposures; None if it is unknown.
         untested: which tests could not be made, and why: clauses that begin with "whether".
+        notes: what else was found; it is too small to make the motion or the panorama wrong.
     """
 
     status: Literal["trusted", "doubtful"]
     reasons: tuple[Reason, ...]
     residual_ratio: float | None
     untested: tuple[str, ...] = ()
+    notes: tuple[Reason, ...] = ()
 
     @classmethod
-    def of(cls, reasons: Iterable[Reason], residual_ratio: float | None, untested: Iterable[str] = ()) -> Verdict:
+    def of(
+        cls,
+        reasons: Iterable[Reason],
+        residual_ratio: float | None,
+        untested: Iterable[str] = (),
+        notes: Iterable[Reason] = (),
+    ) -> Verdict:
         """Return the verdict that has these reasons: doubtful if there is one."""
         reasons = tuple(reasons)
-        return cls("doubtful" if reasons else "trusted", reasons, residual_ratio, tuple(untested))
+        return cls("doubtful" if reasons else "trusted", reasons, residual_ratio, tuple(untested), tuple(notes))
 
 
 class Found(NamedTuple):
-    """Figure of a test and where it occurs; `doubtful` overrides the threshold.
+    """Figure of a test and where it occurs; `doubtful` overrides the threshold, and `harmless` makes a note of a doubt.
 
     Where the test could not be made, the figure is NaN, and `where` says why.
     """
@@ -65,6 +78,7 @@ class Found(NamedTuple):
     figure: float
     where: str = ""
     doubtful: bool = False
+    harmless: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +100,16 @@ class Test(Generic[Facts]):
             return None
         return Reason(self.what, found.figure, self.threshold, found.where, self.what_to_do)
 
+    def judged(self, facts: Facts) -> Reason | None:
+        """Make the test; None if what it finds is trusted, or not known."""
+        return self.reason(self.find(facts))
+
 
 def judged(tests: Iterable[Test[Facts]], facts: Facts, residual_ratio: float | None, doubts: Iterable[Reason] = ()) -> Verdict:
     """Return the verdict of a table of tests, in its order, after the doubts that are there already."""
     found = [(test, test.find(facts)) for test in tests]
-    reasons = (reason for test, each in found if (reason := test.reason(each)) is not None)
+    reasons = [(reason, each) for test, each in found if (reason := test.reason(each)) is not None]
     untested = (clause for test, each in found if (clause := test.untested(each)) is not None)
-    return Verdict.of((*doubts, *reasons), residual_ratio, untested)
+    notes = (reason for reason, each in reasons if each is not None and each.harmless)
+    doubted = (reason for reason, each in reasons if each is None or not each.harmless)
+    return Verdict.of((*doubts, *doubted), residual_ratio, untested, notes)
