@@ -260,6 +260,8 @@ def test_page_says_verdict_in_words(record, text):
     assert "Do not rely" not in unknown
     assert "scatter of short spans" not in unknown
     assert "Not tested" not in unknown
+    note = {"what": "parts change", "figure": 0.08, "threshold": 0.03, "where": "x 3", "what_to_do": "mask"}
+    assert "Found, but too small to make it wrong: Parts change (x 3) : 0.08" in text(verdict=trusted | {"notes": [note]})
     assert "Not tested: whether it moves (20 spans)" in text(verdict=trusted | {"untested": ["whether it moves (20 spans)"]})
 
 
