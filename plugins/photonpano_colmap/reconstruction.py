@@ -76,10 +76,9 @@ def reconstruct(
         _extract(database, folder, camera, images[0][0].shape, config)
         _match(database, config, seed)
         keypoints, matches = _counts(database, len(images))
-        # a camera that only turns may leave images without a point
-        found = [model for model in _map(database, folder, camera, config, seed) if model.num_points3D()]
-        pieces = [_piece(each, camera.focal_px is None) for each in _apart(found)]
-    return Reconstruction(tuple(pieces), keypoints, matches)
+        pieces = [_piece(each, camera.focal_px is None) for each in _apart(_map(database, folder, camera, config, seed))]
+    # a camera that only turns may leave images without a point
+    return Reconstruction(tuple(piece for piece in pieces if len(piece.points)), keypoints, matches)
 
 
 def _extract(database: Path, folder: Path, camera: CameraGuess, shape: tuple[int, ...], config: ColmapAveragesConfig) -> None:

@@ -17,7 +17,7 @@ from photonpano import FloatArray, Reason
 from photonpano_colmap.posing.path import positions_of
 
 _NEAREST = 0.1  # minimum distance of reversed points, in median depths
-_FARTHEST_OFF_PX = 4.0  # points of a reversed reading with a larger residual are removed, as COLMAP removes them
+_FARTHEST_OFF_PX = 4.0  # points with a larger residual are removed, as COLMAP removes them
 _SAME = 0.2  # two readings agree if their rotations differ by less than this fraction
 _ALIKE = 0.9  # neither reading is likelier if the ratio of their residuals is above this
 
@@ -57,14 +57,11 @@ class Readings:
 
 
 def likelier_reading(found: pycolmap.Reconstruction, finds_focal: bool) -> tuple[pycolmap.Reconstruction, Readings]:
-    """Return a reconstruction, or a copy with its depth reversed if that explains the images better; and how well each does."""
+    """Return a reconstruction adjusted to its images, with its depth reversed if that explains them better; and how well."""
     adjusted, other = copy.deepcopy(found), _reversed(found)
     found_px, reversed_px = adjust_model(adjusted, finds_focal), adjust_model(other, finds_focal)
     likelier = adjusted if found_px <= reversed_px else other
-    is_reversed = not _agree(found, likelier)
-    readings = Readings(found_px, reversed_px, is_reversed, not _agree(adjusted, other))
-    if not is_reversed:
-        return found, readings
+    readings = Readings(found_px, reversed_px, not _agree(found, likelier), not _agree(adjusted, other))
     for identifier, point in list(likelier.points3D.items()):
         if point.error > _FARTHEST_OFF_PX:
             likelier.delete_point3D(identifier)
