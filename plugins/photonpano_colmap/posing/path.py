@@ -21,12 +21,15 @@ _DEGREE = 5  # degree of the polynomial in time that is always kept: gauge and d
 
 
 class PoseSpline:
-    """Cubic splines of positions and of rotations; beyond the first and the last pose the camera keeps its velocity."""
+    """Cubic splines of positions and of rotations; beyond the first and the last pose the camera keeps its velocity.
+
+    That of positions is a natural one: others magnify the noise of the outermost poses.
+    """
 
     def __init__(self, instants: FloatArray, poses: FloatArray) -> None:
         """Fit (N, 3, 4) poses at increasing instants, in frames; N is at least 2."""
         self._ends = float(instants[0]), float(instants[-1])
-        self._positions = CubicSpline(instants, positions_of(poses))
+        self._positions = CubicSpline(instants, positions_of(poses), bc_type="natural")
         self._rotations = RotationSpline(instants, Rotation.from_matrix(poses[:, :, :3]))
 
     def at(self, instants: ArrayLike) -> FloatArray:
@@ -75,14 +78,19 @@ class Path:
         """Return this path, corrected where groups of frames were located along it.
 
         The frames of a group were merged along the path, so a group's pose gives the mean correction of its frames, (N, 6), not
-        that of one instant. The correction is the function with these means and the least second derivative: the derivative of
-        the natural quintic spline through its integral at the borders of the groups, (N + 1,) in frames.
+        that of one instant. Rotations are corrected by the function with these means and the least second derivative: the
+        derivative of the natural quintic spline through its integral at the borders of the groups, (N + 1,) in frames.
+        Positions become such a function: within a group they were interpolated only, from poses with more noise.
         """
+        starts = np.ceil(borders).astype(int)
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(self._centres, axis=0)])[starts]
+        centres = np.diff(sums, axis=0) / np.diff(starts)[:, None]
+        means = np.concatenate([means[:, :3], centres + means[:, 3:]], axis=1)
         integral = np.concatenate([np.zeros((1, 6)), np.cumsum(means * np.diff(borders)[:, None], axis=0)])
         end = [(3, np.zeros(6)), (4, np.zeros(6))]
         ends: Any = end, end  # which the library's types do not have
-        correction = make_interp_spline(borders, integral, k=5, bc_type=ends).derivative()(np.arange(len(self.poses)))
-        return Path(posed(rotation_matrices(correction[:, :3]) @ self.poses[:, :, :3], self._centres + correction[:, 3:]))
+        smooth = make_interp_spline(borders, integral, k=5, bc_type=ends).derivative()(np.arange(len(self.poses)))
+        return Path(posed(rotation_matrices(smooth[:, :3]) @ self.poses[:, :, :3], smooth[:, 3:]))
 
     def rotated(self, rotations: FloatArray) -> Path:
         """Return this path with the camera rotated on the spot at each frame, by (T, 3) rotation vectors in its own axes."""

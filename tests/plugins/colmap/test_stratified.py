@@ -108,8 +108,15 @@ def test_corrected_path_has_the_means_at_which_its_groups_were_located() -> None
 
 def test_noise_of_the_outermost_groups_is_not_magnified_at_the_ends() -> None:
     means = 1e-4 * np.random.default_rng(0).normal(size=(20, 6))
-    steps = moves(true_poses(), TRUE.corrected(np.linspace(0, 320, 21) - 0.5, means).poses)
-    assert abs(steps[[0, -1]]).max() < 5e-4
+    exact, noisy = (TRUE.corrected(np.linspace(0, 320, 21) - 0.5, each).poses for each in (0 * means, means))
+    assert abs(moves(exact, noisy)[[0, -1]]).max() < 5e-4
+
+
+def test_corrected_path_keeps_no_motion_within_groups_that_was_only_interpolated() -> None:
+    wrong = 0.01 * (np.arange(320) % 16 - 7.5)[:, None] / 8
+    start = Path(posed(true_poses()[:, :, :3], positions_of(true_poses()) + wrong))
+    found = start.corrected(np.linspace(0, 320, 21) - 0.5, np.zeros((20, 6)))
+    np.testing.assert_allclose(positions_of(found.poses), positions_of(true_poses()), atol=2e-3)
 
 
 def trembling(rms_px: float) -> tuple[Path, np.ndarray]:
