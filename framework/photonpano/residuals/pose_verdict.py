@@ -47,7 +47,7 @@ TESTS: tuple[Test[PoseEstimate], ...] = (
         "the poses are likely wrong: move farther, or choose another pose.with.group_size",
         _residuals,
     ),
-    Test("the expected error of the positions is large", 0.38, _MORE_LIGHT, _position),
+    Test("the expected error of the positions is large", 0.3, _MORE_LIGHT, _position),
     Test("the expected error of the rotations is large", 5.0, _MORE_LIGHT, _rotation),
     Test("the expected errors are not known", 0, "use a pose estimator that knows them, or more light", _unknown),
     Test("many frames have no pose", 0.5, "see the reasons under `lost`; choose another pose.with.group_size", _lost),
