@@ -46,7 +46,7 @@ test: $(COMPLETE)
 demo: $(RUNS)
 	@mkdir -p demo
 	$(STEP) 'simulating a capture'
-	@$(BIN)/photonpano simulate examples/pipelines/demo-capture.yaml --output demo/capture.npy
+	@$(BIN)/photonpano simulate examples/pipelines/demo-capture.yaml --output demo/capture.npy --overwrite
 	$(STEP) 'making its panorama (a minute or two)'
 	@$(BIN)/photonpano run examples/pipelines/demo.yaml
 	$(STEP) 'comparing it with the truth'

@@ -100,7 +100,7 @@ def batch(
         changes: values to change in all runs, such as `run.seed=1`. A list sweeps a key that takes no list.
         sweep: values of keys, such as `{"resample.with.group_size": [50, 100]}`; every combination is run on every capture.
         jobs: how many runs go on at once; they share the cores.
-        overwrite: as in `run`, for each run folder.
+        overwrite: write beside other files, which stay, or replace a run of another capture.
         progress: receives a note for each run that ends; by default, bars in a notebook and nothing elsewhere.
 
     Raises:

@@ -18,6 +18,7 @@ from photonpano.evaluation import evaluate, load_run_trajectory
 from photonpano.evaluation.comparison import motion_difference, on_canvas, reduced
 from photonpano.evaluation.inputs import RunTrajectory
 from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import require_new
 from photonpano.record.contents import require_one_run
 from photonpano.record.run_json import read_record
 from photonpano.record.schema import PanoramaRecord, RunRecord
@@ -58,26 +59,34 @@ def _lines(found: Comparison) -> Iterator[str]:
     output=typer.Option("--output", "-o", metavar="PAGE.html"),
     truth=typer.Option(metavar="TRUTH.npz"),
 )
-def compare(runs: Sequence[Path | str], output: Path | str = "compare.html", truth: Path | str | None = None) -> Comparison:
+def compare(
+    runs: Sequence[Path | str],
+    output: Path | str = "compare.html",
+    truth: Path | str | None = None,
+    *,
+    overwrite: bool = False,
+) -> Comparison:
     """Lay runs of one capture side by side, on a page of its own: motion, panoramas, scores, and settings that differ.
 
     Captures are not opened. The first run is the one that the others are compared with.
 
     Args:
         runs: at least two run folders.
-        output: the page, whose name ends in .html; one that is there is replaced.
+        output: the page, whose name ends in .html.
         truth: the `.truth.npz` of a simulated capture, for scores; by default the one beside the capture, if it is there.
+        overwrite: replace the page that is there under this name.
 
     Raises:
         InputError: a folder is no run with a panorama, the runs are of different captures, or two of them located no frame in
             common; or the truth is that of another capture.
-        OutputError: the page cannot be written, or its name has another ending.
+        OutputError: the page is there already, or cannot be written; or its name has another ending.
     """
     folders, page = [Path(run) for run in runs], Path(output)
-    if page.suffix != ".html":  # so that no file of another kind is replaced by mistake
+    if page.suffix != ".html":
         raise OutputError(f"cannot write {output}: the page is HTML; choose a name that ends in .html")
     if len({folder.absolute().resolve() for folder in folders}) < max(2, len(folders)):
         raise InputError("a comparison needs at least two different run folders")
+    require_new(page, overwrite)
     runs_read = [_read(folder) for folder in folders]
     for other in runs_read[1:]:
         _require_same_capture(runs_read[0], other)

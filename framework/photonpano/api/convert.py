@@ -14,17 +14,19 @@ import typer
 from rich.filesize import decimal
 
 from photonpano.api.command import command, warn
-from photonpano.capture.writing import write_folder, write_packed
-from photonpano.contracts.protocols import Source
+from photonpano.capture.writing import truth_path, write_folder, write_packed
+from photonpano.contracts.protocols import KnowsTruth, Source
 from photonpano.errors import OutputError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import thread_count
 from photonpano.files.atomic import part_path
+from photonpano.files.folders import require_new
 from photonpano.notebooks import facts
 from photonpano.pipeline.components import build_source
 from photonpano.plugins.contributions import SourceContribution
 from photonpano.plugins.registry import Catalog, discover
 from photonpano.plugins.registry.description import flow
+from photonpano.record.fingerprint import capture_files
 from photonpano.specs import Plan
 from photonpano.text import columns, counted
 from photonpano.values import StreamInfo
@@ -90,6 +92,7 @@ def convert(
     resumed: Callable[[int], object] | None = None,
     *,
     compress: bool = False,
+    overwrite: bool = False,
     catalog: Catalog | None = None,
 ) -> WrittenCapture:
     """Write a capture of binary frames to a packed .npy file, or to a zarr array.
@@ -104,11 +107,12 @@ def convert(
         progress: receives the stage; by default, bars in a notebook and nothing elsewhere.
         resumed: called with the number of frames that OUTPUT.part holds, if there are any.
         compress: compress the frames, in a format that can, such as zarr.
+        overwrite: replace the files that are there under these names.
         catalog: the sources that may write it; by default those of the installed plugins.
 
     Raises:
         InputError: the frames are not binary, or a correction changes sums of frames, which bits cannot hold.
-        OutputError: the file cannot be written, the disk is full, or OUTPUT.part is another file.
+        OutputError: the file is there already, or cannot be written; the disk is full, or OUTPUT.part is another file.
     """
     output = Path(output)
     writer = writer_of(output, discover() if catalog is None else catalog)
@@ -124,6 +128,7 @@ def convert(
     before = part.stat().st_mtime_ns if part.exists() else None
     try:
         with build_source(plan) as source:
+            require_new_capture(source, plan, output, overwrite)
             return write_capture(source, plan, output, progress, goes_on, writer, compress)
     finally:
         if part.exists() and part.stat().st_mtime_ns != before:
@@ -137,6 +142,12 @@ def writer_of(output: Path, catalog: Catalog) -> SourceContribution | None:
         if isinstance(source, SourceContribution) and source.write and output.suffix.lower() in source.suffixes:
             return source
     return None
+
+
+def require_new_capture(source: Source, plan: Plan, output: Path, overwrite: bool) -> None:
+    """Refuse names of a capture and its truth under which there is something, unless it is to be overwritten."""
+    for path in (output, truth_path(output)) if isinstance(source, KnowsTruth) else (output,):
+        require_new(path, overwrite, capture_files(plan))
 
 
 def write_capture(

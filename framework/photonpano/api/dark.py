@@ -16,6 +16,7 @@ from photonpano.corrections.hot_pixels import THRESHOLD
 from photonpano.errors import InputError, OutputError
 from photonpano.execution.context import Progress, usual
 from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import require_new
 from photonpano.pipeline.components import build_source
 from photonpano.plugins.registry.description import flow
 from photonpano.specs import Plan
@@ -73,7 +74,14 @@ def _lines(measured: DarkMeasurement) -> Iterator[str]:
     output=typer.Option("--output", "-o", metavar="FILE"),
     threshold=typer.Option(min=0, metavar="STD"),
 )
-def dark(plan: Plan, output: Path | str, threshold: float = THRESHOLD, progress: Progress | None = None) -> DarkMeasurement:
+def dark(
+    plan: Plan,
+    output: Path | str,
+    threshold: float = THRESHOLD,
+    progress: Progress | None = None,
+    *,
+    overwrite: bool = False,
+) -> DarkMeasurement:
     """Measure dark counts and hot pixels in a capture that was recorded with the lens covered, and write them.
 
     Corrections that move pixels are applied before, so list the file after them in a spec.
@@ -84,14 +92,16 @@ def dark(plan: Plan, output: Path | str, threshold: float = THRESHOLD, progress:
             .npy file for the mask of the hot pixels.
         threshold: hot pixels are above the median by this many standard deviations.
         progress: receives the stage; by default, bars in a notebook and nothing elsewhere.
+        overwrite: replace the file that is there under this name.
 
     Raises:
         InputError: all pixels are masked.
-        OutputError: the file has another suffix, or cannot be written.
+        OutputError: the file has another suffix, is there already, or cannot be written.
     """
     output = Path(output)
     if output.suffix not in (".npz", ".npy"):
         raise OutputError(f"cannot write {output}: dark counts are an .npz file, and a mask of hot pixels is a .npy file")
+    require_new(output, overwrite)
     with build_source(plan) as source:
         info, valid = source.info, source.valid
         if not valid.any():

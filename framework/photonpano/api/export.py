@@ -11,7 +11,7 @@ import typer
 from photonpano.api.command import command
 from photonpano.errors import InputError
 from photonpano.evaluation import RunPoses, RunTrajectory, has_poses, load_run_poses, load_run_trajectory
-from photonpano.files.atomic import atomic_folder
+from photonpano.files.folders import atomic_folder, require_new
 from photonpano.record.contents import require_one_run
 from photonpano.record.poses import POSE_FORMATS, PoseFormat, Poses, centres
 from photonpano.record.run_json import read_record
@@ -36,7 +36,9 @@ class ExportedPoses:
     file_format=typer.Option("--format"),
     every=typer.Option(min=1, metavar="N"),
 )
-def export(run_folder: Path | str, file_format: PoseFormat, output: Path | str, every: int = 1) -> ExportedPoses:
+def export(
+    run_folder: Path | str, file_format: PoseFormat, output: Path | str, every: int = 1, *, overwrite: bool = False
+) -> ExportedPoses:
     """Write the poses and the camera of a run for another program.
 
     Needs a run with the model rotation, or with pose. Frames that were not located are left out.
@@ -44,13 +46,14 @@ def export(run_folder: Path | str, file_format: PoseFormat, output: Path | str, 
     Args:
         run_folder: written by `run`, with the model `rotation` or with `pose`.
         file_format: "colmap" (a text model), "nerfstudio" (transforms.json) or "tum" (times and quaternions).
-        output: a new folder.
+        output: the folder of the files.
         every: 1 for all located frames, 2 for every other, and so on.
+        overwrite: replace the poses that are there under this name.
 
     Raises:
         InputError: the folder is no run folder, the run knows no rotations, or no frame is located; for "tum", the frame rate
             of the capture is not known.
-        OutputError: the folder cannot be written, or is there already.
+        OutputError: the folder is there already, or cannot be written.
         ValueError: the format is not known, or `every` is below 1.
     """
     if file_format not in POSE_FORMATS or every < 1:
@@ -58,6 +61,7 @@ def export(run_folder: Path | str, file_format: PoseFormat, output: Path | str, 
             f"file_format must be one of {', '.join(POSE_FORMATS)}, and every at least 1; got {file_format!r} and {every}"
         )
     folder, output = Path(run_folder), Path(output)
+    require_new(output, overwrite, [folder])
     files = POSE_FORMATS[file_format](poses := _poses(folder, every, needs_seconds=file_format == "tum"))
     with atomic_folder(output) as written:
         for name, text in files.items():

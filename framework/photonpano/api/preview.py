@@ -11,7 +11,9 @@ import typer
 from photonpano.api.command import command
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
+from photonpano.files.folders import require_new
 from photonpano.pipeline.components import build_source
+from photonpano.record.fingerprint import capture_files
 from photonpano.record.picture_files import counted, require_writable, write_pictures
 from photonpano.report.preview import Style, pictures, preview_spans, white_flux
 from photonpano.specs import Plan
@@ -66,6 +68,7 @@ def preview(
     srgb: bool = True,
     label: bool = True,
     fps: float = 24,
+    overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Preview:
     """Merge frames into pictures without motion, to look at a capture.
@@ -74,7 +77,7 @@ def preview(
 
     Args:
         plan: of the capture; its corrections are applied.
-        output: a new folder for PNGs, or an .mp4, .webp or .gif file.
+        output: a folder for PNGs, or an .mp4, .webp or .gif file.
         group_size: frames of a picture.
         step: frames from the start of one picture to the next; by default `group_size`.
         quantile: the share of the pixels that are darker than white.
@@ -82,12 +85,14 @@ def preview(
         srgb: sRGB levels for screens, or levels proportional to the flux.
         label: write the frame numbers and the time below each picture.
         fps: pictures per second of a film.
+        overwrite: replace the pictures that are there under this name.
         progress: receives the stage; by default, bars in a notebook and nothing elsewhere.
 
     Raises:
-        OutputError: the pictures cannot be written, or a library that writes them is missing.
+        OutputError: the pictures are there already, or cannot be written, or a library that writes them is missing.
     """
     output = Path(output)
+    require_new(output, overwrite, capture_files(plan))
     with build_source(plan) as source, one_thread_inside():
         threads = thread_count(plan.run.threads)
         spans = preview_spans(source.info, group_size, step or group_size)

@@ -79,7 +79,7 @@ def render(
         output: the new run folder.
         changes: values of the recorded spec to change, such as `render.scale=2`, `output.formats=[exr]`, or
             `source.with.path=...` for a capture that was moved.
-        overwrite: whether `output` may hold files that no run has written, which stay, or a run of another capture.
+        overwrite: write beside other files, which stay, or replace a run of another capture.
         progress: receives the stages; by default, bars in a notebook and nothing elsewhere.
         catalog: what can be chosen; by default what the installed plugins offer.
 

@@ -99,7 +99,7 @@ def _run(
         spec: a YAML file.
         output: the run folder, instead of the spec's output.directory.
         changes: overrides of values of the spec, such as run.seed=1.
-        overwrite: as in `run`.
+        overwrite: write beside other files, which stay, or replace a run of another capture.
         resume: go on with a run of this spec that was interrupted.
         from_level: take the levels before N from the run before, whose work was kept, and compute N and what follows.
         keep_work: keep what each level has found, for --from-level, in the folder DIR.work.

@@ -19,6 +19,7 @@ from photonpano.corrections.moments import showing
 from photonpano.errors import InputError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
+from photonpano.files.folders import require_new
 from photonpano.geometry import canvas_of_box
 from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
@@ -27,6 +28,7 @@ from photonpano.motion.frame_motion import view_of
 from photonpano.pipeline.film import Film, merged
 from photonpano.pipeline.rendering import naming_key_of_canvas
 from photonpano.plugins.registry import Catalog
+from photonpano.record.fingerprint import capture_files
 from photonpano.record.picture_files import counted, require_writable, write_pictures
 from photonpano.text import byte_size
 from photonpano.values import FrameSpan
@@ -84,6 +86,7 @@ def video(
     speed: float | None = None,
     trail: bool = False,
     changes: Sequence[str] = (),
+    overwrite: bool = False,
     progress: Progress | None = None,
     catalog: Catalog | None = None,
 ) -> Video:
@@ -94,7 +97,7 @@ def video(
 
     Args:
         run_folder: written by `run`.
-        output: an .mp4, .webp or .gif file, or a new folder for PNGs of 16 bits.
+        output: an .mp4, .webp or .gif file, or a folder for PNGs of 16 bits.
         view: "panorama", the canvas of the panorama, on which still things stand still; or "smooth", as large as a frame, which
             follows the camera without its tremor.
         exposure: frames that a picture merges, or a time such as "5 ms"; by default as many as the groups of the last level.
@@ -103,6 +106,7 @@ def video(
             begins where the exposure of the one before ends.
         trail: draw the outline of the frame, over the panorama.
         changes: values of the recorded spec to change, such as `render.scale=0.5` or `render.extent=reference`.
+        overwrite: replace the video that is there under this name.
         progress: receives the stages; by default, bars in a notebook and nothing elsewhere.
         catalog: what can be chosen; by default what the installed plugins offer.
 
@@ -110,7 +114,7 @@ def video(
         CanvasTooLargeError: the panorama would exceed `run.memory`.
         InputError: the folder is no run folder, its capture cannot be opened, or is another capture now; or an argument is
             wrong.
-        OutputError: the video cannot be written, or the library that writes it is missing.
+        OutputError: the video is there already, or cannot be written, or the library that writes it is missing.
         SpecError: a change is wrong.
     """
     for change in changes:
@@ -124,6 +128,7 @@ def video(
         raise InputError("the trail is drawn over the panorama; choose the view panorama, or no trail")
     output, progress = Path(output), usual(progress)
     with opened_run(Path(run_folder), catalog, changes) as opened, one_thread_inside():
+        require_new(output, overwrite, [opened.folder, *capture_files(opened.plan)])
         require_same_plane(opened)
         n_frames, step = _timing(opened, exposure, fps, speed)
         located = opened.motion.span

@@ -16,7 +16,8 @@ from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, OutputError, PluginError
 from photonpano.execution.threads import in_order
-from photonpano.files.atomic import atomic_folder, atomic_path, require_space, resumable_path
+from photonpano.files.atomic import atomic_path, require_space, resumable_path
+from photonpano.files.folders import atomic_folder
 from photonpano.values import FrameSpan, StreamInfo
 
 FolderWriter = Callable[[Path, StreamInfo, Iterable[NDArray[np.uint8]]], None]
@@ -39,7 +40,7 @@ def write_folder(
     """Write a binary source as a folder by `write`, whole or not at all, in constant memory; otherwise as `write_packed`.
 
     Raises:
-        OutputError: there is something under that name, or the folder cannot be written, or does not fit on the disk.
+        OutputError: there is a file under that name, or the folder cannot be written, or does not fit on the disk.
     """
     _require_bits(source, path)
     packed, truth = PackedFrames(source), capture_of(source).truth() or {}

@@ -82,26 +82,6 @@ def resumable_path(final: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(final: Path) -> Iterator[Path]:
-    """Lend an empty folder beside `final`, which becomes `final` in one rename when the block ends well.
-
-    Raises:
-        OutputError: there is something under that name, or the folder cannot be written.
-    """
-    place = final.absolute()
-    try:
-        if final.exists() and not (final.is_dir() and next(final.iterdir(), None) is None):
-            raise OutputError(f"cannot write {final}: it is there already; choose another folder, or remove it")
-        with _lent(place, f".{place.name}.", ".partial", folder=True) as temporary:
-            yield temporary
-            for file in temporary.rglob("*"):
-                flush(file)
-            _rename(temporary, place)
-    except OSError as error:
-        raise OutputError(_message(final, error)) from error
-
-
-@contextmanager
 def unfinished_folder(place: Path, start: str) -> Iterator[Path]:
     """Lend a new folder beside `place` whose name begins with `start` and ends in `.partial`, and remove it after the block."""
     with _lent(place, start, ".partial", folder=True) as temporary:
@@ -167,11 +147,18 @@ def remove(path: Path) -> None:
 @contextmanager
 def _becoming(final: Path) -> Iterator[None]:
     """Refuse a name that no file can get, and turn what the system raises into an `OutputError`."""
-    try:
+    with writing(final):
         if final.is_symlink():
             raise OutputError(f"cannot write {final}: it is a symbolic link; remove it, or choose another name")
         if final.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        yield
+
+
+@contextmanager
+def writing(final: Path) -> Iterator[None]:
+    """Turn what the system raises in the block into an `OutputError` that names `final`, and says what to do."""
+    try:
         yield
     except OSError as error:
         raise OutputError(_message(final, error)) from error
@@ -209,6 +196,7 @@ def flush(path: Path) -> None:
 
 
 _REMEDIES = {
+    errno.ENOTDIR: "choose another name, or remove the file",
     errno.ENOSPC: "free some space or choose another folder",
     errno.EDQUOT: "free some of your quota or choose another folder",
     errno.EFBIG: "raise the limit on file sizes or choose another file system",

@@ -8,17 +8,19 @@ From then on they count: `finish_replacement` puts them in place, and whoever op
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
+import pwd
 import re
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from shlex import quote
 
 from photonpano.errors import OutputError
-from photonpano.files.atomic import flush, is_partial, partial_paths, remove, unfinished_folder
+from photonpano.files.atomic import flush, is_partial, partial_paths, remove, unfinished_folder, writing
 from photonpano.files.locks import claim
 
 PENDING = ".photonpano-pending"  # the folder of new files that are complete, and not yet all in place
@@ -26,6 +28,64 @@ _REMOVED = ".removed"  # a file in it: the names that the folder loses
 # Folders of unfinished files of older versions, and of what a stopped program discards
 _OLDER = re.compile(r"\.part-[a-z0-9_]{8}")
 _AT_FDCWD, _RENAME_EXCHANGE, _RENAME_SWAP = -100, 2, 2
+
+
+def require_new(path: Path, overwrite: bool, inputs: Sequence[Path] = ()) -> None:
+    """Refuse a name under which there is something, unless it is to be overwritten; an empty folder is nothing.
+
+    `inputs` are what the new file or folder is made of: they must not lie in a folder that is overwritten.
+
+    Raises:
+        OutputError: there is something under the name.
+    """
+    if path.is_dir():
+        with writing(path):
+            there = any(path.iterdir())
+    else:
+        there = os.path.lexists(path)
+    if there and not overwrite:
+        raise OutputError(f"{path} is there already; choose another name, or replace it with --overwrite")
+    if there and path.is_dir():
+        require_harmless(path.absolute().resolve(), inputs)
+
+
+def require_harmless(directory: Path, inputs: Sequence[Path]) -> None:
+    """Raise an `OutputError` for a folder of a user, of the system, or in which one of the `inputs` lies."""
+    homes = [Path("/")]
+    with suppress(KeyError, RuntimeError):  # containers run users that the system does not know
+        homes += [Path(pwd.getpwuid(os.getuid()).pw_dir), Path.home()]
+    if any(home.resolve().is_relative_to(directory) for home in homes):
+        raise OutputError(f"{directory} is the folder of a user or of the system; choose another one")
+    for path in inputs:
+        if path.absolute().resolve().is_relative_to(directory):
+            raise OutputError(f"{directory} cannot be written, since {path}, which is read, lies in it; choose another folder")
+
+
+@contextmanager
+def atomic_folder(final: Path) -> Iterator[Path]:
+    """Lend an empty folder beside `final`, which becomes `final` in one step when the block ends well.
+
+    If `final` is there already, it loses what has the names of new files and folders, whatever the numbers in them, such as
+    `frame_07.png`. The rest stays in it.
+
+    Raises:
+        OutputError: there is a file under that name, or the folder cannot be written.
+    """
+    place = final.absolute().resolve()
+    with writing(final):
+        if place.exists() and not place.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        with staging_of(place) as staging:
+            yield staging
+            finish_replacement(place)
+            names = {_without_numbers(path) for path in staging.iterdir()}
+            old = [path for path in _entries(place) if _without_numbers(path) in names]
+            lost = [file for path in old for file in (_files(path) if path.is_dir() and not path.is_symlink() else [path])]
+            replace_folder(staging, place, [file.relative_to(place).as_posix() for file in lost])
+
+
+def _without_numbers(path: Path) -> str:
+    return re.sub(r"\d+", "0", path.name)
 
 
 def lock_path(directory: Path) -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import pwd
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -25,6 +24,7 @@ from photonpano.files.folders import (
     others_in,
     remove_leftovers,
     replace_folder,
+    require_harmless,
     staging_of,
 )
 from photonpano.files.locks import locked
@@ -131,7 +131,7 @@ def run_folder(directory: Path, *, overwrite: bool = False, inputs: Sequence[Pat
         OutputError: the folder cannot be made or written to, another process writes it, or it is none that a run may write.
     """
     directory = _resolved(directory)
-    _require_harmless(directory, inputs)
+    require_harmless(directory, inputs)
     with ExitStack() as stack:
         try:
             stack.enter_context(_made(directory.parent))
@@ -184,21 +184,6 @@ def _resolved(directory: Path) -> Path:
         return directory.absolute().resolve()
     except (OSError, RuntimeError) as error:
         raise OutputError(f"{directory}: the run folder cannot be found ({error}); choose another one with --output") from error
-
-
-def _require_harmless(directory: Path, inputs: Sequence[Path]) -> None:
-    """Refuse a folder that holds more than a run: that of a user, of the system, or of what the run reads."""
-    homes = [Path("/")]
-    with suppress(KeyError, RuntimeError):  # containers run users that the system does not know
-        homes += [Path(pwd.getpwuid(os.getuid()).pw_dir), Path.home()]
-    elsewhere = "choose another one with --output"
-    if any(home.resolve().is_relative_to(directory) for home in homes):
-        raise OutputError(f"{directory} is the folder of a user or of the system; {elsewhere}")
-    for path in inputs:
-        if path.absolute().resolve().is_relative_to(directory):
-            raise OutputError(
-                f"{directory} cannot be the run folder, since {path} lies in it; choose another one with --output"
-            )
 
 
 def _require_own(directory: Path) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import OutputError
-from photonpano.files.atomic import atomic_folder, atomic_path
+from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_folder
 from photonpano.plugins.contributions import Requirement, install_command
 
 Picture = NDArray[np.uint8] | NDArray[np.uint16]  # of 16 bits in a folder of PNGs only
@@ -42,8 +43,8 @@ def require_writable(path: Path, n_pictures: int) -> None:
 def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str], fps: float) -> None:
     """Write pictures of one size, (H, W) or (H, W, 3) with red first; uint8, or uint16 into a folder.
 
-    The path is a new or empty folder for PNGs, or a film that ends in .mp4, .webp or .gif. `names` are those of the PNGs,
-    without suffix, as many as there are pictures; a GIF counts the time of a picture in 1/100 s.
+    The path is a folder for PNGs, see `atomic_folder`, or a film that ends in .mp4, .webp or .gif. `names` are those of the
+    PNGs, without suffix, as many as there are pictures; a GIF counts the time of a picture in 1/100 s.
 
     Raises:
         OutputError: see `require_writable`; or the files cannot be written. Nothing is left then.

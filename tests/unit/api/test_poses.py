@@ -123,8 +123,17 @@ def test_run_without_poses_or_times_is_refused(
         export(folder, "colmap", tmp_path / "poses")
 
 
-def test_export_into_a_folder_with_files_is_refused(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "poses").mkdir()
-    (tmp_path / "poses" / "mine.txt").write_text("")
-    with pytest.raises(OutputError, match="it is there already; choose another folder"):
-        export(folder, "colmap", tmp_path / "poses")
+def test_export_replaces_its_files_only_with_overwrite(folder: Path, tmp_path: Path) -> None:
+    poses = tmp_path / "poses"
+    export(folder, "colmap", poses, every=5)
+    before = (poses / "images.txt").read_text()
+    (poses / "mine.txt").write_text("mine")
+    with pytest.raises(OutputError) as caught:
+        export(folder, "colmap", poses)
+    assert str(caught.value) == f"{poses} is there already; choose another name, or replace it with --overwrite"
+    assert (poses / "images.txt").read_text() == before
+    export(folder, "colmap", poses, overwrite=True)
+    assert len((poses / "images.txt").read_text()) > len(before)
+    assert (poses / "mine.txt").read_text() == "mine"
+    with pytest.raises(OutputError, match="which is read, lies in it; choose another folder"):
+        export(folder, "colmap", folder, overwrite=True)

@@ -19,7 +19,8 @@ from photonpano import (
     Url,
 )
 from photonpano import text as words
-from photonpano.files.atomic import atomic_folder, atomic_path
+from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_folder
 from photonpano.files.paths import location
 from photonpano.filtering import exceeding_noise
 

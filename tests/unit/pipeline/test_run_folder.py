@@ -197,11 +197,11 @@ def test_run_folder_refuses_what_must_not_be_replaced(tmp_path: Path, monkeypatc
     (tmp_path / "home" / "me").mkdir(parents=True)
     capture = tmp_path / "captures" / "night" / "cube.npy"
     for directory in (Path("/"), tmp_path / "home", tmp_path / "home" / "me", tmp_path / "captures", capture):
-        reason = "is the folder of a user or of the system"
+        reason = "is the folder of a user or of the system; choose another one"
         if directory in (tmp_path / "captures", capture):
-            reason = f"cannot be the run folder, since {capture} lies in it"
+            reason = f"cannot be written, since {capture}, which is read, lies in it; choose another folder"
         found = refusal(directory, overwrite=True, inputs=[capture])
-        assert found == f"{directory} {reason}; choose another one with --output"
+        assert found == f"{directory} {reason}"
 
 
 def test_second_run_into_a_folder_is_refused_with_the_first(tmp_path: Path) -> None:

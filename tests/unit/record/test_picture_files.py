@@ -92,14 +92,21 @@ def refused(path: Path, n_pictures: int = 3) -> str:
     return str(caught.value).replace(f"{path.parent}/", "")
 
 
-def test_folder_with_files_is_refused(tmp_path: Path, smooth: list[np.ndarray]) -> None:
-    (tmp_path / "look").mkdir()
-    (tmp_path / "look" / "mine.txt").touch()
-    assert refused(tmp_path / "look") == ("cannot write look: it is there already; choose another folder, or remove it")
-    assert [path.name for path in tmp_path.rglob("*")] == ["look", "mine.txt"]
-    (tmp_path / "look" / "mine.txt").unlink()
-    write_pictures(tmp_path / "look", iter(smooth), NAMES, 24)
-    assert len(list((tmp_path / "look").iterdir())) == 3
+def test_pictures_replace_those_before_and_leave_other_files(tmp_path: Path, smooth: list[np.ndarray]) -> None:
+    look = tmp_path / "look"
+    write_pictures(look, iter(smooth), NAMES, 24)
+    first, *others = (look / f"{name}.png" for name in NAMES)
+    before = first.read_bytes()
+    (look / "mine.png").touch()
+    write_pictures(look, iter(smooth[1:2]), NAMES[:1], 24)
+    assert first.read_bytes() != before
+    assert sorted(look.iterdir()) == [first, look / "mine.png"]
+    assert not any(path.exists() for path in others)
+
+
+def test_folder_does_not_replace_a_file(tmp_path: Path) -> None:
+    (tmp_path / "look").touch()
+    assert refused(tmp_path / "look") == "cannot write look: Not a directory; choose another name, or remove the file"
 
 
 def test_wrong_names_are_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,6 @@ _USUAL: dict[str, Any] = {
     "run_folder": typer.Argument(metavar="RUN", help="A run folder."),
     "output": typer.Option("--output", "-o", metavar="DIR"),
     "changes": typer.Option("--set", metavar="KEY=VALUE"),
-    "overwrite": typer.Option(help="Write beside other files, which stay, or replace a run of another capture."),
     "strict": typer.Option(help="Exit with 1 if the verdict is doubtful."),
     "as_json": typer.Option("--json", help="Print JSON, for programs."),
 }

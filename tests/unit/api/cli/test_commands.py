@@ -74,8 +74,8 @@ def test_dark_counts_and_masks_are_those_of_the_camera(folder: Path, invoke: Cal
     np.testing.assert_array_equal(np.load("mask.npy"), hot)
     corrections = [parse_spec(f"{SPEC}{each.stdout.splitlines()[-1]}\n", directory=folder).corrections for each in done]
     assert list(map(len, corrections)) == [2, 1]
-    invoke("dark", "covered.yaml", "-o", "dark.npz", "--correct", "rot90", "--correct", "{crop: {rows: [0, 10]}}")
-    with np.load("dark.npz") as archive:
+    invoke("dark", "covered.yaml", "-o", "rotated.npz", "--correct", "rot90", "--correct", "{crop: {rows: [0, 10]}}")
+    with np.load("rotated.npz") as archive:
         assert archive["rates"].shape == (10, 24)
 
 
@@ -274,5 +274,5 @@ def test_convert_continues_after_interrupt(cube: Path, invoke: Callable[..., Any
 def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any]) -> None:
     """The old file stays open until the new one replaces it."""
     before = cube.read_bytes()
-    assert invoke("convert", "cube.npy", "cube.npy").exit_code == 0
+    assert invoke("convert", "cube.npy", "cube.npy", "--overwrite").exit_code == 0
     assert cube.read_bytes() == before
