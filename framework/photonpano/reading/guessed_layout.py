@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,9 @@ _WEIGHTS = np.unpackbits(np.arange(256, dtype=np.uint8)).reshape(256, 8) @ 4.0 *
 _CARRIES = 0.25
 _BLOCK = 8  # side of the blocks of frames, rows and columns that are correlated with their neighbours
 _TIMES_LONGER = 2  # the axis of the frames is more than twice as long as both of the image
+
+Eight: TypeAlias = Literal["pixels of a column", "pixels of a row", "frames"]
+_PACKED_AXES: tuple[Eight, ...] = get_args(Eight)  # the axis of an array whose last is that of the frames
 
 _MIN_LEAD = 4.0  # standard errors by which the correlation along the axis of the frames exceeds the others
 _MIDDLE = 1  # the channel of three that is chosen
@@ -141,44 +144,44 @@ def frames_are_last(samples: Sequence[NDArray[Any]], shape: Sequence[int]) -> bo
     return _last_is_longest(*shape) and _last_is_alike(samples, (_BLOCK, _BLOCK, _BLOCK))
 
 
-def packed_frames_are_last(
-    samples: Sequence[NDArray[np.uint8]], shape: Sequence[int], a_byte_holds: Literal["pixels", "frames"]
-) -> bool:
+def packed_frames_are_last(samples: Sequence[NDArray[np.uint8]], shape: Sequence[int], a_byte_holds: Eight) -> bool:
     """Return whether the last axis of an array of bytes is that of the frames: see `frames_are_last`.
 
     Args:
         samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, bytes of a row).
-        shape: that of the array.
-        a_byte_holds: whether a byte would hold eight pixels of a frame, or a pixel of eight frames.
+        shape: that of the array: (rows, bytes of a row, frames), (bytes of a column, columns, frames), or (rows, columns, bytes
+            of eight frames).
+        a_byte_holds: what the eight bits of a byte would be.
     """
-    first, second, last = shape
-    if a_byte_holds == "frames":
-        return _last_is_longest(first, second, 8 * last) and _last_is_alike(_lit(samples), (_BLOCK, _BLOCK, 1))
-    if not _last_is_longest(first, 8 * second, last):
+    axis = _PACKED_AXES.index(a_byte_holds)
+    lengths, block = list(shape), [_BLOCK] * 3
+    lengths[axis], block[axis] = 8 * shape[axis], 1
+    if not _last_is_longest(*lengths):
         return False
-    if _last_is_alike(_lit(samples), (_BLOCK, 1, _BLOCK)):
+    lit = [np.bitwise_count(each) for each in samples]
+    if a_byte_holds == "frames":
+        return _last_is_alike(lit, block)
+    # Bytes of eight pixels are less alike along the axis where they are packed, as they are 8 px apart there.
+    pixels = [_blocks(each, (1, 1, _BLOCK)) for each in lit]
+    if _correlation(pixels, axis) < _correlation(pixels, 1 - axis) and _last_is_alike(lit, block):
         return True
-    # The frames may move too fast for that. Then the second axis, where bytes are packed, is still an axis of the image.
-    other = other_order(samples)
+    # The frames may move too fast for that. Then the axis where bytes are packed is still an axis of the image.
+    other = other_order(samples if axis == 1 else [each.swapaxes(0, 1) for each in samples])
     return other is not None and other.order.packed_along == "height"
-
-
-def _lit(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
-    return [np.bitwise_count(each) for each in samples]
 
 
 def _last_is_longest(first: int, second: int, last: int) -> bool:
     return last > _TIMES_LONGER * max(first, second)
 
 
-def _last_is_alike(samples: Sequence[NDArray[Any]], block: tuple[int, int, int]) -> bool:
+def _last_is_alike(samples: Sequence[NDArray[Any]], block: Sequence[int]) -> bool:
     """Return whether neighbouring blocks of values correlate most along the last axis."""
     blocks = [_blocks(each, block) for each in samples]
     (first, _), (second, _), (last, number) = (_correlation(blocks, axis) for axis in range(3))
     return bool(first and second and last) and last - max(first, second) > _MIN_LEAD * math.sqrt(2 / number)
 
 
-def _blocks(frames: NDArray[Any], block: tuple[int, int, int]) -> NDArray[np.float64]:
+def _blocks(frames: NDArray[Any], block: Sequence[int]) -> NDArray[np.float64]:
     """Return the means of blocks of values: (n, rows, columns) becomes smaller by the sides of a block."""
     shape = [length // side for length, side in zip(frames.shape, block, strict=True)]
     cut = frames[tuple(slice(n * side) for n, side in zip(shape, block, strict=True))]

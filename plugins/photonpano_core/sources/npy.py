@@ -269,20 +269,24 @@ def _require_order(config: PackedNpyConfig) -> None:
         if content.holds == "sums":
             seen = f"neighbouring bytes are alike as numbers, up to {content.highest} in {content.n_values:,} sampled"
         raise InputError(f"{path} is not packed: {seen}; write {_section(path, content.holds, content.highest)}")
-    if packed_frames_are_last(samples, header.shape[:3], "pixels"):
-        raise _frames_last(path, header, "pixels", "numpy.moveaxis(numpy.load(path), -1, 0)")
+    frames_first = "numpy.moveaxis(numpy.load(path), -1, 0)"
+    if packed_frames_are_last(samples, header.shape[:3], "pixels of a row"):
+        raise _frames_last(path, header, "pixels of a row", f"save {frames_first} to another file")
+    if packed_frames_are_last(samples, header.shape[:3], "pixels of a column"):
+        remedy = f"save {frames_first} to another file and read that with packed_along: height"
+        raise _frames_last(path, header, "pixels of a column", remedy)
     if other := other_order(samples):
         keys = " and ".join(f"{key}: {value}" for key, value in _keys_of(other.order).items())
         raise InputError(f"{path} is packed in another order: {other}; write {keys}, or bit_order: big if it is right")
     if packed_frames_are_last(samples, header.shape[:3], "frames"):
         frames_first = "numpy.moveaxis(numpy.unpackbits(numpy.load(path), axis=-1), -1, 0)"
-        raise _frames_last(path, header, "frames", f"numpy.packbits({frames_first}, axis=-1)")
+        raise _frames_last(path, header, "frames", f"save numpy.packbits({frames_first}, axis=-1) to another file")
 
 
-def _frames_last(path: Location, header: NpyHeader, a_byte_holds: str, repacked: str) -> InputError:
+def _frames_last(path: Location, header: NpyHeader, a_byte_holds: str, remedy: str) -> InputError:
     return InputError(
         f"{path} has its frames along the last axis of {header.shape[:3]}, where values are most alike, and a byte holds eight "
-        f"{a_byte_holds}; save {repacked} to another file, or write bit_order: big if it is right"
+        f"{a_byte_holds}; {remedy}, or write bit_order: big if it is right"
     )
 
 
@@ -323,11 +327,12 @@ def _recognise_packed(path: Location) -> Recognised | None:
     samples = _samples(path, header, channel.keys.get("channel"))
     if not samples:
         return Recognised(keys, because)
-    if unpacked_content(samples) or packed_frames_are_last(samples, header.shape[:3], "pixels"):
+    shape = header.shape[:3]
+    if unpacked_content(samples) or any(packed_frames_are_last(samples, shape, f"pixels of a {line}") for line in ("row", "column")):
         return None
     if other := other_order(samples):
         return Recognised(keys | _keys_of(other.order), f"{because}, where {other}")
-    return None if packed_frames_are_last(samples, header.shape[:3], "frames") else Recognised(keys, because)
+    return None if packed_frames_are_last(samples, shape, "frames") else Recognised(keys, because)
 
 
 def _recognise_bits(path: Location) -> Recognised | None:

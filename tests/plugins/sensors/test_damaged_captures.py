@@ -59,6 +59,7 @@ LAYOUTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "packed-npy packed along the height": lambda frames: np.packbits(frames, axis=1),
     "packed-npy along the height, lowest bit first": lambda frames: np.packbits(frames, axis=1, bitorder="little"),
     "packed-npy with frames last": lambda frames: last(np.packbits(frames[:, :32, :48], axis=2)),
+    "packed-npy with frames last, packed along the height": lambda frames: last(np.packbits(frames[:, :32, :48], axis=1)),
     "packed-npy with frames last in bytes": lambda frames: np.packbits(np.moveaxis(frames, 0, -1), axis=-1),
     "npy with frames last": last,
 }

@@ -162,8 +162,9 @@ def test_order_of_packed_pixels_is_recognised(
         lambda frames: frames.reshape(12, 32, 64, 96).sum(axis=1).astype(np.uint8),
         lambda frames: frames.reshape(12, 32, 64, 96).sum(axis=1).astype(np.float32),
         lambda frames: np.ascontiguousarray(np.moveaxis(np.packbits(frames[:, :32, :48], axis=2), 0, -1)),
+        lambda frames: np.ascontiguousarray(np.moveaxis(np.packbits(frames[:, :32, :48], axis=1), 0, -1)),
     ],
-    ids=["sums", "floats", "packed, frames last"],
+    ids=["sums", "floats", "packed, frames last", "packed along the height, frames last"],
 )
 def test_other_layouts_are_not_recognised(tmp_path: Path, clouds: Callable[..., np.ndarray], stored: Callable) -> None:
     np.save(tmp_path / "cube.npy", stored(clouds()))

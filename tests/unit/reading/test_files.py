@@ -171,15 +171,16 @@ def test_last_axis_is_that_of_the_frames_where_values_are_most_alike(clouds: Cal
 def test_last_axis_of_packed_frames_is_found(clouds: Callable[..., np.ndarray]) -> None:
     frames = clouds(n_frames=1024)
     packed = np.packbits(frames, axis=2)
-    for holds in ("pixels", "frames"):
+    for axis, holds in enumerate(("pixels of a column", "pixels of a row", "frames")):
         assert not packed_frames_are_last([packed], packed.shape, holds)
-    for stored, holds in ((last(packed), "pixels"), (np.packbits(last(frames), axis=-1), "frames")):
+        stored = np.packbits(last(frames), axis=axis)
         assert packed_frames_are_last([stored], stored.shape, holds)
 
 
 def test_last_axis_of_fast_packed_frames_is_found_by_the_axis_that_is_packed(clouds: Callable[..., np.ndarray]) -> None:
-    stored = last(np.packbits(clouds(n_frames=1024)[::5, :, :32], axis=2))  # 1 px a frame
-    assert packed_frames_are_last([stored], stored.shape, "pixels")
+    frames = last(clouds(n_frames=1024)[::5, :, :32])  # 1 px a frame
+    stored = np.packbits(frames, axis=1)
+    assert packed_frames_are_last([stored], stored.shape, "pixels of a row")
 
 
 def test_wide_short_noise_has_its_frames_first() -> None:
