@@ -43,7 +43,13 @@ def _lines(found: RunCheck, *, strict: bool = False) -> Iterator[str]:
 
 
 @command("runs/first --strict", _lines)
-def check_run(run_folder: Path | str, progress: Progress | None = None, catalog: Catalog | None = None) -> RunCheck:
+def check_run(
+    run_folder: Path | str,
+    progress: Progress | None = None,
+    catalog: Catalog | None = None,
+    *,
+    capture: Path | str | None = None,
+) -> RunCheck:
     """Judge a finished run: render the panorama along its motion, and compare it with the photons of the capture.
 
     Writes nothing. The panorama is rendered with the scale of the frames, whatever that of the run was. What only the loop can
@@ -53,11 +59,12 @@ def check_run(run_folder: Path | str, progress: Progress | None = None, catalog:
         run_folder: written by `run`.
         progress: receives the stages; by default, bars in a notebook and nothing elsewhere.
         catalog: what can be chosen; by default what the installed plugins offer.
+        capture: the capture, if it is not where the run has read it: a file, a folder, or a URL.
 
     Raises:
         InputError: the folder is no run folder, its capture cannot be opened, or it is another capture now.
     """
-    with opened_run(Path(run_folder), catalog) as opened, one_thread_inside():
+    with opened_run(Path(run_folder), catalog, moved=capture) as opened, one_thread_inside():
         record, plan = opened.record, opened.plan
         context = Context(thread_count(plan.run.threads), usual(progress))
         copied = any(each["what"] == REPEATED for each in record.get("decisions", ()))

@@ -60,6 +60,8 @@ def evaluate(
     oracle: bool = True,
     progress: Progress | None = None,
     catalog: Catalog | None = None,
+    *,
+    capture: Path | str | None = None,
 ) -> Evaluation:
     """Score a run folder against the truth of its capture.
 
@@ -75,13 +77,14 @@ def evaluate(
         oracle: also render the capture along the true motion, and score that; opens the capture again.
         progress: receives the stages of that; by default, bars in a notebook and nothing elsewhere.
         catalog: what can be chosen; by default what the installed plugins offer.
+        capture: the capture, if it is not where the run has read it: a file, a folder, or a URL.
 
     Raises:
         InputError: a file is missing or damaged, or run and truth are not of the same capture.
     """
     if not oracle:
         return evaluate_folder(run_folder, truth)
-    with opened_run(Path(run_folder), catalog) as opened:
+    with opened_run(Path(run_folder), catalog, moved=capture) as opened:
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
             source, plan = opened.source, opened.plan

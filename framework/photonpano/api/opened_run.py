@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from photonpano.api.batching.sweeps import capture_override
 from photonpano.capture import seen_through
 from photonpano.contracts.protocols import Source
 from photonpano.corrections import Vignette, divided_by, read_vignette
@@ -17,6 +18,7 @@ from photonpano.corrections.movers import before_background_of
 from photonpano.errors import InputError, SpecError
 from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.evaluation import load_panorama as read_panorama
+from photonpano.files.paths import location
 from photonpano.geometry import FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import through_lens
@@ -56,8 +58,11 @@ def opened_run(
     catalog: Catalog | None = None,
     changes: Sequence[str] = (),
     output: Path | None = None,
+    moved: Path | str | None = None,
 ) -> Iterator[OpenedRun]:
     """Open a finished run and its capture, with changes of its spec such as `render.scale=2`.
+
+    `moved` is where the capture is now, if it is not where it was.
 
     Raises:
         InputError: the files are of several runs, or of none, or the capture cannot be opened or is another one now.
@@ -66,6 +71,8 @@ def opened_run(
     require_one_run(folder, ["trajectory.npz", "light.npz", "layers.npz", "vignette.npz"])
     run = load_run_trajectory(folder, needs_std_px=False)
     record = read_record(folder)
+    if moved is not None:
+        changes = [*changes, capture_override(location(moved))]
     with _capture(folder, record, catalog, changes, output) as (plan, capture):
         stream, n_frames, (height, width) = capture.info, len(run.homographies), run.frame_shape
         if (stream.n_frames, *stream.frame_shape) != (n_frames, height, width):
@@ -96,7 +103,10 @@ def _capture(
             if any(problem.override for problem in error.problems):
                 raise
             problems = "; ".join(f"{problem.where}: {problem.message}" for problem in error.problems)
-            raise InputError(f"{folder}: the capture of this run cannot be opened by its recorded spec ({problems})") from error
+            raise InputError(
+                f"{folder}: the capture of this run cannot be opened by its recorded spec ({problems}); if it was moved, name it "
+                "with --capture, or with --set source.with.path=PATH"
+            ) from error
         yield plan, source
 
 

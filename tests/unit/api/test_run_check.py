@@ -64,6 +64,16 @@ def test_check_run_doubts_other_photons_of_the_same_size(finished: Path) -> None
     assert any(reason.what.startswith("the panorama does not explain the photons") for reason in verdict.reasons)
 
 
+def test_check_run_opens_a_capture_that_was_moved(finished: Path) -> None:
+    verdict, cube = check_run(finished).verdict, finished.parent / "cube.npy"
+    moved = cube.rename(cube.with_name("moved.npy"))
+    assert error_of(finished).endswith("if it was moved, name it with --capture, or with --set source.with.path=PATH")
+    assert check_run(finished, capture=moved).verdict == verdict
+    np.save(moved, np.load(moved)[:, ::-1])
+    with pytest.raises(InputError, match="it is another capture"):
+        check_run(finished, capture=moved)
+
+
 def test_check_run_judges_recorded_contradictions(finished: Path) -> None:
     pair = {"moving": [0, 50], "fixed": [50, 100]}
     change(finished, lambda record: record["levels"][-1].update(pairs=10, contradictions=[pair, pair]))

@@ -27,6 +27,7 @@ _GIVEN = {"plan", "progress", "catalog", "resumed"}  # parameters without an opt
 _USUAL: dict[str, Any] = {
     "run_folder": typer.Argument(metavar="RUN", help="A run folder."),
     "output": typer.Option("--output", "-o", metavar="DIR"),
+    "capture": typer.Option(metavar="PATH"),
     "changes": typer.Option("--set", metavar="KEY=VALUE"),
     "strict": typer.Option(help="Exit with 1 if the verdict is doubtful."),
     "as_json": typer.Option("--json", help="Print JSON, for programs."),
