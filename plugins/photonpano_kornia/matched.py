@@ -144,7 +144,7 @@ class LoftrLocator:
         """Match and fit; see `photonpano.Locator`."""
         if min(moving.image.shape) < _SMALLEST_SIDE:
             height, width = moving.image.shape
-            return NotLocated(f"the images have {height} x {width} px, LoFTR needs at least {_SMALLEST_SIDE} along each side")
+            return NotLocated(f"the images have {height}x{width} px, LoFTR needs at least {_SMALLEST_SIDE} along each side")
         if not (moving.seen.any() and fixed.seen.any()):
             return NotLocated("all pixels are masked")
         with one_thread(), torch.inference_mode():

@@ -28,7 +28,7 @@ def undistorted(config: SimulationConfig, points: ArrayLike) -> FloatArray:
     ideal = camera(config).ideal(points)
     if np.isnan(ideal).any():
         raise InputError(
-            f"distortion folds the image of {config.frame_shape[1]}x{config.frame_shape[0]} px at the focal length of "
+            f"distortion folds the image of {config.frame_shape[0]}x{config.frame_shape[1]} px at the focal length of "
             f"{config.focal_length_px:g} px, so that nothing is imaged at its border; take smaller coefficients"
         )
     return ideal

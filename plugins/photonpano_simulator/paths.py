@@ -178,8 +178,8 @@ def _require_seen(rotations: FloatArray, ours: Camera, frame: FloatArray, scene_
     needed, reach = np.rad2deg(np.arcsin(min(1.0, steepest))), 180 * scene_shape[0] / scene_shape[1]
     if needed > reach + 1e-9:
         raise InputError(
-            f"the frames reach {needed:.1f} degrees above or below the horizon, but the scene of {scene_shape[1]}x"
-            f"{scene_shape[0]} px, which is 360 degrees wide, only {reach:.1f}; take a higher scene, or a smaller wobble"
+            f"the frames reach {needed:.1f} degrees above or below the horizon, but the scene of {scene_shape[0]}x"
+            f"{scene_shape[1]} px, which is 360 degrees wide, only {reach:.1f}; take a higher scene, or a smaller wobble"
         )
 
 
@@ -301,7 +301,7 @@ def _require_inside(homographies: FloatArray, frame: FloatArray, scene_shape: tu
     if worst[side].max() > 1e-6:
         progress = worst[side].argmax() / max(1, len(homographies) - 1)
         raise InputError(
-            f"the camera path leaves the scene of {width}x{height} px by {worst[side].max():.1f} px at the "
+            f"the camera path leaves the scene of {height}x{width} px by {worst[side].max():.1f} px at the "
             f"{('left', 'right', 'top', 'bottom')[side]}, {progress:.0%} of the way along; "
             "shorten or move the path, or take a larger scene"
         )

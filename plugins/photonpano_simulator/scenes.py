@@ -131,7 +131,7 @@ def photograph(path: Path, width: int | None = None, in_colour: bool = False) ->
         )
     if max(linear.shape[:2]) > _LARGEST:
         raise InputError(
-            f"{path} is {linear.shape[1]}x{linear.shape[0]} px; set scene.width so that no side exceeds {_LARGEST} px"
+            f"{path} is {linear.shape[0]}x{linear.shape[1]} px; set scene.width so that no side exceeds {_LARGEST} px"
         )
     return linear
 

@@ -154,7 +154,7 @@ class TravelConfig(Config):
                 f"take {_WIDEST * width:g} to {_NARROWEST * width:g} px"
             )
         if self.centre_px is not None and not (0 <= self.centre_px[0] < width and 0 <= self.centre_px[1] < height):
-            raise ValueError(f"centre_px {self.centre_px} lies outside the frame of {width}x{height} px")
+            raise ValueError(f"centre_px {self.centre_px} lies outside the frame of {height}x{width} px")
         if self.sensor.filters is not None:
             raise ValueError("sensor.filters: scenes with depth are grey; leave the colour filters out")
         return self

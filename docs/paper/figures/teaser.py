@@ -89,7 +89,7 @@ def claims(numbers: Numbers) -> list[Claim]:
         ),
         Claim(
             "a panorama from merely half a second",
-            f"{numbers['pixels'][1]} x {numbers['pixels'][0]} px from {numbers['milliseconds']:g} ms; corner error "
+            f"{numbers['pixels'][0]}x{numbers['pixels'][1]} px from {numbers['milliseconds']:g} ms; corner error "
             f"{numbers['mean_px']:g} px, {numbers['below_oracle_db']:z.1f} dB below the panorama along the true motion",
             numbers["below_oracle_db"] < 1,
         ),

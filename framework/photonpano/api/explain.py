@@ -107,7 +107,7 @@ def _forecast_lines(plan: Plan, source: Source) -> list[str]:
     memory, (height, width) = byte_size(found.memory_bytes), found.canvas
     return [
         f"forecast from a trial on {found.tried}: about {total} with {threads} ({each})",
-        f"memory: about {memory}, for a panorama of about {width} x {height} px if no place is seen twice",
+        f"memory: about {memory}, for a panorama of about {height}x{width} px if no place is seen twice",
     ]
 
 

@@ -193,7 +193,7 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
     bytes_per_pixel = (BYTES_PER_PIXEL + bytes_of_light(source)) * channels_of(source)
     if (needed := canvas.height * canvas.width * bytes_per_pixel) > memory:
         raise InputError(
-            f"{opened.folder}: a picture of {canvas.width} x {canvas.height} pixels takes {byte_size(needed)}, more than the "
+            f"{opened.folder}: a picture of {canvas.height}x{canvas.width} px takes {byte_size(needed)}, more than the "
             f"{byte_size(memory)} of run.memory; lower render.scale, or choose a part with render.extent"
         )
     tolerance_px = plan.render.tolerance_px

@@ -75,7 +75,7 @@ def plan_canvas(
         fitting = scale * np.sqrt(MAX_EXCESS / excess)
         digit = 10.0 ** (np.floor(np.log10(fitting)) - 1)  # two are significant; rounded down, the suggestion fits
         raise CanvasTooLargeError(
-            f"the panorama would have {canvas.width} x {canvas.height} pixels, {excess:.0f} times what fits into the "
+            f"the panorama would have {canvas.height}x{canvas.width} px, {excess:.0f} times what fits into the "
             f"{memory / 1024**3:.2g} GiB of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
             "More often means that the motion is wrong. Raise run.memory, "
             f"lower render.scale from {scale:g} to {np.floor(fitting / digit) * digit:g}, "

@@ -91,7 +91,7 @@ def _write_mp4(path: Path, pictures: Iterable[Picture], fps: float) -> None:
                 stream.height, stream.width = height, width = frame.shape[:2]
                 if max(height, width) > _MOST_H264_PX:
                     raise OutputError(
-                        f"cannot write an MP4 of {width} x {height} pixels: its sides hold up to {_MOST_H264_PX:,}; make them "
+                        f"cannot write an MP4 of {height}x{width} px: its sides hold up to {_MOST_H264_PX:,}; make them "
                         "smaller, or write PNGs to a folder"
                     )
             layout = "gray" if frame.ndim == 2 else "rgb24"

@@ -41,10 +41,10 @@ def _rows(record: RunRecord, place: Path) -> Iterator[tuple[str, str]]:
             yield "doubtful", str(reason)
     for warning in record["warnings"]:
         yield "warning", warning
-    yield "capture", f"{frames} of {source['height']} x {source['width']} pixels"
+    yield "capture", f"{frames} of {source['height']}x{source['width']} px"
     if panorama is not None:
         seen = share(panorama["coverage_share"])
-        yield "panorama", f"{panorama['height']} x {panorama['width']} pixels, of which {seen} were seen"
+        yield "panorama", f"{panorama['height']}x{panorama['width']} px, of which {seen} were seen"
     if motion is not None:
         yield "expected error", f"{pixels(motion['std_px'])} px, and {pixels(motion['worst_std_px'])} px in the worst frame"
     if poses is not None:

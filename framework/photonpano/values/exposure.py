@@ -78,7 +78,7 @@ class Panorama:
         """Show the flux in a notebook."""
         height, width = self.flux.shape[:2]
         seen = np.isfinite(self.flux)
-        rows = [("panorama", f"{height} x {width} pixels" + (", in colour" if self.flux.ndim == 3 else ""))]
+        rows = [("panorama", f"{height}x{width} px" + (", in colour" if self.flux.ndim == 3 else ""))]
         rows.append(("seen", share(float(seen.mean()))))
         if seen.any():
             rows += [

@@ -328,7 +328,9 @@ def _recognise_packed(path: Location) -> Recognised | None:
     if not samples:
         return Recognised(keys, because)
     shape = header.shape[:3]
-    if unpacked_content(samples) or any(packed_frames_are_last(samples, shape, f"pixels of a {line}") for line in ("row", "column")):
+    if unpacked_content(samples) or packed_frames_are_last(samples, shape, "pixels of a row"):
+        return None
+    if packed_frames_are_last(samples, shape, "pixels of a column"):
         return None
     if other := other_order(samples):
         return Recognised(keys | _keys_of(other.order), f"{because}, where {other}")

@@ -87,7 +87,7 @@ class LensView:
         ideal = camera.ideal(parts)
         if np.isnan(ideal).any():
             raise InputError(
-                f"distortion folds the image of {width}x{height} px at the focal length of {camera.focal_px:g} px, so that "
+                f"distortion folds the image of {height}x{width} px at the focal length of {camera.focal_px:g} px, so that "
                 "nothing is imaged at its border; take smaller coefficients"
             )
         low, high = (np.floor(each(ideal, axis=(0, 1))) for each in (np.min, np.max))

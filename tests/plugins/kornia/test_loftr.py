@@ -158,7 +158,7 @@ def test_matches_in_masked_areas_are_dropped(build: Callable, shot: Callable, mo
 def test_images_below_32_px_are_rejected(build: Callable, photograph: Callable) -> None:
     locator = build()
     tiny = locator.describe(photograph(np.full((20, 40), 0.5)))
-    assert locator.register(tiny, tiny, None).reason == "the images have 20 x 40 px, LoFTR needs at least 32 along each side"
+    assert locator.register(tiny, tiny, None).reason == "the images have 20x40 px, LoFTR needs at least 32 along each side"
     assert sum(each.nbytes for each in tiny) == 2 * 20 * 40
 
 

@@ -155,12 +155,12 @@ def test_path_of_one_frame(kind: str) -> None:
     [
         (
             {"kind": "pan", "length_px": 1600},
-            "the camera path leaves the scene of 2048x1365 px by 34.5 px at the left, 0% of the way along; "
+            "the camera path leaves the scene of 1365x2048 px by 34.5 px at the left, 0% of the way along; "
             "shorten or move the path, or take a larger scene",
         ),
         (
             {"kind": "pan", "centre": (1023.5, 1300)},
-            "the camera path leaves the scene of 2048x1365 px by 66.9 px at the bottom, 0% of the way along; "
+            "the camera path leaves the scene of 1365x2048 px by 66.9 px at the bottom, 0% of the way along; "
             "shorten or move the path, or take a larger scene",
         ),
         (
@@ -180,7 +180,7 @@ def test_impossible_paths_are_refused(path: dict[str, Any], message: str) -> Non
 def test_path_is_refused_if_the_distorted_frame_leaves_the_scene() -> None:
     path = {"kind": "pan", "length_px": 1500}
     assert homographies(path).shape == (2001, 3, 3)
-    with pytest.raises(InputError, match=r"leaves the scene of 2048x1365 px by 12\.2 px at the right"):
+    with pytest.raises(InputError, match=r"leaves the scene of 1365x2048 px by 12\.2 px at the right"):
         homographies(path, lens={"k1": -0.1})
 
 
@@ -217,7 +217,7 @@ def test_wrong_homography_files_are_refused(tmp_path: Path) -> None:
         assert str(caught.value) == message.format(path=path)
     behind = np.tile(translation(100, 100), (5, 1, 1))
     behind[:, 2, 0] = -0.01
-    with pytest.raises(InputError, match="leaves the scene of 2048x1365 px by inf px"):
+    with pytest.raises(InputError, match="leaves the scene of 1365x2048 px by inf px"):
         homographies({"kind": "file", "file": saved(tmp_path / "behind.npy", behind)}, 5)
     path = tmp_path / "other.npz"
     np.savez(path, scene=np.zeros(3))

@@ -86,7 +86,7 @@ def test_wrong_photographs_are_refused(tmp_path: Path) -> None:
     written(path, np.zeros((9, 9), np.uint8))
     assert_refused(f"{path} is black: no flux can be made of it; take another photograph", path)
     wide = written(tmp_path / "wide.png", np.ones((1, 20_000), np.uint8))
-    assert_refused(f"{wide} is 20000x1 px; set scene.width so that no side exceeds 16384 px", wide)
+    assert_refused(f"{wide} is 1x20000 px; set scene.width so that no side exceeds 16384 px", wide)
     floats = written(tmp_path / "floats.tiff", np.ones((9, 9, 3), np.float32))
     assert_refused(f"{floats} holds float32 values; a photograph has 8 or 16 bits: save it as PNG", floats)
 

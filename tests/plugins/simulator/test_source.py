@@ -48,7 +48,7 @@ def test_relative_paths_are_relative_to_the_spec(tmp_path: Path) -> None:
 def test_check_refuses_path_that_leaves_the_street() -> None:
     scene = {"kind": "street", "width": 800, "height": 600}
     assert problems(scene=scene, path={"kind": "pan", "length_px": 400, "shake": {}}, n_frames=1_000_000) == [
-        "the camera path leaves the scene of 800x600 px by 49.1 px at the right, 100% of the way along; "
+        "the camera path leaves the scene of 600x800 px by 49.1 px at the right, 100% of the way along; "
         "shorten or move the path, or take a larger scene"
     ]
     (problem,) = problems(path={"kind": "file", "file": "nowhere.npy"})

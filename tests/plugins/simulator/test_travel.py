@@ -104,7 +104,7 @@ def test_lens_bends_the_image(truth) -> None:
     ideal = bent.camera.ideal(np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), axis=-1)).astype(np.float32)
     expected, seen = cv2.remap(straight, ideal, None, cv2.INTER_LINEAR), sharp_view(bent, 0)
     assert np.std(seen - expected) < 0.1 * np.std(seen - straight)
-    with pytest.raises(InputError, match="distortion folds the image of 64x48 px"):
+    with pytest.raises(InputError, match="distortion folds the image of 48x64 px"):
         sharp_view(truth(scene, here, distortion=(-2, 0, 0, 0)), 0)
 
 
@@ -371,7 +371,7 @@ def test_wrong_paths_are_refused_before_anything_is_drawn(settings: dict[str, An
     [
         ({"focal_px": 5}, "focal_px of 5 does not fit frames 52 px wide; take 13 to 5200 px"),
         ({"focal_px": 9000}, "focal_px of 9000 does not fit frames 52 px wide; take 13 to 5200 px"),
-        ({"centre_px": (60, 20)}, "lies outside the frame of 52x40 px"),
+        ({"centre_px": (60, 20)}, "lies outside the frame of 40x52 px"),
         ({"sensor": {"filters": "rggb"}}, "scenes with depth are grey"),
         ({"path": {"kind": "travel", "degrees": 3}}, "Extra inputs"),
         ({"objects": [{"distance_m": 0}]}, "greater than or equal to 0.2"),

@@ -157,7 +157,7 @@ def test_pixels_have_an_area_before_a_finer_scene_all_around() -> None:
     [
         (
             {"scene": SCENE | {"height": 200}, "focal_length_px": 60},
-            "the frames reach 72.7 degrees above or below the horizon, but the scene of 512x200 px, which is 360 degrees wide, "
+            "the frames reach 72.7 degrees above or below the horizon, but the scene of 200x512 px, which is 360 degrees wide, "
             "only 70.3; take a higher scene, or a smaller wobble",
         ),
         (
@@ -167,7 +167,7 @@ def test_pixels_have_an_area_before_a_finer_scene_all_around() -> None:
         ),
         (
             {"distortion": {"k1": -1.5}},
-            "distortion folds the image of 96x64 px at the focal length of 80 px, so that nothing is imaged at its border; "
+            "distortion folds the image of 64x96 px at the focal length of 80 px, so that nothing is imaged at its border; "
             "take smaller coefficients",
         ),
     ],

@@ -33,7 +33,7 @@ def test_plan_canvas_refuses_canvas_far_beyond_memory(pan: Callable) -> None:
     with pytest.raises(CanvasTooLargeError) as caught:
         plan_canvas(pan(3960 / (N - 1), 4970 / (N - 1)), ALL, SHAPE, 10.0, 2 * GIB)
     assert str(caught.value) == (
-        "the panorama would have 40000 x 50000 pixels, 37 times what fits into the 2 GiB of run.memory; "
+        "the panorama would have 50000x40000 px, 37 times what fits into the 2 GiB of run.memory; "
         "up to 16 times is rendered in tiles. More often means that the motion is wrong. "
         "Raise run.memory, lower render.scale from 10 to 6.5, "
         "or choose a render.reference nearer to the middle of the motion"

@@ -60,7 +60,7 @@ def test_mp4_of_too_large_pictures_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError) as caught:
         write_pictures(tmp_path / "look.mp4", iter([np.zeros((16, 16_386), np.uint8)]), NAMES[:1], 24)
     assert str(caught.value) == (
-        "cannot write an MP4 of 16386 x 16 pixels: its sides hold up to 16,384; make them smaller, or write PNGs to a folder"
+        "cannot write an MP4 of 16x16386 px: its sides hold up to 16,384; make them smaller, or write PNGs to a folder"
     )
     assert list(tmp_path.iterdir()) == []
 
