@@ -35,9 +35,16 @@ class ExportedPoses:
     lambda found: [f"{found.n_frames:,} poses in {', '.join(map(str, found.files))}"],
     file_format=typer.Option("--format"),
     every=typer.Option(min=1, metavar="N"),
+    frame_rate_hz=typer.Option("--frame-rate", min=1e-6, metavar="HZ"),
 )
 def export(
-    run_folder: Path | str, file_format: PoseFormat, output: Path | str, every: int = 1, *, overwrite: bool = False
+    run_folder: Path | str,
+    file_format: PoseFormat,
+    output: Path | str,
+    every: int = 1,
+    *,
+    frame_rate_hz: float | None = None,
+    overwrite: bool = False,
 ) -> ExportedPoses:
     """Write the poses and the camera of a run for another program.
 
@@ -48,28 +55,31 @@ def export(
         file_format: "colmap" (a text model), "nerfstudio" (transforms.json) or "tum" (times and quaternions).
         output: the folder of the files.
         every: 1 for all located frames, 2 for every other, and so on.
+        frame_rate_hz: for the times of "tum", in Hz; by default that of the capture.
         overwrite: replace the poses that are there under this name.
 
     Raises:
         InputError: the folder is no run folder, the run knows no rotations, or no frame is located; for "tum", the frame rate
-            of the capture is not known.
+            is not known.
         OutputError: the folder is there already, or cannot be written.
-        ValueError: the format is not known, or `every` is below 1.
+        ValueError: the format is not known, `every` is below 1, or `frame_rate_hz` is not above 0.
     """
     if file_format not in POSE_FORMATS or every < 1:
         raise ValueError(
             f"file_format must be one of {', '.join(POSE_FORMATS)}, and every at least 1; got {file_format!r} and {every}"
         )
+    if frame_rate_hz is not None and not 0 < frame_rate_hz < np.inf:
+        raise ValueError(f"frame_rate_hz must be above 0, got {frame_rate_hz:g}")
     folder, output = Path(run_folder), Path(output)
     require_new(output, overwrite, [folder])
-    files = POSE_FORMATS[file_format](poses := _poses(folder, every, needs_seconds=file_format == "tum"))
+    files = POSE_FORMATS[file_format](poses := _poses(folder, every, frame_rate_hz, needs_seconds=file_format == "tum"))
     with atomic_folder(output) as written:
         for name, text in files.items():
             (written / name).write_text(text, encoding="utf-8")
     return ExportedPoses(tuple(output / name for name in files), len(poses.names))
 
 
-def _poses(folder: Path, every: int, needs_seconds: bool) -> Poses:
+def _poses(folder: Path, every: int, frame_rate_hz: float | None, needs_seconds: bool) -> Poses:
     require_one_run(folder, ["trajectory.npz", "poses.npz"])
     positions = None
     run: RunPoses | RunTrajectory
@@ -88,12 +98,9 @@ def _poses(folder: Path, every: int, needs_seconds: bool) -> Poses:
     frames = np.flatnonzero(run.located)[::every]
     if not len(frames):
         raise InputError(f"{folder}: the run located no frame, so that it has no poses")
-    rate = read_record(folder)["source"]["frame_rate_hz"]
+    rate = frame_rate_hz or read_record(folder)["source"]["frame_rate_hz"]
     if rate is None and needs_seconds:
-        raise InputError(
-            f"{folder} knows no frame rate, which the times of the format tum need; set source.with.frame_rate_hz and run "
-            "the spec again"
-        )
+        raise InputError(f"{folder} knows no frame rate, which the times of the format tum need; give it with --frame-rate")
     digits = len(str(len(run.located) - 1))
     names = tuple(f"frame_{frame:0{digits}}.png" for frame in frames.tolist())
     places = None if positions is None else positions[frames]
