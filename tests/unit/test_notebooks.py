@@ -186,7 +186,7 @@ def test_batch_shows_its_runs_and_its_summary(tmp_path: Path, monkeypatch: pytes
     html = BatchResult(tmp_path / "monday", (done, failed), ("levels",))._repr_html_()
     assert [re.findall(r"<t[dh][^>]*>([^<]*)</t[dh]>", row) for row in html.split("<tr>")[1:]] == [
         list(BatchRow.COLUMNS),
-        ["a &lt;b&gt;, levels=1", "trusted", "\N{EN DASH}", "\N{EN DASH}", "2,000", "\N{EN DASH}", "\N{EN DASH}", ""],
-        ["c, levels=1", "failed", *5 * ["\N{EN DASH}"], "too dark"],
+        ["a &lt;b&gt;, levels=1", "trusted", *3 * ["\N{EN DASH}"], "2,000", "\N{EN DASH}", "\N{EN DASH}", ""],
+        ["c, levels=1", "failed", *6 * ["\N{EN DASH}"], "too dark\nfor this"],
         ["summary", str(Path("monday", "summary.html"))],
     ]

@@ -33,7 +33,7 @@ from photonpano.files.locks import locked
 from photonpano.files.paths import Location
 from photonpano.notebooks import facts, from_here, table
 from photonpano.plugins.registry import discover
-from photonpano.record.batch_row import BatchRow
+from photonpano.record.batch_row import BatchRow, ranked
 from photonpano.specs.loading import read_spec
 from photonpano.text import columns, counted
 
@@ -46,7 +46,7 @@ class BatchResult:
 
     Attributes:
         directory: the folder of the batch, with a run folder for each capture, `summary.csv` and `summary.html`.
-        rows: a `BatchRow` for each run: captures in their order, each with all of its settings.
+        rows: a `BatchRow` for each run: captures in their order, the runs of each ranked as in the summary.
         keys: the swept keys of the spec.
     """
 
@@ -198,11 +198,15 @@ def run_batch(batch: Batch, jobs: int = 1, progress: Progress | None = None, *, 
             rows[:] = [replace(row, status="interrupted") if row.status in ("waiting", "running") else row for row in rows]
             write()
             raise
-    return BatchResult(directory, tuple(rows), batch.keys)
+    return BatchResult(directory, tuple(ranked(rows)), batch.keys)
 
 
 def _lines(result: BatchResult, *, strict: bool = False) -> Iterator[str]:
-    yield columns([BatchRow.COLUMNS, *(row.cells() for row in result.rows)])
+    table: list[Sequence[str]] = [BatchRow.COLUMNS]
+    for *cells, reason in (row.cells() for row in result.rows):
+        first, *others = reason.splitlines() or [""]
+        table += [[*cells, first], *([*("" for _ in cells), each] for each in others)]
+    yield columns(table)
     yield f"\nsummary   {result.directory / PAGE}"
     if result.failed:
         others = "; the others are done" if len(result.failed) < len(result.rows) else ""

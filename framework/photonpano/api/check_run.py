@@ -87,4 +87,4 @@ def check_run(
     recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
     reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NO_TURN)]
     judged = Verdict.of(reasons, verdict.residual_ratio, verdict.untested, verdict.notes)
-    return RunCheck(judged, tuple(unknown))
+    return RunCheck(replace(judged, reduced_chi2=verdict.reduced_chi2), tuple(unknown))

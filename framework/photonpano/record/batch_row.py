@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -24,6 +25,7 @@ def _percent(share: float) -> str:
 
 # The figures of a run by their attributes: the title of each, and how it is written.
 FIGURES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "reduced_chi2": ("chi-square", "{:.3f}".format),
     "expected_error_px": ("expected error", _px),
     "true_error_px": ("true error", _px),
     "psnr_db": ("PSNR", "{:.1f} dB".format),
@@ -48,6 +50,7 @@ class BatchRow:
         was_finished: whether the run was finished before, so that nothing was left to do.
         verdict: "trusted" or "doubtful"; None unless the run is done.
         reason: why it failed, is doubtful, or has no score; empty if there is nothing to say.
+        reduced_chi2: how well the panorama explains the photons, see `photonpano.Verdict`; None for poses.
         expected_error_px: expected corner error of the motion, in px of a frame; None for poses.
         true_error_px: mean corner error against the truth beside the capture, in px of a frame; None without a truth.
         psnr_db: of the panorama against the true scene, in dB; None without a true scene.
@@ -62,7 +65,17 @@ class BatchRow:
         thumbnail: the panorama as a data URI of a small JPEG; None without a panorama.
     """
 
-    COLUMNS: ClassVar = ("capture", "verdict", "expected error", "true error", "frames", "time", "memory", "reason")
+    COLUMNS: ClassVar = (
+        "capture",
+        "verdict",
+        "chi-square",
+        "expected error",
+        "true error",
+        "frames",
+        "time",
+        "memory",
+        "reason",
+    )
 
     name: str
     capture: Location
@@ -72,6 +85,7 @@ class BatchRow:
     was_finished: bool = False
     verdict: str | None = None
     reason: str = ""
+    reduced_chi2: float | None = None
     expected_error_px: float | None = None
     true_error_px: float | None = None
     psnr_db: float | None = None
@@ -92,13 +106,29 @@ class BatchRow:
         """Return what stands in each of the `COLUMNS` of a table; a dash where the run has no such figure."""
         expected = "expected_error_px" if self.expected_position_error is None else "expected_position_error"
         true = "true_error_px" if self.true_position_error is None else "true_position_error"
-        figures = (expected, true, "n_frames", "seconds", "peak_memory_bytes")
-        return [self.label, self.verdict or self.status, *map(self.figure, figures), self.reason.partition("\n")[0]]
+        figures = ("reduced_chi2", expected, true, "n_frames", "seconds", "peak_memory_bytes")
+        return [self.label, self.verdict or self.status, *map(self.figure, figures), self.reason]
 
     def figure(self, name: str) -> str:
         """Return one of the `FIGURES`, written with its unit; a dash where the run has none."""
         value = getattr(self, name)
         return "\N{EN DASH}" if value is None else FIGURES[name][1](value)
+
+
+def ranked(rows: Iterable[BatchRow]) -> list[BatchRow]:
+    """Order the runs of each capture, the best first: trusted before doubtful before others, then by their reduced chi-square.
+
+    The captures stay in their order.
+    """
+    captures: dict[str, list[BatchRow]] = {}
+    for row in rows:
+        captures.setdefault(row.name, []).append(row)
+
+    def place(row: BatchRow) -> tuple[int, float]:
+        chi2 = math.inf if row.reduced_chi2 is None else row.reduced_chi2
+        return ("trusted", "doubtful", None).index(row.verdict), chi2
+
+    return [row for runs in captures.values() for row in sorted(runs, key=place)]
 
 
 def written(value: Any) -> str:

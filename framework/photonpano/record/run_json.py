@@ -231,7 +231,8 @@ def verdict_of(found: VerdictRecord) -> Verdict:
     """Return the verdict that a record describes."""
     status: Literal["trusted", "doubtful"] = "trusted" if found["status"] == "trusted" else "doubtful"
     reasons, notes = (tuple(Reason(**each) for each in listed) for listed in (found["reasons"], found.get("notes", ())))
-    return Verdict(status, reasons, found["residual_ratio"], tuple(found.get("untested", ())), notes)
+    untested = tuple(found.get("untested", ()))
+    return Verdict(status, reasons, found["residual_ratio"], untested, notes, found.get("reduced_chi2"))
 
 
 def refinement_record(refinement: Refinement) -> RefinementRecord:

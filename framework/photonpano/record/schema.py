@@ -175,8 +175,10 @@ class VerdictRecord(TypedDict):
     `status` is "trusted" or "doubtful". `residual_ratio` is the scatter of the shifts of short spans of frames, in units of
     what noise explains: about 1 if nothing is left. None if there are too few frames to tell. Of poses it is the median
     distance of points from where exposures show them, in units of what photon noise explains, None where the pose estimator
-    does not know that noise. `untested` lists the tests that could not be made, and why, in clauses that begin with "whether";
-    `notes` is what was found, too, that is too small to make motion or panorama wrong.
+    does not know that noise. `reduced_chi2` is how well the panorama explains the photons of spans, without the share that they
+    have in it themselves: 1 where only photon noise is left; None for poses. `untested` lists the tests that could not be made,
+    and why, in clauses that begin with "whether"; `notes` is what was found, too, that is too small to make motion or panorama
+    wrong.
     """
 
     status: str
@@ -184,6 +186,7 @@ class VerdictRecord(TypedDict):
     residual_ratio: float | None
     untested: NotRequired[Sequence[str]]
     notes: NotRequired[Sequence[ReasonRecord]]
+    reduced_chi2: NotRequired[float | None]
 
 
 class LostFramesRecord(TypedDict):

@@ -125,6 +125,7 @@ def _rows(runs: Sequence[ComparedRun]) -> list[tuple[str, list[str]]]:
         row("verdict", part("verdict", "status"), str),
         row("expected error (px)", part("motion", "std_px"), pixels),
         row("scatter of short spans (noise = 1)", part("verdict", "residual_ratio"), pixels),
+        row("reduced chi-square of the photons (noise = 1)", part("verdict", "reduced_chi2"), "{:.3f}".format),
         row("levels", lambda run: len(run.record["levels"]), str),
         row("exposures of the last level", last("groups"), count),
         row("of these, located", last("located"), count),

@@ -6,6 +6,7 @@ A test is a function under `Tests.doubtful_above`; `judge` makes a `Reason` of w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,5 +34,6 @@ TESTS: tuple[Test[TestedRun], ...] = (*CAPTURE_TESTS, *RESIDUAL_TESTS, *MOTION_T
 
 def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
     """Test the result of a run; `levels` are empty if they are not known, `decisions` hold the share that stands still."""
-    ratio = explained.ratio if np.isfinite(explained.ratio) else None
-    return judged(TESTS, TestedRun(explained, levels, decisions), ratio)
+    figures = explained.ratio, float(explained.residuals.reduced_chi2.mean())
+    ratio, reduced_chi2 = (each if np.isfinite(each) else None for each in figures)
+    return replace(judged(TESTS, TestedRun(explained, levels, decisions), ratio), reduced_chi2=reduced_chi2)

@@ -48,6 +48,8 @@ class Verdict:
             the residuals of points in exposures; None if it is unknown.
         untested: which tests could not be made, and why: clauses that begin with "whether".
         notes: what else was found; it is too small to make the motion or the panorama wrong.
+        reduced_chi2: of the photons against the panorama, on average over the spans, without what a span adds to the panorama
+            itself; 1 if only photon noise is left. None for poses.
     """
 
     status: Literal["trusted", "doubtful"]
@@ -55,6 +57,7 @@ class Verdict:
     residual_ratio: float | None
     untested: tuple[str, ...] = ()
     notes: tuple[Reason, ...] = ()
+    reduced_chi2: float | None = None
 
     @classmethod
     def of(

@@ -82,6 +82,7 @@ def _finished(row: BatchRow, result: RunResult) -> BatchRow:
         was_finished=result.was_finished,
         verdict="doubtful" if doubts else "trusted",
         reason="\n".join(doubts),
+        reduced_chi2=result.verdict.reduced_chi2 if result.verdict else None,
         expected_error_px=motion["std_px"] if motion else None,
         expected_position_error=poses["std_position"] if poses else None,
         n_frames=record["source"]["n_frames"],

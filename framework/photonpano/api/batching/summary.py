@@ -10,7 +10,7 @@ from typing import Any
 
 from photonpano.errors import OutputError
 from photonpano.files.atomic import atomic_path
-from photonpano.record.batch_row import FIGURES, BatchRow, written
+from photonpano.record.batch_row import FIGURES, BatchRow, ranked, written
 from photonpano.report import render_batch
 
 TABLE, PAGE = "summary.csv", "summary.html"
@@ -24,7 +24,8 @@ def write_summary(
     common: Sequence[str],
     keys: Sequence[str],
 ) -> None:
-    """Write both files, each whole or not at all; for the arguments, see `render_batch`."""
+    """Write both files, each whole or not at all, with the runs `ranked`; for the arguments, see `render_batch`."""
+    rows = ranked(rows)
     page = render_batch(directory, rows, spec, common, keys)
     for name, text in ((TABLE, _table(directory, rows, keys)), (PAGE, page)):
         with atomic_path(directory / name, flushed=False) as temporary:

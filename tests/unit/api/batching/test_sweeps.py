@@ -311,6 +311,20 @@ def test_sweep_is_drawn_over_its_values(tmp_path: Path, n_captures: int, thin: i
     assert "true error (px)" in figure
 
 
+def test_runs_of_a_capture_are_ranked_by_how_well_they_explain_the_photons(tmp_path: Path) -> None:
+    found = {50: ("doubtful", 0.9), 25: ("trusted", 1.2), 100: ("trusted", 1.1), 200: (None, None)}
+    rows = [
+        row(name, tmp_path, {"size": size}, **DONE | {"verdict": verdict, "reduced_chi2": chi2, "expected_error_px": 1 / size})
+        for name in ("b", "a")
+        for size, (verdict, chi2) in found.items()
+    ]
+    table, page = summary(tmp_path, rows, ("size",))
+    assert [(each["name"], each["size"]) for each in table] == [
+        (name, size) for name in "ba" for size in ("100", "25", "50", "200")
+    ]
+    assert "ranked: trusted before doubtful, then by chi-square" in page
+
+
 def test_values_that_are_no_numbers_are_named_and_a_sweep_without_results_has_no_figure(tmp_path: Path) -> None:
     key = "locate.use"
     rows = [row("scan", tmp_path, {key: name}, **DONE) for name in ("direct", "opencv-sift")]
