@@ -160,9 +160,12 @@ class DynamicRange:
 
     @property
     def measurable_decibels(self) -> float | None:
-        """Range of flux that the mean number of frames over a pixel measures; None if none is measured."""
+        """Range of flux that the mean number of frames over a pixel measures; None if none is measured.
+
+        It is at least the range that was measured, to which pixels contribute that more frames saw, or with fewer dark counts.
+        """
         found = self.noise.measurable(self.frames / self.n_seen) if self.n_seen else None
-        return None if found is None else found.decibels
+        return None if found is None else max(found.decibels, self.decibels or 0.0)
 
     @property
     def saturated_share(self) -> float:

@@ -129,9 +129,9 @@ class PanoramaRecord(TypedDict):
 
     `picture_reduction` is the factor by which the PNG is smaller than the panorama, 1 unless that was rendered in tiles.
     `dynamic_range_db` is the ratio of the highest and the lowest flux that exceed their standard deviation, and
-    `measurable_range_db` what the mean number of frames over a pixel can measure, both None where nothing exceeds its noise;
-    `saturated_share` is the share of the seen pixels that were lit in every frame. `decisions` are the names of those that
-    renderer and exporters took.
+    `measurable_range_db` what the mean number of frames over a pixel can measure, or the former if that is more, both None
+    where nothing exceeds its noise; `saturated_share` is the share of the seen pixels that were lit in every frame. `decisions`
+    are the names of those that renderer and exporters took.
     """
 
     height: int

@@ -123,6 +123,16 @@ def test_dynamic_range_is_that_of_flux_above_its_noise(colours: int) -> None:
     assert found.measurable_decibels == pytest.approx(99.9, abs=0.1)
 
 
+def test_range_that_was_measured_can_be_measured() -> None:
+    """The flux of the darkest pixel exceeds its noise by more frames than the others have."""
+    flux, weight = image(1.0), image(100)
+    flux[0, 0], weight[0, 0] = 2e-7, 1e7
+    found = DynamicRange(CanvasNoise(BinaryResponse()))
+    found.add(flux, weight, 0, 0)
+    assert found.decibels == pytest.approx(20 * np.log10(5e6))
+    assert found.measurable_decibels == found.decibels
+
+
 def test_dynamic_range_of_nothing_is_unknown() -> None:
     found = DynamicRange(CanvasNoise(BinaryResponse()))
     found.add(image(np.nan), image(0), 0, 0)
