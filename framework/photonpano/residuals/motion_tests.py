@@ -9,7 +9,7 @@ import numpy as np
 from photonpano.geometry import corners, jacobian
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
 from photonpano.residuals.residual_tests import changing_places, grain
-from photonpano.residuals.tested_run import RIVAL, TestedRun, Tests
+from photonpano.residuals.tested_run import FIND_LENS, RIVAL, TestedRun, Tests
 from photonpano.values import Located, Reason
 from photonpano.values.verdict import Found
 
@@ -82,9 +82,7 @@ def contradictions(dropped: int, pairs: int) -> Reason | None:
     return _contradictions.reason(_contradicting(dropped, pairs))
 
 
-@MOTION_TESTS.doubtful_above(
-    3.0, NO_TURN, "write motion: {model: homography}, or find the lens with camera: {distortion: {k1: find}}"
-)
+@MOTION_TESTS.doubtful_above(3.0, NO_TURN, "write motion: {model: homography}")
 def _no_turn(run: TestedRun) -> Found | None:
     if not run.levels or run.levels[-1].located.solution.rotations is None:
         return None
@@ -94,7 +92,9 @@ def _no_turn(run: TestedRun) -> Found | None:
         return None
     residual, free = np.sqrt([evidence.rivals[each].chi2 for each in (name, "homography")]).tolist()
     where = f"residuals in units of their noise; those of any homographies are {free:.2g}"
-    return Found(residual, where, doubtful=not evidence.suffices(name))
+    camera = run.explained.motion.camera
+    what_to_do = "" if camera is not None and camera.distorts else f"write motion: {{model: homography}}, or {FIND_LENS}"
+    return Found(residual, where, not evidence.suffices(name), what_to_do)
 
 
 @MOTION_TESTS.doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")

@@ -10,7 +10,7 @@ from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import LensDistortion, deformation_px, lens_distortion
 from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
-from photonpano.residuals.tested_run import TestedRun, Tests
+from photonpano.residuals.tested_run import FIND_LENS, TestedRun, Tests
 from photonpano.values import BoolArray
 from photonpano.values.verdict import Found
 
@@ -165,6 +165,9 @@ def grain(run: TestedRun) -> Found | None:
     return Found(max(fine, 0.0) / max(coarse, 1e-9), "power of waves of 2 to 3 px, relative to those of 6 to 10 px")
 
 
+_WITHOUT_LENS = "undistort the frames before, or use their middle only (corrections: crop)"
+
+
 def distorting_lens(explained: Explained) -> LensDistortion | None:
     """Return the distortion that the residuals of a run show; None if it is not significant."""
     residuals, motion = explained.residuals, explained.motion
@@ -178,12 +181,17 @@ def distorting_lens(explained: Explained) -> LensDistortion | None:
     # Half of this is seen without a lens; even a small distortion bends a long path.
     LEAST_K1,
     "the lens distorts the frames, which bends the motion",
-    "write motion: {model: rotation} and camera: {distortion: {k1: find}} for a camera that only turns; or undistort the "
-    "frames before, or use their middle only (corrections: crop)",
+    f"write motion: {{model: rotation}} and {FIND_LENS} for a camera that only turns; or {_WITHOUT_LENS}",
 )
 def _lens(run: TestedRun) -> Found | None:
     found = distorting_lens(run.explained)
-    return None if found is None else Found(abs(found.k1), f"about {found.k1:.1%} at the corners")
+    if found is None:
+        return None
+    camera, what_to_do = run.explained.motion.camera, ""
+    if camera is not None:
+        distortion = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
+        what_to_do = f"{distortion}; or {_WITHOUT_LENS}"
+    return Found(abs(found.k1), f"about {found.k1:.1%} at the corners", what_to_do=what_to_do)
 
 
 @RESIDUAL_TESTS.doubtful_above(

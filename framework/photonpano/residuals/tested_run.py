@@ -11,6 +11,7 @@ from photonpano.residuals.refinement import Explained
 from photonpano.values import Decision
 from photonpano.values.verdict import Found, Test
 
+FIND_LENS = "camera: {distortion: {k1: find}}"  # what a spec says to measure the lens
 RIVAL = "rival_motion"  # name of the decision on a part of the frame that moves otherwise
 
 

@@ -73,15 +73,16 @@ class Verdict:
 
 
 class Found(NamedTuple):
-    """Figure of a test and where it occurs; `doubtful` overrides the threshold, and `harmless` makes a note of a doubt.
+    """Figure of a test and where it occurs.
 
-    Where the test could not be made, the figure is NaN, and `where` says why.
+    `doubtful` overrides the threshold, `what_to_do` the advice of the test; `harmless` makes a note of a doubt. Where the test could not be made, the figure is NaN, and `where` says why.
     """
 
     figure: float
     where: str = ""
     doubtful: bool = False
     harmless: bool = False
+    what_to_do: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +102,7 @@ class Test(Generic[Facts]):
         """Judge what was found; None if it is trusted, or not known."""
         if found is None or not (found.doubtful or found.figure > self.threshold):
             return None
-        return Reason(self.what, found.figure, self.threshold, found.where, self.what_to_do)
+        return Reason(self.what, found.figure, self.threshold, found.where, found.what_to_do or self.what_to_do)
 
     def judged(self, facts: Facts) -> Reason | None:
         """Make the test; None if what it finds is trusted, or not known."""
