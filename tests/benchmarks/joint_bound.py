@@ -84,7 +84,7 @@ class Model:
         grid = np.moveaxis(np.indices(shape, np.float64)[::-1], 0, -1)
         down, right = np.gradient(ours.ideal(grid), axis=(0, 1))
         area = np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]).ravel()
-        to_frame, there = np.linalg.inv(lens_at_corners(ours, shape)), _homogeneous(ours.ideal(corners(shape)))
+        to_frame, there = np.linalg.inv(ours.ideal_at_corners(shape)), _homogeneous(ours.ideal(corners(shape)))
         moved = np.concatenate([moves @ there, _shared(ours, shape, n_shared, corners(shape))])
         shared = _shared(ours, shape, n_shared, grid.reshape(-1, 2))
         return cls(shape, ours, moves, shared, area, slopes(to_frame @ there, to_frame @ moved))
@@ -103,12 +103,6 @@ def _shared(camera: Camera, shape: tuple[int, int], n_shared: int, points: Array
         x, y, z = changed.directions(points).T
         changes[index, :2] += (2 * sign - 1) * camera.focal_px * np.array([x / z, y / z]) / (2 * HALF_STEP)
     return changes
-
-
-def lens_at_corners(camera: Camera, shape: tuple[int, int]) -> Array:
-    """Return the homography from pixels of a frame to ideal pixels that is exact at its corners: (3, 3)."""
-    here = corners(shape)
-    return np.asarray(cv2.getPerspectiveTransform(here.astype(np.float32), camera.ideal(here).astype(np.float32)))
 
 
 def gradient(chance: Array, variance: Array, limited: bool) -> tuple[Array, Array]:
@@ -185,7 +179,7 @@ def corner_errors_px(known: Array, views: Array, model: Model, spline: Array) ->
     """
     n, k = len(views), len(model.moves)
     moved = np.hstack([np.kron(np.eye(n), model.corners[:, :k]), np.tile(model.corners[:, k:], (n, 1))]) @ spline
-    to_scene, here = views @ lens_at_corners(model.camera, model.shape), _homogeneous(corners(model.shape))
+    to_scene, here = views @ model.camera.ideal_at_corners(model.shape), _homogeneous(corners(model.shape))
     by_plane = np.linalg.inv(to_scene)[:, None] @ generators(model.shape) @ to_scene[:, None] @ here
     planes = np.linalg.qr(slopes(np.broadcast_to(here, (n, 3, 4)), by_plane).reshape(-1, 8))[0]
     # Numbers in units of their own information, as they differ by many orders of magnitude.

@@ -33,7 +33,6 @@ import cv2
 import numpy as np
 from harness import RATE_HZ, Study, chosen, command, middles, packed, passing, record_of, scores_of, simulator
 from harness import table as table_of
-from joint_bound import lens_at_corners
 from trust_captures import CUT_ROWS, FULL, SMALL, STREET_SHAPE, TINY, Row, Size, bases, before_photographs
 from trust_scores import Result, status, table
 
@@ -166,9 +165,8 @@ def figures_of(estimated: dict[str, np.ndarray], truth: Truth) -> Result:
 def figures_of_run(folder: Path, truth: Truth) -> Result:
     """Return the figures of a run, of where the corners of frames lie through the lens that it has found."""
     found = load_run_trajectory(folder)
-    lens = np.eye(3) if found.camera is None else lens_at_corners(found.camera, found.frame_shape)
     estimated = {name: getattr(found, name) for name in ("frame_shape", "located", "std_px")}
-    return figures_of(estimated | {"homographies": found.homographies @ lens}, truth)
+    return figures_of(estimated | {"homographies": found.corner_homographies}, truth)
 
 
 def scored(cube: Path, more: Callable[[Path], Result] = lambda _: {}) -> Result:

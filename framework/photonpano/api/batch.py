@@ -203,8 +203,9 @@ def run_batch(batch: Batch, jobs: int = 1, progress: Progress | None = None, *, 
 
 def _lines(result: BatchResult, *, strict: bool = False) -> Iterator[str]:
     table: list[Sequence[str]] = [BatchRow.COLUMNS]
-    for *cells, reason in (row.cells() for row in result.rows):
-        first, *more = reason.splitlines() or [""]
+    for row in result.rows:
+        *cells, reasons = row.cells()
+        first, *more = reasons.splitlines() or [""]
         table += [[*cells, first], *([*("" for _ in cells), each] for each in more)]
     yield columns(table)
     yield f"\nsummary   {result.directory / PAGE}"

@@ -47,7 +47,7 @@ class RunTrajectory:
     """Content of `trajectory.npz` in a run folder.
 
     Attributes:
-        homographies: (T, 3, 3), frame pixels to reference pixels.
+        homographies: (T, 3, 3), frame pixels to reference pixels; ideal pixels of the frame if the lens of `camera` distorts.
         canvas: (3, 3), reference pixels to panorama pixels; (a, b, 1) to panorama pixels unless the projection is planar.
         frame_shape: (height, width) of a frame.
         located: (T,), False where a frame lies outside what was located.
@@ -70,6 +70,11 @@ class RunTrajectory:
         """Return the canvas of the panorama, whose (height, width) is known."""
         matrix = None if self.camera is None or self.projection == "planar" else self.camera.matrix
         return Canvas(*shape, self.canvas, self.projection, matrix, self.horizon)
+
+    @property
+    def corner_homographies(self) -> FloatArray:
+        """(T, 3, 3), pixels of a frame to reference pixels, exact at the corners of the frame if the lens distorts."""
+        return self.homographies if self.camera is None else self.homographies @ self.camera.ideal_at_corners(self.frame_shape)
 
     @property
     def turn(self) -> Turn | None:

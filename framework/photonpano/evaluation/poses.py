@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
+from photonpano.evaluation.trajectory import of_focal_length
 from photonpano.geometry import Camera, nearest_rotations, rotation_vectors
 from photonpano.notebooks import facts
 from photonpano.reading import read_arrays
@@ -162,7 +163,7 @@ class PoseScore:
             shares = ", ".join(f"{100 * share:.1f} %" for share in self.honest_shares)
             rows += [("within 1, 2, 3 std_position", shares), ("error over std_position, rms", f"{self.std_ratio:.2f}")]
         if self.focal_error is not None:
-            rows.append(("focal length", f"{100 * self.focal_error:+.3f} %"))
+            rows.append(("focal length", of_focal_length(self.focal_error)))
         return rows
 
     def _repr_html_(self) -> str:

@@ -12,7 +12,14 @@ from photonpano.contracts.protocols import Trajectory
 from photonpano.errors import InputError
 from photonpano.evaluation.images import ImageScore, covered, image_score, known, true_panorama, white_flux
 from photonpano.evaluation.inputs import RunTrajectory, Truth, load_panorama, load_run_trajectory, load_truth
-from photonpano.evaluation.trajectory import RotationScore, TrajectoryScore, corner_errors, rotation_errors, turned_alignment
+from photonpano.evaluation.trajectory import (
+    RotationScore,
+    TrajectoryScore,
+    corner_errors,
+    of_focal_length,
+    rotation_errors,
+    turned_alignment,
+)
 from photonpano.geometry import Canvas, FrameTrajectory, inverse, scaled_ahead
 from photonpano.notebooks import facts
 from photonpano.record.contents import require_one_run
@@ -69,7 +76,7 @@ class Evaluation:
             rows += [
                 ("rotation error, mean", f"{rotation.mean_deg:.4f} degrees"),
                 ("rotation error, worst", f"{rotation.max_deg:.4f} degrees"),
-                ("focal length", f"{100 * rotation.focal_error:+.3f} %"),
+                ("focal length", f"{of_focal_length(rotation.focal_error)}, which the corner errors include"),
             ]
         for name, score in (("panorama", self.panorama), ("oracle", self.oracle)):
             if score is not None:
@@ -146,15 +153,15 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | 
 
 
 def _motion_scores(run: RunTrajectory, truth: Truth) -> tuple[TrajectoryScore, RotationScore | None]:
-    shape, located, found = run.frame_shape, run.located, run.turn
+    shape, located, found, estimated = run.frame_shape, run.located, run.turn, run.corner_homographies
     if found is not None and truth.turn is not None:
         start = turned_alignment(found, truth.turn, truth.ideal_homographies, located)
-        motion = corner_errors(run.homographies, truth.ideal_homographies, shape, located, start)
+        motion = corner_errors(estimated, truth.homographies, shape, located, start)
         return motion, rotation_errors(found, truth.turn, located)
     if not truth.around:
-        return corner_errors(run.homographies, truth.homographies, shape, located), None
+        return corner_errors(estimated, truth.homographies, shape, located), None
     # No plane before the camera holds a whole turn, but that of a located frame holds what the run located in a plane.
     places = np.flatnonzero(located)
     plane = truth.homographies[places[len(places) // 2]]
-    motion = corner_errors(run.homographies, scaled_ahead(np.linalg.inv(plane) @ truth.homographies), shape, located)
+    motion = corner_errors(estimated, scaled_ahead(np.linalg.inv(plane) @ truth.homographies), shape, located)
     return replace(motion, alignment=plane @ motion.alignment), None

@@ -78,6 +78,12 @@ class Turn:
     camera: Camera
 
 
+def of_focal_length(relative_error: float) -> str:
+    """Write the error of a focal length in words: "5.20 % too short"."""
+    percent = 100 * relative_error
+    return f"{abs(percent):.2f} % too {'long' if percent > 0 else 'short'}" if abs(percent) >= 0.005 else "right within 0.01 %"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RotationScore:
     """Errors of rotations after the best common rotation, and of the focal length.

@@ -86,6 +86,15 @@ class Camera:
             imaged = (away <= 1e-6) & (a * d > b * b) & ((found * seen).sum(axis=-1) >= 0)
         return self._in_px(np.where(imaged[..., None], found, np.nan))
 
+    def ideal_at_corners(self, frame_shape: tuple[int, int]) -> Homography:
+        """Return the homography from pixels of a frame to ideal pixels that is exact at its corners: (3, 3), h33 = 1."""
+        if not self.distorts:
+            return np.eye(3)
+        import cv2
+
+        seen = corners(frame_shape)
+        return np.asarray(cv2.getPerspectiveTransform(seen.astype(np.float32), self.ideal(seen).astype(np.float32)))
+
     def ideal_shift(self, points: ArrayLike, shift: FloatArray) -> FloatArray:
         """Return how (..., 2) ideal pixels move if their images in a frame move by a small (..., 2) shift, to first order."""
         if not self.distorts:

@@ -1,6 +1,7 @@
 """Scores of poses, and of a camera that turns all the way round against a scene all around it."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,8 @@ from typer.testing import CliRunner
 from photonpano import InputError, evaluate, evaluate_poses, evaluation
 from photonpano.api.cli.app import app
 from photonpano.evaluation import load_truth, pose_errors, true_panorama
-from photonpano.geometry import Camera, Canvas, rotation_matrices, translation
+from photonpano.evaluation.trajectory import of_focal_length
+from photonpano.geometry import Camera, Canvas, corners, rotation_matrices, translation
 
 N_FRAMES, RATE = 200, 1000.0
 MATRIX = np.array([[90.0, 0, 44.5], [0, 90, 29.5], [0, 0, 1]])
@@ -266,6 +268,24 @@ def test_evaluate_measures_rotation_and_focal_errors_over_located_frames(turn):
     assert score.rotation.focal_error == pytest.approx(0.01)
     # 0.1 degrees are 0.14 px; 1 % of the focal length shifts corners, which lie 54 px from the middle, by up to 0.5 px.
     assert 0.1 < score.trajectory.mean_px < 0.7
+
+
+def test_evaluate_compares_corners_through_the_lens_that_the_run_found(turn):
+    """The true lens is ideal: a run that finds a barrel has its corners elsewhere, though its ideal pixels are right."""
+    turn.camera = replace(turn.camera, distortion=np.array([-0.02, 0, 0, 0]))
+    turn.trajectory["distortion"] = turn.camera.distortion
+    turn.write()
+    score = evaluation.evaluate(turn.folder, turn.truth)
+    moved = np.linalg.norm(turn.camera.ideal(corners(SHAPE)) - corners(SHAPE), axis=-1).mean()
+    assert 0.3 * moved < score.trajectory.mean_px < 1.1 * moved
+    turn.true["undistorted_corners"] = turn.camera.ideal(corners(SHAPE))
+    turn.write()
+    assert evaluation.evaluate(turn.folder, turn.truth).trajectory.max_px < 1e-4
+
+
+def test_focal_length_is_compared_in_words():
+    found = [of_focal_length(error) for error in (-0.05199, 0.1, 4e-5)]
+    assert found == ["5.20 % too short", "10.00 % too long", "right within 0.01 %"]
 
 
 def test_evaluate_scores_homographies_of_part_of_a_turn(turn):
