@@ -94,7 +94,7 @@ def _no_turn(run: TestedRun) -> Found | None:
     where = f"residuals in units of their noise; those of any homographies are {free:.2g}"
     camera = run.explained.motion.camera
     what_to_do = "" if camera is not None and camera.distorts else f"write motion: {{model: homography}}, or {FIND_LENS}"
-    return Found(residual, where, not evidence.suffices(name), what_to_do)
+    return Found(residual, where, not evidence.suffices(name), what_to_do=what_to_do)
 
 
 @MOTION_TESTS.doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")

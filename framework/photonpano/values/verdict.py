@@ -75,7 +75,8 @@ class Verdict:
 class Found(NamedTuple):
     """Figure of a test and where it occurs.
 
-    `doubtful` overrides the threshold, `what_to_do` the advice of the test; `harmless` makes a note of a doubt. Where the test could not be made, the figure is NaN, and `where` says why.
+    `doubtful` overrides the threshold, `what_to_do` the advice of the test; `harmless` makes a note of a doubt. Where the test
+    could not be made, the figure is NaN, and `where` says why.
     """
 
     figure: float
