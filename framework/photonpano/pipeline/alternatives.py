@@ -15,7 +15,7 @@ from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
 from photonpano.residuals.motion_tests import of_either_part, second_place_px
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.residual_tests import LEAST_K1, distorting_lens
+from photonpano.residuals.residual_tests import distorting_lens
 from photonpano.residuals.tested_run import RIVAL, TestedRun
 from photonpano.values import Decision, FloatArray
 
@@ -38,9 +38,7 @@ def beside_alternatives(state: State, explained: Explained, decisions: Sequence[
     explained = _apart(explained, np.full(n_frames, np.hypot(jumps_px, second_place_px(run))))
     if (lens := distorting_lens(explained)) is not None:
         frames = np.linspace(located[0], located[-1], len(lens.bend_px))
-        # Half of the least distortion is seen without a lens.
-        beyond = max(abs(lens.k1) - LEAST_K1 / 2, 0)
-        explained = _apart(explained, np.interp(np.arange(n_frames), frames, beyond * lens.bend_px))
+        explained = _apart(explained, np.interp(np.arange(n_frames), frames, abs(lens.k1) * lens.bend_px))
     beside, rival = _beside_rival(state, explained)
     return (beside if rival or not of_either_part(run) else _apart(beside, np.full(n_frames, np.inf))), rival
 

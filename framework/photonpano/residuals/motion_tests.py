@@ -41,8 +41,11 @@ def _one_direction(run: TestedRun) -> Found | None:
     if located is None or not informed:
         return None
     middle = corners(located.frame_shape).mean(axis=0)[None]
-    slopes = np.array([jacobian(pair.homography, middle)[0] for pair in informed])
-    covariances = slopes @ np.linalg.pinv(np.array([pair.information for pair in informed])) @ slopes.transpose(0, 2, 1)
+    # Where nothing but shift and roll moves the image, the other parameters are known.
+    free = slice(4, 6) if located.solution.model.is_simple else slice(0, 8)
+    slopes = np.array([jacobian(pair.homography, middle)[0][:, free] for pair in informed])
+    information = np.array([pair.information for pair in informed])[:, free, free]
+    covariances = slopes @ np.linalg.pinv(information) @ slopes.transpose(0, 2, 1)
     variances, directions = np.linalg.eigh(np.median(covariances, axis=0))
     strong, weak = np.sqrt(np.maximum(variances, 0)).tolist()
     if weak < _ASLANT * strong:
