@@ -12,7 +12,7 @@ from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import Timeline
 from photonpano.residuals.refinement import Refinement
 from photonpano.text import listed
-from photonpano.values import FloatArray, FrameSpan, PoseEstimate, true_spans
+from photonpano.values import FrameSpan, PoseEstimate, true_spans
 
 # Expected corner error above which a warning names the frames: it is likely to be visible.
 UNCERTAIN_PX = 0.5
@@ -87,7 +87,7 @@ def timeline_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
 
 def motion_warnings(motion: FrameMotion, timeline: Timeline | None = None) -> list[str]:
     """Warn of frames whose motion is uncertain, that seem to be out of order, or that show the scene and are left out."""
-    warnings = [*uncertain_frames(motion.std_px), *_out_of_order(motion)]
+    warnings = [*uncertain_frames(motion), *_out_of_order(motion)]
     lost = ~motion.located if timeline is None else ~motion.located & timeline.shown
     if lost.any():
         n_left_out, n_frames = int(np.sum(lost)), len(lost)
@@ -106,9 +106,12 @@ def _out_of_order(motion: FrameMotion) -> list[str]:
     ]
 
 
-def uncertain_frames(std_px: FloatArray) -> list[str]:
-    """Warn of frames whose expected error, (T,) and infinite where nothing was located, exceeds `UNCERTAIN_PX`."""
+def uncertain_frames(motion: FrameMotion) -> list[str]:
+    """Warn of frames whose expected error exceeds `UNCERTAIN_PX`, or is not known."""
+    std_px = motion.std_px
     if not np.isfinite(std_px).any():
+        if np.ptp(motion.homographies, axis=0).any():
+            return ["how far the motion errs is not known: it may be that of the scene, or of something else; see the verdict"]
         return ["only one exposure was located, so no motion is known: its frames are summed without motion compensation"]
     uncertain = np.isfinite(std_px) & (std_px > UNCERTAIN_PX)
     if not uncertain.any():
