@@ -13,9 +13,10 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import UNCUT_JUMP
 from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
-from photonpano.residuals.motion_tests import of_either_part, second_place_px
+from photonpano.residuals.motion_tests import second_place_px
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.residual_tests import distorting_lens
+from photonpano.residuals.scene_tests import of_either_part
 from photonpano.residuals.tested_run import RIVAL, TestedRun
 from photonpano.values import Decision, FloatArray
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from photonpano.motion.timeline import INTERLACED, SHOTS, SHUFFLED
-from photonpano.residuals.tested_run import RIVAL, TestedRun, Tests
+from photonpano.residuals.tested_run import TestedRun, Tests
 from photonpano.values.verdict import Found
 
 CAPTURE_TESTS = Tests()
@@ -49,12 +49,3 @@ def _given_camera(run: TestedRun) -> Found | None:
     what, unit = [("a focal length", " px"), ("k1", "")][freed.number]
     where = f"{what} of {freed.found:.4g} ± {freed.std:.2g}{unit} fits, {freed.given:.4g}{unit} is given; in expected errors"
     return Found(abs(freed.found - freed.given) / freed.std, where)
-
-
-@CAPTURE_TESTS.doubtful_above(
-    1.0,
-    "parts of the frame follow another motion than the one that was found",
-    "mask what does not belong to the scene (corrections: mask); the motion may be that of either part",
-)
-def _two_motions(run: TestedRun) -> Found | None:
-    return run.decided(RIVAL)

@@ -8,7 +8,7 @@ import numpy as np
 
 from photonpano.geometry import corners, jacobian
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
-from photonpano.residuals.residual_tests import changing_places, grain
+from photonpano.residuals.scene_tests import of_either_part
 from photonpano.residuals.tested_run import FIND_LENS, RIVAL, TestedRun, Tests
 from photonpano.values import Located, Reason
 from photonpano.values.verdict import Found
@@ -16,7 +16,6 @@ from photonpano.values.verdict import Found
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
 NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
 _ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
-_EITHER = 0.25  # share of the frames that is left out, and of the panorama that changes, of which either may be the scene
 
 MOTION_TESTS = Tests()
 
@@ -114,42 +113,6 @@ def _ambiguous(run: TestedRun) -> Found | None:
 
 
 @MOTION_TESTS.doubtful_above(
-    0.5,
-    "more than half of the frame stands still while the rest moves",
-    "mask what stands in the frame (corrections: mask); the motion may be that of either part",
-)
-def _standing(run: TestedRun) -> Found | None:
-    return run.decided("standing_share", "share of the parts that show motion or rest")
-
-
-@MOTION_TESTS.doubtful_above(
-    0.5,
-    "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
-    "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
-)
-def _layers(run: TestedRun) -> Found | None:
-    # Later levels leave out what is near.
-    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
-    where = "share of the frames that is left out, on average"
-    if parallax:
-        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
-    if (found := run.decided("movers", where)) is None:
-        return None
-    # Where little is left out, but much changes that is not, what is left out may be the scene.
-    changing_share, _ = changing_places(run.explained.residuals)
-    return found._replace(doubtful=min(found.figure, changing_share) > _EITHER)
-
-
-@MOTION_TESTS.doubtful_above(
-    0.35,
-    "the background of much of the panorama was never seen, as where one thing fills the middle of all frames",
-    "record so that each place is seen without what hides it; the motion may be that of what fills the frames",
-)
-def _never_seen(run: TestedRun) -> Found | None:
-    return run.decided("background_never_seen", "share of the panorama")
-
-
-@MOTION_TESTS.doubtful_above(
     0,
     "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
     "leave these frames out, or keep the light on",
@@ -166,11 +129,6 @@ def _jump_in_the_dark(run: TestedRun) -> Found:
 )
 def _uncut_jump(run: TestedRun) -> Found | None:
     return run.decided(UNCUT_JUMP)
-
-
-def of_either_part(run: TestedRun) -> bool:
-    """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
-    return any(test.judged(run) for test in (_standing, _layers, grain))
 
 
 def second_place_px(run: TestedRun) -> float:

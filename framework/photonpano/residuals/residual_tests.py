@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
-from photonpano.geometry import corners, transform_points
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import LensDistortion, deformation_px, lens_distortion
 from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
@@ -21,9 +19,6 @@ _HARMLESS_CONTRAST, _HARMLESS_SHARE = 0.05, 0.1
 LEAST_K1 = 0.002  # radial distortion from which a run is doubtful
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
-_STILL_PX = 1.0  # an image that moves by less over the capture stands still
-_SMOOTH_PX = 8.0  # standard deviation of the Gaussian that takes the light of the scene out of its image
-_FINE, _COARSE = (0.35, 0.5), (0.1, 0.17)  # cycles per pixel
 
 RESIDUAL_TESTS = Tests()
 
@@ -139,30 +134,6 @@ def _hot_pixels(run: TestedRun) -> Found:
     excess = np.abs(run.explained.residuals.pixel_gain - 1) * predicted
     outlier = known & (excess > _STANDARD_DEVIATIONS * np.sqrt(predicted) + 5) & (excess > 0.5 * predicted)
     return Found(float(outlier.sum() / max(known.sum(), 1)), f"{int(outlier.sum())} pixels")
-
-
-@RESIDUAL_TESTS.doubtful_above(
-    0.5,
-    "the image stands still, and has the fine grain of a sensor whose pixels differ",
-    "divide by a flat field (corrections: flat-field); what was found to stand still may be the sensor, and not the scene",
-)
-def grain(run: TestedRun) -> Found | None:
-    """Look for the sensor in an image that stands still."""
-    residuals, motion = run.explained.residuals, run.explained.motion
-    middle = corners(residuals.frame_shape).mean(axis=0)
-    places = transform_points(motion.homographies[motion.located], middle[None])[:, 0]
-    if np.ptp(places, axis=0).max() > _STILL_PX:
-        return None
-    # A lens blurs what it images, so that waves of two or three pixels are weak; the grain of pixels is white.
-    counts = np.nan_to_num(residuals.pixel_gain * residuals.pixel_mean)
-    image = counts / np.maximum(ndimage.gaussian_filter(counts, _SMOOTH_PX), 1e-9)
-    window = np.outer(*(np.hanning(size + 2)[1:-1] for size in image.shape))
-    power = np.abs(np.fft.rfft2(window * (image - np.average(image, weights=window)))) ** 2 / (window**2).sum()
-    sums = residuals.blocks[..., [V, M]].sum(axis=(0, 1))
-    noise = sums[0] / max(sums[1], 1e-9) / max(float(counts.mean()), 1e-9)
-    cycles = np.hypot(np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1]))
-    fine, coarse = (float(power[(low < cycles) & (cycles < high)].mean()) - noise for low, high in (_FINE, _COARSE))
-    return Found(max(fine, 0.0) / max(coarse, 1e-9), "power of waves of 2 to 3 px, relative to those of 6 to 10 px")
 
 
 _WITHOUT_LENS = "undistort the frames before, or use their middle only (corrections: crop)"

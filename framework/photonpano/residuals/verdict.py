@@ -1,4 +1,4 @@
-"""The verdict on a run: a table of tests of the capture, the residuals and the motion, each with a known rate of false alarms.
+"""The verdict on a run: a table of tests, each with a known rate of false alarms.
 
 A test is a function under `Tests.doubtful_above`; `judge` makes a `Reason` of what it found if that exceeds the threshold.
 """
@@ -15,6 +15,7 @@ from photonpano.residuals.capture_tests import CAPTURE_TESTS
 from photonpano.residuals.motion_tests import MOTION_TESTS, NO_TURN, REPEATS, contradictions
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.residual_tests import MAX_CONTRAST, RESIDUAL_TESTS, changing_places
+from photonpano.residuals.scene_tests import SCENE_TESTS
 from photonpano.residuals.tested_run import TestedRun
 from photonpano.values import Decision, Verdict
 from photonpano.values.verdict import Test, judged
@@ -29,7 +30,7 @@ __all__ = [
     "judge",
 ]
 
-TESTS: tuple[Test[TestedRun], ...] = (*CAPTURE_TESTS, *RESIDUAL_TESTS, *MOTION_TESTS)  # the most telling first
+TESTS: tuple[Test[TestedRun], ...] = (*CAPTURE_TESTS, *SCENE_TESTS, *RESIDUAL_TESTS, *MOTION_TESTS)  # the most telling first
 
 
 def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
