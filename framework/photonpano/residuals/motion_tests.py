@@ -15,6 +15,7 @@ from photonpano.values.verdict import Found
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
 NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
+_UNCERTAIN_PX = 1.0
 _ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
 
 MOTION_TESTS = Tests()
@@ -54,7 +55,7 @@ def _one_direction(run: TestedRun) -> Found | None:
     return Found(weak, f"px, the error of a pair at {angle} degrees from x towards y; {strong:.2g} px across")
 
 
-@MOTION_TESTS.doubtful_above(1.0, "the expected error of the motion is large", "use more light")
+@MOTION_TESTS.doubtful_above(_UNCERTAIN_PX, "the expected error of the motion is large", "use more light")
 def _uncertain(run: TestedRun) -> Found | None:
     motion = run.explained.motion
     known = motion.std_px[motion.located]
@@ -63,7 +64,11 @@ def _uncertain(run: TestedRun) -> Found | None:
     if not len(known) or not np.isfinite(known).all() or alternatives:
         return None
     worst = int(np.argmax(np.where(motion.located, motion.std_px, 0)))
-    return Found(float(known.mean()), f"px on average, most at frame {worst}")
+    where, change_px = f"px on average, most at frame {worst}", run.levels[-1].change_px if run.levels else None
+    if change_px is not None and change_px > _UNCERTAIN_PX:
+        where += f"; the last level changed the motion by {change_px:.2g} px"
+        return Found(float(known.mean()), where, what_to_do="let it converge: use smaller groups, or levels: until-converged")
+    return Found(float(known.mean()), where)
 
 
 @MOTION_TESTS.doubtful_above(

@@ -227,6 +227,7 @@ def level_with(
     evidence: Evidence | None = None,
     n_ambiguous: int = 0,
     motion: Located = UNINFORMED,
+    change_px: float | None = None,
     **of_solution: object,
 ) -> Any:
     """A level of 30 pairs."""
@@ -236,7 +237,7 @@ def level_with(
     solution = SimpleNamespace(**known | of_solution)
     edges = (Edge(1, 0, motion),) * 30
     located = SimpleNamespace(ambiguity=ambiguity, evidence=evidence, edges=edges, solution=solution, frame_shape=SHAPE)
-    return SimpleNamespace(level=SimpleNamespace(number=1), located=located)
+    return SimpleNamespace(level=SimpleNamespace(number=1), located=located, change_px=change_px)
 
 
 @pytest.mark.parametrize(("rotation", "gain", "doubtful"), [(1.2, 1.1, False), (25.0, 3.0, True), (4.0, 40.0, True)])
@@ -346,6 +347,18 @@ def test_motion_along_an_edge_is_doubtful(explained: Explained, angle: int, alon
 @pytest.mark.parametrize(("n_pairs", "where"), [(2, []), (3, ["3 of 30 pairs of level 1, 40 px away"])])
 def test_level_is_ambiguous_from_three_pairs_on(explained: Explained, n_pairs: int, where: list[str]) -> None:
     assert [reason.where for reason in judge(explained, [level_with(n_ambiguous=n_pairs)]).reasons] == where
+
+
+@pytest.mark.parametrize(
+    ("change_px", "what_to_do"), [(None, "use more light"), (0.9, "use more light"), (6.4, "let it converge")]
+)
+def test_error_of_motion_that_has_not_converged_is_not_for_want_of_light(
+    explained: Explained, change_px: float | None, what_to_do: str
+) -> None:
+    uncertain = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + 3))
+    [reason] = judge(uncertain, [level_with(change_px=change_px)]).reasons
+    assert reason.what_to_do.startswith(what_to_do)
+    assert ("changed the motion by 6.4 px" in reason.where) == (change_px == 6.4)
 
 
 def test_contradicting_pairs_are_doubtful_above_a_tenth() -> None:
