@@ -149,3 +149,19 @@ def test_kept_exposures_lie_where_the_panorama_shows_them(kept: Any) -> None:
 
     assert alike(3, 3) > 0.9
     assert alike(3, 3) > alike(3, 5) + 0.05
+
+
+def test_run_whose_time_is_over_ends_with_the_motion_known_by_then(run: Callable[..., Any]) -> None:
+    result = run("run.time_limit=0.000001")
+    assert len(result.record["levels"]) == 1
+    [decision] = [each for each in result.record["decisions"] if each["what"] == "time_limit"]
+    assert decision["value"].startswith("further levels, corrections")
+    assert [warning for warning in result.record["warnings"] if "are left out, since 1e-06 s were over" in warning]
+    assert not [each for each in run("run.time_limit=9999").record["warnings"] if "run.time_limit" in each]
+
+
+def test_poses_have_no_time_limit(small_spec: dict[str, Any]) -> None:
+    posed = {"pose": {"use": "colmap-averages"}, "camera": {"focal_px": 200}, "run": {"time_limit": 60}}
+    kept = {key: small_spec[key] for key in ("version", "source")}
+    with pytest.raises(photonpano.SpecError, match=r"run\.time_limit: a pose estimator cannot end early; remove it"):
+        parse_spec(kept | posed)

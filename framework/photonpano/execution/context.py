@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
@@ -108,6 +110,22 @@ class KeepNothing:
         return self
 
 
+@dataclass(slots=True, eq=False)
+class TimeLimit:
+    """The time after which a run begins nothing that it can do without."""
+
+    ends: float = math.inf  # by `time.perf_counter`
+    left_out: list[str] = field(default_factory=list)
+
+    def leaves_out(self, what: str) -> bool:
+        """Return whether the time is over, and remember what is left out then."""
+        if time.perf_counter() < self.ends:
+            return False
+        if what not in self.left_out:
+            self.left_out.append(what)
+        return True
+
+
 @dataclass(frozen=True, slots=True)
 class Context:
     """How a computation runs; its result does not depend on it."""
@@ -118,6 +136,7 @@ class Context:
     on_level: Callable[[Any], object] = lambda _: None
     checkpoints: Checkpoints = field(default_factory=KeepNothing)  # keep what is found, for the case of an interruption
     executor: Executor = field(default_factory=LocalExecutor)
+    time_limit: TimeLimit = field(default_factory=TimeLimit)
 
     def in_order(self, work: Callable[[ItemT], ResultT], items: Iterable[ItemT]) -> Iterator[ResultT]:
         """Yield the results of `work` in the order of the items, in tasks of the executor: see `threads.in_order`."""

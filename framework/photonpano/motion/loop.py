@@ -89,6 +89,8 @@ def estimate_motion(
     results: list[LevelResult] = []
     timeline = timeline or Timeline.regular(source.info.n_frames)
     for level in levels:
+        if results and context.time_limit.leaves_out("further levels"):
+            break
         clock = Stopwatch(context.threads)
         model = replace(model.knowing(camera_of_motion(previous)), layered=capture_of(source).background is not None)
         groups = timeline.parts(resample(level, source.info.n_frames, clock))

@@ -68,6 +68,8 @@ def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decisio
         passes.cut_at_jumps,
     )
     for each in tried:
+        if context.time_limit.leaves_out("further levels, corrections"):
+            break
         state = passes.tried(state, each).state
     journal += [*state.decisions, *state.timeline.decisions, *_model_decisions(plan, state.results)]
     return state

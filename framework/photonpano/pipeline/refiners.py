@@ -43,7 +43,7 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Expla
     refinements = []
     for place, refiner in enumerate(refiners):
         before, rounds, kept_out = state.motion, list[str](), ""
-        while len(rounds) < MAX_ROUNDS:
+        while len(rounds) < MAX_ROUNDS and not state.context.time_limit.leaves_out("refinements"):
             each = partial(_corrected, refiner=refiner, place=place, number=len(rounds) + 1)
             state, accepted, summary, worse = tried(state, each)
             if not accepted:

@@ -24,12 +24,14 @@ from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_steps import BegunRun, begun_run
 from photonpano.pipeline.shots import run_others
 from photonpano.record.run_json import record_of
+from photonpano.record.run_warnings import TIME_LIMIT
 from photonpano.record.schema import RunRecord
 from photonpano.report import LiveFigures, OpenCapture, render_report
 from photonpano.report.notebook import run_html
 from photonpano.residuals.verdict import judge
 from photonpano.specs.plan import Plan
-from photonpano.values import Verdict
+from photonpano.text import listed
+from photonpano.values import Decision, Verdict
 
 END_AFTER_S = 5.0  # default time without a new frame after which a followed capture is complete
 
@@ -123,6 +125,8 @@ def make_panorama(run: BegunRun) -> None:
         with naming_obstacles(run.source, journal):
             state = estimate(plan, run.source, journal, context)
         state, explained = refine(state, build_refiners(plan, state.view.source, journal))
+        if left_out := context.time_limit.left_out:
+            journal.append(Decision(TIME_LIMIT, listed(left_out), f"left out, since {plan.run.time_limit:g} s were over"))
         if (background := capture_of(state.source).background) is not None:
             journal.append(decision_of(background))
         explained, others = beside_alternatives(state, explained, journal)

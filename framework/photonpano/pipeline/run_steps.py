@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -14,7 +15,7 @@ from photonpano.capture import capture_of
 from photonpano.compiling import notify_on_first_compile
 from photonpano.contracts.protocols import Source
 from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError, PhotonpanoError, PluginError
-from photonpano.execution.context import Context, Progress
+from photonpano.execution.context import Context, Progress, TimeLimit
 from photonpano.execution.threads import one_thread_inside
 from photonpano.files.atomic import atomic_path
 from photonpano.motion.loop import LevelResult
@@ -78,7 +79,8 @@ class BegunRun:
             self.levels.append(result)
             self.observers.level_finished(result)
 
-        context = Context(progress=self.progress, on_level=on_level)
+        limit = TimeLimit(self.start + (self.plan.run.time_limit or math.inf))
+        context = Context(progress=self.progress, on_level=on_level, time_limit=limit)
         return context if self.work is None else replace(context, checkpoints=self.work.checkpoints)
 
     def started_record(self) -> RunRecord:

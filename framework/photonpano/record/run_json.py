@@ -18,7 +18,13 @@ from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.loop import LevelResult, converges
 from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
 from photonpano.record.fingerprint import CaptureRecord
-from photonpano.record.run_warnings import level_warnings, motion_warnings, refinement_warnings, timeline_warnings
+from photonpano.record.run_warnings import (
+    level_warnings,
+    motion_warnings,
+    refinement_warnings,
+    time_warnings,
+    timeline_warnings,
+)
 from photonpano.record.schema import (
     CameraRecord,
     DecisionRecord,
@@ -59,6 +65,7 @@ def record_of(
         "refinements": [refinement_record(each) for each in explained.refinements],
         "verdict": verdict_record(verdict),
         "warnings": [
+            *time_warnings(started["decisions"]),
             *timeline_warnings(timeline, plan.output.directory),
             *level_warnings(levels),
             *motion_warnings(motion, timeline),

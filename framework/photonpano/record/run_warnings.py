@@ -10,6 +10,7 @@ import numpy as np
 from photonpano.motion.frame_motion import FrameMotion, frames_displaced
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import Timeline
+from photonpano.record.schema import DecisionRecord
 from photonpano.residuals.refinement import Refinement
 from photonpano.text import listed
 from photonpano.values import FrameSpan, PoseEstimate, true_spans
@@ -19,6 +20,7 @@ UNCERTAIN_PX = 0.5
 SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst first
 
 DOUBTFUL = "doubtful: "  # begins the warnings that are doubts
+TIME_LIMIT = "time_limit"  # name of the decision on what was left out
 _MANY_COPIES = 0.25  # share of the frames from which a warning names them
 _SHOWN_LOST = 3  # spans of lost frames that a warning names
 
@@ -51,6 +53,12 @@ def level_warnings(results: Sequence[LevelResult]) -> list[str]:
                 f"dropped ({first}{' and others' if len(dropped) > 1 else ''})"
             )
     return warnings
+
+
+def time_warnings(decisions: Sequence[DecisionRecord]) -> list[str]:
+    """Warn of what was left out of a run whose time was over."""
+    found = [each for each in decisions if each["what"] == TIME_LIMIT]
+    return [f"{each['value']} are {each['reason']} (run.time_limit): the motion may not have converged" for each in found]
 
 
 def other_shots(shots: Sequence[FrameSpan], directory: Path) -> dict[Path, FrameSpan]:

@@ -55,7 +55,7 @@ _TURNING = ("rotation", "auto")  # the models that may find that a camera turns
 
 def check_settings(found: dict[str, Any], posed: bool, spec: Spec) -> None:
     """Check the settings of each section, None where they have problems, against each other; problems go to the spec."""
-    motion, camera, output, render = (found[name] for name in ("motion", "camera", "output", "render"))
+    motion, camera, output, render, run = (found[name] for name in ("motion", "camera", "output", "render", "run"))
     if motion is not None and camera is not None:
         _check_camera(motion, camera, posed, spec)
     if output is not None and output.exposures and not posed:
@@ -64,6 +64,8 @@ def check_settings(found: dict[str, Any], posed: bool, spec: Spec) -> None:
     if output is not None and output.keep is not None and posed:
         message = "exposures are those of the levels of a panorama; remove it, or write exposures: true"
         spec.wrong(spec.root.at("output", "keep"), message)
+    if run is not None and run.time_limit is not None and posed:
+        spec.wrong(spec.root.at("run", "time_limit"), "a pose estimator cannot end early; remove it")
     if (
         motion is not None
         and render is not None

@@ -183,6 +183,12 @@ class RunSettings(Config):
         description="memory for rendering the panorama; a larger panorama is rendered in parts, and one of more than "
         "16 times this size is an error",
     )
+    time_limit: float | None = Field(
+        None,
+        gt=0,
+        description="seconds after which no further level, correction or refinement of the motion begins: the panorama is made "
+        "along the motion that is known by then, and a warning says what was left out; none without it",
+    )
 
 
 VERSION = 1
