@@ -15,8 +15,8 @@ from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
 from photonpano.residuals.motion_tests import second_place_px
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.residual_tests import distorting_lens
-from photonpano.residuals.scene_tests import of_either_part
+from photonpano.residuals.residual_tests import changing_places, distorting_lens
+from photonpano.residuals.scene_tests import MUCH, of_either_part
 from photonpano.residuals.tested_run import RIVAL, TestedRun
 from photonpano.values import Decision, FloatArray
 
@@ -52,11 +52,15 @@ def _apart(explained: Explained, distances_px: FloatArray) -> Explained:
 def _beside_rival(state: State, explained: Explained) -> tuple[Explained, list[Decision]]:
     """Look for a second motion in short spans of frames, where the motion does not explain parts of the frame.
 
-    Nobody can know from the frames which motion is that of the scene. Where a span shows a single motion, that counts.
+    Nobody can know from the frames which motion is that of the scene. If much of the panorama changes, the motion of the spans
+    counts, too, where these show a single one.
     """
     share = float((np.nan_to_num(explained.residuals.block_chi2) > _MISFIT).mean())
     start = starting_motion(before(state.source, None), state.results[0].groups, state.context) if share > _LEAST else None
     if start is None:
+        return explained, []
+    shows = bool(np.isfinite(start.rivals).all(axis=1).mean() >= _KNOWN)
+    if not shows and changing_places(explained.residuals)[0] <= MUCH:
         return explained, []
     motion = explained.motion
     apart = np.stack([start.velocities, start.rivals]) - _velocities(motion, start.instants, start.reach)
@@ -67,7 +71,7 @@ def _beside_rival(state: State, explained: Explained) -> tuple[Explained, list[D
     away = travelled[:, :2, 2] - travelled[motion.located][:, :2, 2].mean(axis=0)
     distances_px = np.linalg.norm(away, axis=1)
     explained = _apart(explained, distances_px)
-    if np.isfinite(start.rivals).all(axis=1).mean() < _KNOWN:
+    if not shows:
         return explained, []
     mean_px = float(distances_px[motion.located].mean())
     reason = f"px on average between both; {share:.0%} of the frame is not explained by the motion that was found"

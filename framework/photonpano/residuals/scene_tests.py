@@ -14,7 +14,7 @@ from photonpano.values.verdict import Found
 _STILL_PX = 1.0  # an image that moves by less over the capture stands still
 _SMOOTH_PX = 8.0  # standard deviation of the Gaussian that takes the light of the scene out of its image
 _FINE, _COARSE = (0.35, 0.5), (0.1, 0.17)  # cycles per pixel
-_EITHER = 0.25  # share of the frames that is left out, and of the panorama that changes, of which either may be the scene
+MUCH = 0.25  # share of the frames that is left out, or of the panorama that changes, which may be the scene
 
 SCENE_TESTS = Tests()
 
@@ -75,7 +75,7 @@ def _layers(run: TestedRun) -> Found | None:
         return None
     # Where little is left out, but much changes that is not, what is left out may be the scene.
     changing_share, _ = changing_places(run.explained.residuals)
-    return found._replace(doubtful=min(found.figure, changing_share) > _EITHER)
+    return found._replace(doubtful=min(found.figure, changing_share) > MUCH)
 
 
 @SCENE_TESTS.doubtful_above(
