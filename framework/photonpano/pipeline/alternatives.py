@@ -59,7 +59,8 @@ def _beside_rival(state: State, explained: Explained) -> tuple[Explained, list[D
     start = starting_motion(before(state.source, None), state.results[0].groups, state.context) if share > _LEAST else None
     if start is None:
         return explained, []
-    shows = bool(np.isfinite(start.rivals).all(axis=1).mean() >= _KNOWN)
+    known = np.isfinite(start.rivals).all(axis=1)
+    shows = bool(known.mean() >= _KNOWN)
     if not shows and changing_places(explained.residuals)[0] <= MUCH:
         return explained, []
     motion = explained.motion
@@ -67,7 +68,9 @@ def _beside_rival(state: State, explained: Explained) -> tuple[Explained, list[D
     speeds = np.nan_to_num(np.linalg.norm(apart, axis=-1))
     farther = np.take_along_axis(apart, speeds.argmax(axis=0)[None, :, None], axis=0)[0]
     differs = speeds.max(axis=0) * start.reach > _DIFFERENT_PX
-    travelled = replace(start, velocities=np.where(differs[:, None], farther, 0.0)).at(np.arange(len(motion.std_px)))
+    counted = known if shows else np.ones_like(known)
+    velocities = np.where(differs[:, None], farther, 0.0)[counted]
+    travelled = replace(start, instants=start.instants[counted], velocities=velocities).at(np.arange(len(motion.std_px)))
     away = travelled[:, :2, 2] - travelled[motion.located][:, :2, 2].mean(axis=0)
     distances_px = np.linalg.norm(away, axis=1)
     explained = _apart(explained, distances_px)
