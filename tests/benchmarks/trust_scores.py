@@ -47,7 +47,7 @@ CAUSES: dict[str, tuple[str, ...]] = {
     "missing": ("missing",),
     "jump": ("missing", "jump"),
     "doubled": ("doubled",),
-    "object": ("move by themselves",),
+    "object": ("move by themselves", "another motion"),
     "light": ("light",),
     "parallax": ("depth",),
     "repeat": ("repeat",),

@@ -59,23 +59,6 @@ def _shaking(run: TestedRun) -> Found | None:
     return Found(shaking.size_px, where) if shaking.size_px else None
 
 
-@RESIDUAL_TESTS.doubtful_above(
-    1.1,
-    "the panorama does not explain the photons: they differ from its prediction by more than their noise",
-    "look at the maps of the report; the motion may be wrong, or the scene changes",
-)
-def _photons(run: TestedRun) -> Found | None:
-    residuals = run.explained.residuals
-    reduced_chi2 = float(residuals.reduced_chi2.mean())
-    sums = residuals.blocks.sum(axis=(0, 1))
-    per_span = sums / max(len(residuals.spans), 1)
-    n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
-    # The squared residual of a block beyond its variance, as a part of its photons.
-    contrast = float(np.sqrt(max(reduced_chi2 - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
-    where, harmless = f"on average by {contrast:.0%} of the light", contrast <= _HARMLESS_CONTRAST
-    return Found(reduced_chi2, where, harmless=harmless) if contrast > MAX_CONTRAST else None
-
-
 def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
     """Return the share of the panorama that changes over time by more than noise explains, and its squares of 16 px: (h, w)."""
     counted = residuals.cell_count >= _MIN_BLOCKS
@@ -173,6 +156,24 @@ def _lens(run: TestedRun) -> Found | None:
 def _deformation(run: TestedRun) -> Found | None:
     size = deformation_px(*run.explained.residuals.block_shifts())
     return None if size is None else Found(size, "px, over the frame")
+
+
+# After those that name a cause.
+@RESIDUAL_TESTS.doubtful_above(
+    1.1,
+    "the panorama does not explain the photons: they differ from its prediction by more than their noise",
+    "look at the maps of the report; the motion may be wrong, or the scene changes",
+)
+def _photons(run: TestedRun) -> Found | None:
+    residuals = run.explained.residuals
+    reduced_chi2 = float(residuals.reduced_chi2.mean())
+    sums = residuals.blocks.sum(axis=(0, 1))
+    per_span = sums / max(len(residuals.spans), 1)
+    n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
+    # The squared residual of a block beyond its variance, as a part of its photons.
+    contrast = float(np.sqrt(max(reduced_chi2 - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
+    where, harmless = f"on average by {contrast:.0%} of the light", contrast <= _HARMLESS_CONTRAST
+    return Found(reduced_chi2, where, harmless=harmless) if contrast > MAX_CONTRAST else None
 
 
 def _box(cells: BoolArray, unit: str) -> str:
