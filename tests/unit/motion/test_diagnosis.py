@@ -47,13 +47,14 @@ def require(
     contrast: Contrast = CLEAR,
     disconnected: Literal["error", "largest"] = "error",
     reason: str = "3 matches, fewer than min_inliers = 12 (80 and 91 keypoints)",
+    foreseen: int = N,
 ) -> None:
-    """Check a chain of ten exposures; every pair of a lost one failed."""
+    """Check a chain of ten exposures, the first `foreseen`; every pair of a lost one failed."""
     found, failed = Located(np.eye(3)), NotLocated(reason)
     edges = [Edge(later, later - 1, failed if {later, later - 1} & set(lost) else found) for later in range(1, N)]
     tied = np.array([0 if index not in lost else 1 + index for index in range(N)])
     contrasts = {index: contrast if index in lost else CLEAR for index in range(N)}
-    require_tied(2, GROUPS, edges, tied, contrasts, disconnected)
+    require_tied(2, GROUPS, edges, tied, contrasts, disconnected, foreseen=np.arange(N) < foreseen)
 
 
 @pytest.mark.parametrize(
@@ -68,6 +69,11 @@ def test_require_tied_accepts_two_lost_exposures_in_a_row_or_the_largest_part(
 ) -> None:
     require(lost, disconnected=disconnected)
     require_tied(1, GROUPS[:1], [], np.array([0]), {0: CLEAR}, "error")
+
+
+def test_exposures_that_the_level_before_has_lost_may_be_lost_again() -> None:
+    require((6, 7, 8, 9), foreseen=6)
+    assert "so that frames 600 to 999 cannot be tied to the rest" in refusal((6, 7, 8, 9), foreseen=7)
 
 
 def refusal(*args: Any, **kwargs: Any) -> str:

@@ -54,3 +54,10 @@ def test_pan_has_no_rival(run_with: Callable) -> None:
     result, _, std_px = run_with([])
     assert RIVAL not in [each["what"] for each in result.record["decisions"]]
     assert std_px.mean() < 0.2
+
+
+def test_error_is_not_known_where_most_of_the_frame_stands_still(run_with: Callable) -> None:
+    result, _, std_px = run_with([{"size": (0.95, 0.95), "seed": 1}])
+    assert result.verdict.reasons[0].what == "more than half of the frame stands still while the rest moves"
+    assert np.isinf(std_px).all()
+    assert result.record["motion"] is None

@@ -47,3 +47,13 @@ def test_frames_that_jump_along_the_motion_alone_seem_to_be_out_of_order(times: 
     assert [each.startswith("the image jumps back and forth along its motion") for each in motion_warnings(motion)] == [
         True
     ] * warns
+
+
+@pytest.mark.parametrize(
+    ("px", "begins"), [(0.2, "how far the motion errs is not known"), (0.0, "only one exposure was located")]
+)
+def test_error_that_is_not_known_is_a_warning(px: float, begins: str) -> None:
+    homographies = np.array([translation(px * frame, 0) for frame in range(100)])
+    known = np.ones(100, np.bool_), np.full(100, np.inf), 50, (64, 96)
+    [warning] = motion_warnings(FrameMotion(FrameTrajectory(homographies), FrameSpan(0, 100), homographies, *known))
+    assert warning.startswith(begins)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from photonpano import FrameSpan
 from photonpano.geometry import Camera
@@ -283,13 +282,6 @@ def test_advice_is_not_what_the_run_does_already(
     assert found == {"the lens distorts the frames, which bends the motion": lens, NO_TURN: turn}
 
 
-@pytest.mark.parametrize(("what", "most"), [("movers", 0.5), ("background_never_seen", 0.35)])
-def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained, what: str, most: float) -> None:
-    """A thing that fills the middle of all frames passes for the scene, and what is seen beside it for what hides that."""
-    found = [judge(explained, (), [Decision(what, share, "")]).reasons for share in (most - 0.02, most + 0.02)]
-    assert [[reason.figure for reason in reasons] for reasons in found] == [[], [most + 0.02]]
-
-
 def test_little_that_changes_or_differs_is_a_note(explained: Explained) -> None:
     residuals = explained.residuals
     cells = residuals.cell_chi2.copy()
@@ -300,13 +292,6 @@ def test_little_that_changes_or_differs_is_a_note(explained: Explained) -> None:
     moving, photons = verdict.notes
     assert photons.finding.endswith("than their noise (on average by 4% of the light): 1.2")
     assert moving.finding.endswith("(mostly x 160 to 256, y 32 to 96 in px of the panorama): 0.08")
-
-
-def test_a_third_that_is_left_out_may_be_the_scene_if_as_much_of_the_rest_changes(explained: Explained) -> None:
-    changing = replace(explained.residuals, cell_chi2=np.full_like(explained.residuals.cell_chi2, 9))
-    verdicts = [judge(each, (), [Decision("movers", 0.33, "")]) for each in (explained, replace(explained, residuals=changing))]
-    named = [[reason.what.startswith("much of what the frames show") for reason in verdict.reasons] for verdict in verdicts]
-    assert named == [[], [True, False]]
 
 
 def test_things_that_pass_the_background_tell_how_far_the_camera_travels(explained: Explained) -> None:
@@ -387,20 +372,6 @@ def test_decisions_are_doubtful(explained: Explained, decisions: list[Decision],
     [reason] = judge(explained, (), decisions).reasons
     assert (reason.figure, reason.where) == (figure, where)
     assert not judge(explained, (), [Decision("standing_share", 0.4, "")]).reasons
-
-
-@pytest.mark.parametrize(("grain", "moves_px", "doubtful"), [(1, 0, True), (0, 0, False), (1, 3, False)])
-def test_image_that_stands_still_is_doubtful_if_it_has_the_grain_of_a_sensor(
-    explained: Explained, grain: float, moves_px: float, doubtful: bool
-) -> None:
-    rng = np.random.default_rng(1)
-    pattern = grain * rng.normal(0, 0.1, SHAPE) + 3 * ndimage.gaussian_filter(rng.normal(0, 0.3, SHAPE), 3)
-    homographies = explained.motion.homographies.copy()
-    homographies[:, 0, 2] = np.linspace(0, moves_px, N_FRAMES)
-    residuals = replace(explained.residuals, pixel_mean=np.float32(1000 * np.clip(1 + pattern, 0.1, 2)))
-    still = replace(explained, motion=replace(explained.motion, homographies=homographies), residuals=residuals)
-    whats = [reason.what for reason in judge(still, ()).reasons]
-    assert ("the image stands still, and has the fine grain of a sensor whose pixels differ" in whats) is doubtful
 
 
 def test_several_reasons_are_listed_in_the_order_of_the_table(explained: Explained) -> None:

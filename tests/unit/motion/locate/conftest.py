@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import Group, Located, NotLocated, Trajectory
+from photonpano import FrameSpan, Group, Located, NotLocated, Trajectory
 from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import inverse, translation
@@ -28,9 +28,16 @@ def source(memory_source: type) -> Any:
 
 @pytest.fixture
 def run(source: Any) -> Callable[..., LocatedLevel]:
-    def run(level: Level, previous: Trajectory | None = None, graph: GraphSettings = CHAIN, threads: int = 2) -> LocatedLevel:
+    def run(
+        level: Level,
+        previous: Trajectory | None = None,
+        graph: GraphSettings = CHAIN,
+        threads: int = 2,
+        known: FrameSpan | None = None,
+    ) -> LocatedLevel:
         groups = level.resampler.groups(N_FRAMES, level.number)
-        return locate(VirtualExposures(level, source, groups, previous, Stopwatch(threads)), graph, Context(threads))
+        exposures = VirtualExposures(level, source, groups, previous, Stopwatch(threads), known=known)
+        return locate(exposures, graph, Context(threads))
 
     return run
 

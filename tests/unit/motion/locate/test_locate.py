@@ -197,3 +197,28 @@ def test_hypotheses_that_are_no_homographies_are_refused(run: Callable, hypothes
     made.locators[0].component.hypotheses = lambda *_: repeat(hypothesis)
     with pytest.raises(PluginError, match=r"^locator 'toy' of toys 1\.0 broke its contract at level 1: a homography is a "):
         run(made, graph=GraphSettings())
+
+
+class Overlapping:
+    """Groups of 20 frames, each of which shares half of its frames with the next."""
+
+    def groups(self, n_frames: int, level: int) -> list[Group]:
+        return [Group(FrameSpan(start, start + 20), start + 9.5) for start in range(0, n_frames - 19, 10)]
+
+
+@pytest.mark.parametrize(("apart_fail", "n_located"), [(False, 11), (True, 7)])
+def test_shared_frames_do_not_locate_exposures_beyond_the_motion_known_so_far(
+    run: Callable, make_level: Callable, pan: Callable, apart_fail: bool, n_located: int
+) -> None:
+    """Their noise is shared, too, and agrees with any motion that both exposures were merged along."""
+
+    def answer(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
+        apart = moving.span.start >= fixed.span.stop
+        return NotLocated("no texture") if apart_fail and apart and moving.reference > 75 else found
+
+    level = make_level(answer=answer, resampler=Overlapping())
+    found = run(level, pan(0.25), known=FrameSpan(0, 75))
+    assert found.n_located == n_located
+    reasons = {edge.motion.reason for edge in found.failures if edge.moving == edge.fixed + 1}
+    assert reasons == {"the exposures share frames, and were merged along a motion that is not known there"}
+    assert run(level, pan(0.25), known=FrameSpan(0, 120)).n_located == 11
