@@ -20,7 +20,7 @@ from pictures import movers, scan, scenes, street, tremor
 
 PICTURES = {
     "readme levels interpolation": street.pictures,
-    "first-panorama baselines hot-pixels": scan.pictures,
+    "first-panorama uncertainty baselines hot-pixels": scan.pictures,
     "tremor video": tremor.pictures,
     "what-moves action-shot": movers.pictures,
     "real-world": movers.real_world,

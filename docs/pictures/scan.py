@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import picture_parts as draw
+import tifffile
 from harness import EXAMPLES, Study
 
 from photonpano import FrameSpan, load_panorama, load_spec, open_source, run
@@ -21,7 +23,9 @@ def pictures(study: Study) -> Iterator[tuple[str, draw.Picture]]:
     """Yield each picture with its name."""
     capture = study.capture("capture", study.spec("pipelines/capture"))
     path = {"source.with.path": str(capture.absolute())}
-    yield "first-panorama.png", draw.picture(load_panorama(study.run("scan", study.spec("pipelines/scan", path))).flux, 0.67)
+    scan = study.run("scan", study.spec("pipelines/scan", path))
+    yield "first-panorama.png", draw.picture(load_panorama(scan).flux, 0.67)
+    yield "uncertainty.png", uncertainty(scan)
     unrefined = path | {"refine": []}  # a refiner would mend most of what the methods have lost
     runs = {name: finished(study, name, study.spec(f"pipelines/{name}", unrefined), capture) for name in WAYS}
     panoramas = {f"{name}.yaml": load_panorama(folder) for name, folder in runs.items()}
@@ -31,6 +35,23 @@ def pictures(study: Study) -> Iterator[tuple[str, draw.Picture]]:
         places[name] = draw.magnified(draw.picture(draw.around(panorama.flux, (x, y), (54, 54)), 0.67), 3)
     yield "baselines.png", draw.beside(draw.all_labelled(places))
     yield "hot-pixels.png", hot_pixels(study)
+
+
+def uncertainty(folder: Path) -> draw.Picture:
+    """Return the panorama of a run, its standard deviation, and the ratio of both."""
+    flux, std = load_panorama(folder).flux, tifffile.imread(folder / "panorama-std.tiff")
+    figure, panels = draw.panels(11, 2.6, columns=3)
+    maps = {
+        "flux": (flux, "gray"),
+        "standard deviation": (std, "magma"),
+        "flux in standard deviations": (flux / std, "viridis"),
+    }
+    for panel, (name, (image, colours)) in zip(panels, maps.items(), strict=True):
+        shown = panel.imshow(image, colours, vmin=0, vmax=float(np.nanquantile(image, 0.99)))
+        panel.set_title(name, fontsize=10)
+        panel.set_axis_off()
+        figure.colorbar(shown, ax=panel, shrink=0.8)
+    return draw.in_bgr(figure)
 
 
 def hot_pixels(study: Study) -> draw.Picture:

@@ -98,9 +98,11 @@ def measured(name: str, n_frames: int, seed: int, rms_px: float, dark: float, st
             return seen(scene, motion[index], SHAPE).astype(np.float64)
 
         true_motion = found_motion = to_reference(motion)
+        std_px = None
         if estimated:
             folder = study.run("run", spec)
-            found_motion, record = load_trajectory(folder).homographies, record_of(folder)
+            found_run, record = load_trajectory(folder), record_of(folder)
+            found_motion, std_px = found_run.homographies, found_run.std_px
             errors = corner_errors(found_motion, motion, SHAPE)
             true_motion = normalised(inverse(errors.alignment) @ motion)
             print(f"\nerror of the estimated motion: {errors.mean_px:.3f} px, at most {errors.max_px:.3f} px")
@@ -109,7 +111,7 @@ def measured(name: str, n_frames: int, seed: int, rms_px: float, dark: float, st
             print(*(f"  {reason['what']}" for reason in record["verdict"]["reasons"]), sep="\n")
         trajectory = FrameTrajectory(found_motion)
         canvas: Canvas = canvas_of_box((12, 12, SHAPE[1] - 12, SHAPE[0] - 12), 1.0)
-        noise = CanvasNoise.of(source, trajectory, source.info.span, canvas)
+        noise = CanvasNoise.of(source, trajectory, source.info.span, canvas, std_px)
         panorama = rendered(source, trajectory, canvas)
         if rms_px:
             without_noise = Expected(bare, lambda index: -np.expm1(-view(index)))
@@ -121,8 +123,10 @@ def measured(name: str, n_frames: int, seed: int, rms_px: float, dark: float, st
         else:
             true = view(n_frames // 2)[12:-12, 12:-12]
     gathered = DynamicRange(noise)
-    gathered.add(panorama.flux, panorama.weight, 0, 0)
-    std = noise.std(panorama.flux, panorama.weight)
+    std = np.empty_like(panorama.flux)
+    for rows, found in noise.of_tile(panorama.flux, panorama.weight, 0, 0):
+        gathered.add(panorama.flux[rows], panorama.weight[rows], found.photons)
+        std[rows] = found.whole
     bound = np.sqrt(np.expm1(true + dark) / panorama.weight)
     return Measured(name, panorama.flux.astype(float), std.astype(float), true, bound, gathered)
 

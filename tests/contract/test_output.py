@@ -42,12 +42,22 @@ def trajectory(folder: Path) -> dict[str, np.ndarray]:
 def test_run_folder_holds_exactly_the_promised_files(folder: Path) -> None:
     assert {file.name for file in folder.iterdir()} == {
         "panorama.tiff",
+        "panorama-std.tiff",
         "panorama.png",
         "coverage.tiff",
         "trajectory.npz",
         "run.json",
         "report.html",
     }
+
+
+def test_standard_deviation_of_the_flux_is_known_where_it_is_seen(folder: Path) -> None:
+    flux, coverage, std = (tifffile.imread(folder / f"{name}.tiff") for name in ("panorama", "coverage", "panorama-std"))
+    assert std.dtype == np.float32
+    np.testing.assert_array_equal(np.isnan(std), np.isnan(flux))
+    seen = coverage > 0.5 * N_FRAMES
+    photons = np.sqrt(np.expm1(flux[seen]) / coverage[seen])
+    assert 0.6 < np.median(std[seen] / photons) < 1.1
 
 
 def test_panorama_is_linear_flux_and_nan_where_unseen(folder: Path) -> None:

@@ -90,8 +90,9 @@ def _run(
 ) -> RunResult:
     """Make a panorama from a spec.
 
-    Writes the run folder: panorama.png to look at, panorama.tiff with linear flux, coverage.tiff, trajectory.npz, run.json
-    (settings, versions, results) and report.html. The verdict says whether motion and panorama explain the photons.
+    Writes the run folder: panorama.png to look at, panorama.tiff with linear flux, panorama-std.tiff with its standard
+    deviation, coverage.tiff, trajectory.npz, run.json (settings, versions, results) and report.html. The verdict says whether
+    motion and panorama explain the photons.
     Of several shots, each one but the longest gets a run folder of its own, DIR.panorama-2 and so on.
     A spec with `pose` finds the poses of a camera instead: poses.npz, and files of other programs.
 

@@ -1,16 +1,17 @@
-"""The noise of a merged panorama: its standard deviation and its saturated pixels, with the corrections of the sensor."""
+"""The uncertainty of a merged panorama: the standard deviation of its flux, by photons, motion and light; saturated pixels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from photonpano.capture import Capture, capture_of
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.geometry import Camera, Canvas, rescaling
-from photonpano.merging.averaging import Averaging
+from photonpano.merging.averaging import Averages, Averaging
 from photonpano.merging.footprints import footprints_of
 from photonpano.merging.warping import Grid, Texture, add_warped, average_squares
 from photonpano.photometry import Factor, FluxRange, flux_std, measurable_range, saturated
@@ -20,7 +21,15 @@ _INSTANTS = 64  # largest number of instants at which the corrections of the sen
 _LARGEST_PX = 1024  # longer side of the maps of corrections on a canvas; those of a larger canvas are coarser than its pixels
 _BLOCK = 2**18  # values of a tile that are looked at at once
 _EVEN = 1e-4  # corrections that differ by less than this are one number
+_LEAST = 1e-30  # squared gradient of flat places
 _RGB = 3  # colours of a panorama; clear pixels, which come last, are none
+
+
+class FluxStd(NamedTuple):
+    """Standard deviation of the flux of some rows of a panorama, of the shape of the flux."""
+
+    photons: FluxImage  # by photon noise and dark counts
+    whole: FluxImage  # with what the expected errors of motion and light change
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,13 +44,19 @@ class CanvasNoise:
     offset: Factor = 0.0  # as `slope`
     share: Factor = 1.0  # weight of a frame, on average, as `slope`: what the weight of the canvas is divided by to get frames
     reduction: float = 1.0  # pixels of the canvas per pixel of the maps, along each side
-    averaging: Averaging | None = None  # how far interpolation lowers the noise; None without motion
+    averaging: Averaging | None = None  # what the frames that show a pixel do to its noise; None without motion
 
     @classmethod
-    def of(cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
-        """Average the noise model of a capture over the frames of a span that see each place of a canvas."""
+    def of(
+        cls, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas, std_px: FloatArray | None = None
+    ) -> CanvasNoise:
+        """Average the noise model of a capture over the frames of a span that see each place of a canvas.
+
+        `std_px` (T,) are the expected corner errors of all frames; without them, their motion counts as known.
+        """
         capture = capture_of(source)
-        averaging = Averaging.of(trajectory, span, capture.info.frame_shape, canvas, capture.camera)
+        std_light = None if capture.light is None else capture.light.std
+        averaging = Averaging.of(trajectory, span, capture.info.frame_shape, canvas, capture.camera, std_px, std_light)
         if capture.colour is None:
             return replace(cls._corrected(capture, trajectory, span, canvas), averaging=averaging)
         # The grey source equalises the colours, which are rendered without it.
@@ -73,13 +88,35 @@ class CanvasNoise:
         return cls(capture.response, slope, offset, share, reduction)
 
     def std(self, flux: FluxImage, weight: FluxImage, top: int = 0, left: int = 0) -> FluxImage:
-        """Return the standard deviation of the flux, (h, w) or (h, w, 3), of a part of the canvas from `top`, `left` on."""
+        """Return the standard deviation by photons, (h, w) or (h, w, 3), of a part of the canvas from `top`, `left` on."""
+        return self._of_photons(flux, weight, top, left, self._averages(flux, top, left))
+
+    def of_tile(self, flux: FluxImage, weight: FluxImage, top: int, left: int) -> Iterator[tuple[slice, FluxStd]]:
+        """Return the standard deviations of a part of the canvas, some rows after the other so that it takes little memory.
+
+        A place that is off by e changes the flux by e times its gradient, which is measured and has noise itself.
+        """
+        step = max(1, _BLOCK // max(1, flux[0].size)) if len(flux) else 1
+        for row in range(0, len(flux), step):
+            rows, first = slice(row, min(row + step, len(flux))), max(row - 1, 0)
+            part = flux[rows]
+            averages = self._averages(part, top + row, left)
+            photons = self._of_photons(part, weight[rows], top + row, left, averages)
+            if averages is None:
+                yield rows, FluxStd(photons, photons)
+                continue
+            squares = squared_gradient(flux[first : rows.stop + 1])[row - first :][: len(part)]
+            motion, light = (_as_colours(each, part) for each in (averages.motion_variance, averages.light_variance))
+            rise = np.maximum(squares - photons**2, np.float32(_LEAST))  # an unknown motion moves even places that look flat
+            yield rows, FluxStd(photons, np.asarray(np.sqrt(photons**2 + motion * rise + light * part**2), np.float32))
+
+    def _averages(self, flux: FluxImage, top: int, left: int) -> Averages | None:
+        return None if self.averaging is None else self.averaging.over((flux.shape[0], flux.shape[1]), top, left)
+
+    def _of_photons(self, flux: FluxImage, weight: FluxImage, top: int, left: int, averages: Averages | None) -> FluxImage:
         slope, offset, share = (self._part(each, flux, top, left) for each in (self.slope, self.offset, self.share))
         std = flux_std(flux, np.asarray(weight / share, np.float32), self.response, slope, offset)
-        if self.averaging is None:
-            return std
-        factor = self.averaging.std_factor((flux.shape[0], flux.shape[1]), top, left)
-        return np.asarray(std * (factor if flux.ndim == 2 else factor[..., None]), np.float32)
+        return std if averages is None else np.asarray(std * _as_colours(averages.std_factor, flux), np.float32)
 
     def saturated(self, flux: FluxImage, weight: FluxImage) -> BoolArray:
         """Return the pixels that were lit in every frame."""
@@ -97,8 +134,7 @@ class CanvasNoise:
             np.minimum(((first + np.arange(length)) / self.reduction).astype(int), side - 1)
             for first, length, side in zip((top, left), flux.shape, factor.shape, strict=False)
         )
-        part = factor[np.ix_(rows, columns)]
-        return part if part.ndim == flux.ndim else part[..., None]
+        return _as_colours(factor[np.ix_(rows, columns)], flux)
 
 
 def laid(
@@ -117,6 +153,23 @@ def laid(
             counts = Texture.of(average_squares(np.where(valid, image, np.float32(0)), at.shrink))
             add_warped(counts, known, never if number else once, at, grid._replace(total=total))
     return sums, share[0]
+
+
+def squared_gradient(flux: FluxImage) -> FluxImage:
+    """Return the squared gradient of flux, per squared pixel and of its shape, from the known neighbours of each pixel."""
+    squares = np.zeros_like(flux)
+    for axis in (0, 1):
+        padded = np.pad(flux, [(int(each == axis),) * 2 for each in range(flux.ndim)], constant_values=np.nan)
+        before, after = np.delete(padded, np.s_[-2:], axis), np.delete(padded, np.s_[:2], axis)
+        known = np.isfinite(before).astype(np.float32) + np.isfinite(after)
+        rise = np.where(np.isfinite(after), after, flux) - np.where(np.isfinite(before), before, flux)
+        squares += (rise / np.maximum(known, 1)) ** 2
+    return squares
+
+
+def _as_colours(image: FluxImage, flux: FluxImage) -> FluxImage:
+    """Return an image, (h, w), with an axis of colours if the flux has one."""
+    return image if image.ndim == flux.ndim else image[..., None]
 
 
 def _stacked(factors: list[Factor]) -> Factor:
@@ -139,19 +192,15 @@ class DynamicRange:
     n_seen: int = 0  # number of values of pixels that were seen
     frames: float = 0.0  # frames that saw each value, added up
 
-    def add(self, flux: FluxImage, weight: FluxImage, top: int, left: int) -> None:
-        """Add a tile, row by row so that it takes little memory."""
-        step = max(1, _BLOCK // max(1, flux[0].size)) if len(flux) else 1
-        for row in range(0, len(flux), step):
-            part, frames = flux[row : row + step], weight[row : row + step]
-            std = self.noise.std(part, frames, top + row, left)
-            with np.errstate(invalid="ignore"):
-                measured = part[part >= std]
-            if measured.size:
-                self.low, self.high = min(self.low, float(measured.min())), max(self.high, float(measured.max()))
-            self.n_saturated += int(np.count_nonzero(self.noise.saturated(part, frames)))
-            self.n_seen += int(np.count_nonzero(frames > 0))
-            self.frames += float(frames.sum(dtype=np.float64))
+    def add(self, flux: FluxImage, weight: FluxImage, std: FluxImage) -> None:
+        """Add a part of the panorama, with its standard deviation by photons."""
+        with np.errstate(invalid="ignore"):
+            measured = flux[flux >= std]
+        if measured.size:
+            self.low, self.high = min(self.low, float(measured.min())), max(self.high, float(measured.max()))
+        self.n_saturated += int(np.count_nonzero(self.noise.saturated(flux, weight)))
+        self.n_seen += int(np.count_nonzero(weight > 0))
+        self.frames += float(weight.sum(dtype=np.float64))
 
     @property
     def decibels(self) -> float | None:

@@ -54,7 +54,7 @@ def by_homographies(canvas: Canvas, camera: Camera | None, homographies: FloatAr
     """
     if not canvas.planar or (camera is not None and camera.distorts):
         return False
-    to_rays = _to_rays(canvas, homographies)
+    to_rays = rays_of(canvas, homographies)
     return not bool((to_rays[:, 2:, :2] @ corners(frame_shape).T + to_rays[:, 2:, 2:] <= 0).any())
 
 
@@ -79,7 +79,7 @@ def footprints_of(
 
 def _remapped(canvas: Canvas, camera: Camera | None, homographies: FloatArray, frame_shape: tuple[int, int]) -> list[Footprint]:
     """Return the footprints of frames that no homographies map to a canvas; `camera` is None without a lens."""
-    to_rays = _to_rays(canvas, homographies)
+    to_rays = rays_of(canvas, homographies)
     shrink = _shrink_factors(to_rays, canvas, frame_shape)
     outline = outline_of(frame_shape, float(max(shrink, default=1)))
     rows, columns = _touched_around(canvas, outline if camera is None else camera.ideal(outline), to_rays)
@@ -128,7 +128,7 @@ def _touched_around(canvas: Canvas, outline: FloatArray, to_rays: FloatArray) ->
     return rows, columns
 
 
-def _to_rays(canvas: Canvas, homographies: FloatArray) -> FloatArray:
+def rays_of(canvas: Canvas, homographies: FloatArray) -> FloatArray:
     """Return the maps from homogeneous ideal pixels of frames to rays of a canvas, (N, 3, 3), that keep what is ahead ahead."""
     to_rays = canvas.plane_to_rays @ homographies
     return np.asarray(to_rays * np.sign(np.linalg.det(to_rays))[:, None, None])
@@ -158,14 +158,19 @@ def _fold(k1: float, k2: float) -> float:
     return min(real, default=np.inf)
 
 
-def _shrink_factors(to_rays: FloatArray, canvas: Canvas, frame_shape: tuple[int, int]) -> list[int]:
-    """Return how many pixels in a row fall on one grid pixel: interpolation alone would skip photons."""
+def pixel_sizes(to_rays: FloatArray, canvas: Canvas, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return how large the pixel in the middle of each of N frames is on a canvas, in its pixels: (N,)."""
     middle = np.array([(frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2])
     around = np.concatenate([middle + np.array([[0, 0], [1, 0], [0, 1]]), np.ones((3, 1))], axis=1)
     rays = around @ np.swapaxes(to_rays, -1, -2)
     points = rays[..., :2] / rays[..., 2:] if canvas.planar else rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     step = np.linalg.norm(points[:, 1:] - points[:, :1], axis=-1).max(axis=-1)
-    return [max(1, int(factor)) for factor in 1 / (step * (1 if canvas.planar else canvas.transform[0, 0])) + 1e-6]
+    return np.asarray(step * (1 if canvas.planar else canvas.transform[0, 0]))
+
+
+def _shrink_factors(to_rays: FloatArray, canvas: Canvas, frame_shape: tuple[int, int]) -> list[int]:
+    """Return how many pixels in a row fall on one grid pixel: interpolation alone would skip photons."""
+    return [max(1, int(factor)) for factor in 1 / pixel_sizes(to_rays, canvas, frame_shape) + 1e-6]
 
 
 def _touched(outline: FloatArray, grid_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

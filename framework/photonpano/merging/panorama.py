@@ -24,7 +24,7 @@ from photonpano.merging.chunks import chunks_of
 from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
 from photonpano.merging.light import bytes_of_light
 from photonpano.photometry import Tone, WhiteBalance, balanced, debiased, picture_of
-from photonpano.values import FluxImage, FrameSpan, Panorama
+from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
 
 
 class MergeRenderer:
@@ -166,23 +166,25 @@ class Thumbnail:
         self._shape = -(-canvas.height // reduction), -(-canvas.width // reduction)
         empty = np.zeros((0, 0), np.float32)
         self.panorama = Panorama(empty, empty, rescaling(1 / reduction) @ canvas.transform)
+        self.std: FluxImage = empty  # standard deviation of the flux of a pixel
 
-    def add(self, tile: Tile, rendered: Panorama) -> None:
-        """Add a tile: the mean flux of the seen pixels and the mean weight of all pixels of each square."""
+    def add(self, tile: Tile, rendered: Panorama, std: FluxImage) -> None:
+        """Add a tile: the mean flux and deviation of the seen pixels, and the mean weight of all pixels of each square."""
         step = self._reduction
         seen = np.isfinite(rendered.flux)
         self._n_seen += int(np.count_nonzero(seen_in(rendered)))
         if step == 1:
-            self.panorama = rendered
+            self.panorama, self.std = rendered, std
             return
         seen_share = _averaged(seen, step)
         height, width = seen_share.shape[:2]
         if not self.panorama.flux.size:
             empty = np.zeros((*self._shape, *seen_share.shape[2:]), np.float32)
-            self.panorama = replace(self.panorama, flux=empty, weight=empty.copy())
+            self.panorama, self.std = replace(self.panorama, flux=empty, weight=empty.copy()), empty.copy()
         box = np.s_[tile.top // step : tile.top // step + height, tile.left // step : tile.left // step + width]
-        flux = _averaged(np.where(seen, rendered.flux, 0), step)
-        self.panorama.flux[box] = np.divide(flux, seen_share, out=np.full_like(flux, np.nan), where=seen_share > 0)
+        for whole, image in ((self.panorama.flux, rendered.flux), (self.std, std)):
+            mean = _averaged(np.where(seen, image, 0), step)
+            whole[box] = np.divide(mean, seen_share, out=np.full_like(mean, np.nan), where=seen_share > 0)
         self.panorama.weight[box] = _averaged(rendered.weight, step)
 
     @property
@@ -211,8 +213,8 @@ class RenderedPanorama:
     white_flux: float  # flux that is white in the picture, photons per pixel per frame
     coverage_share: float  # share of the pixels that were seen
     seconds: float  # time of rendering and writing
-    noise: CanvasNoise | None = None  # what the noise depends on, beside flux and weight; None if it was not asked for
-    dynamic_range: DynamicRange | None = None  # the range of flux; None if it was not asked for
+    std: FluxImage  # of the flux of a pixel, averaged down as the thumbnail
+    dynamic_range: DynamicRange  # the range of flux, with what its noise depends on
 
 
 def render_panorama(
@@ -222,15 +224,16 @@ def render_panorama(
     span: FrameSpan,
     options: RenderOptions,
     memory: int,
-    write_tile: Callable[[Tile, Panorama, Canvas], object],
+    write_tile: Callable[[Tile, Panorama, FluxImage, Canvas], object],
     context: Context,
     bytes_per_pixel: int = BYTES_PER_PIXEL,
     view: View | None = None,
+    std_px: FloatArray | None = None,
 ) -> RenderedPanorama:
     """Render the frames of a span, in tiles if the panorama exceeds the memory, in bytes.
 
-    `write_tile` is called with each tile, its flux and weight, and the whole canvas. `bytes_per_pixel` is what the renderer
-    takes in one colour.
+    `write_tile` is called with each tile, its flux and weight, the standard deviation of the flux, and the whole canvas.
+    `bytes_per_pixel` is what the renderer takes in one colour; `std_px` (T,) are the expected corner errors of all frames.
 
     Raises:
         ExtentError: no frame shows the extent.
@@ -241,14 +244,17 @@ def render_panorama(
     shown = trajectory, span, source.info.frame_shape
     canvas = plan_canvas(*shown, options.scale, memory, bytes_per_pixel, options.extent, view)
     tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
-    gathered, noise = Thumbnail(canvas, reduction), CanvasNoise.of(source, trajectory, span, canvas)
+    gathered, noise = Thumbnail(canvas, reduction), CanvasNoise.of(source, trajectory, span, canvas, std_px)
     dynamic_range = DynamicRange(noise)
     rendered = render_tiles(renderer, source, trajectory, span, tiles, options.tolerance_px, context)
     for tile, images in zip(tiles, rendered, strict=True):
         part = composed(images, source)
-        write_tile(tile, part, canvas)
-        gathered.add(tile, part)
-        dynamic_range.add(part.flux, part.weight, tile.top, tile.left)
+        std = np.empty_like(part.flux)
+        for rows, found in noise.of_tile(part.flux, part.weight, tile.top, tile.left):
+            dynamic_range.add(part.flux[rows], part.weight[rows], found.photons)
+            std[rows] = found.whole
+        write_tile(tile, part, std, canvas)
+        gathered.add(tile, part, std)
     if options.extent != "panorama" and not gathered.coverage_share:
         raise ExtentError("no frame that was located shows it; choose a part of the panorama")
     thumbnail = gathered.panorama
@@ -258,4 +264,4 @@ def render_panorama(
     picture = picture_of(lit_picture, white_flux, options.tone, options.exposure_stops)
     seconds = time.perf_counter() - start
     share, white_flux = gathered.coverage_share, white_flux / 2**options.exposure_stops
-    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, share, seconds, noise, dynamic_range)
+    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, share, seconds, gathered.std, dynamic_range)

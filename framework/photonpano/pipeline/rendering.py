@@ -32,6 +32,7 @@ from photonpano.motion.level import Recorder
 from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.run_folder import RunFolder
 from photonpano.plugins.contributions import ExporterContribution, RendererContribution
+from photonpano.record.contents import MAPS
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, FrameSpan, Homography, Panorama, PanoramaRows
 
@@ -66,6 +67,7 @@ def render_into(
             context,
             renderer.bytes_per_pixel,
             view_of(motion, source, plan.render.projection, level=plan.render.horizon == "level"),
+            motion.std_px,
         )
     renderer.require_seen(panorama.coverage_share)
     folder.write_results(panorama, motion)
@@ -165,22 +167,23 @@ class StoredPanorama:
     Attributes:
         flux: (H, W) or (H, W, 3) float32, on disk.
         weight: the same shape, on disk.
+        std: the same shape, on disk.
         canvas: (3, 3), pixels of the reference plane to pixels of the panorama.
         white_flux: flux that is white in the picture.
     """
 
     flux: NDArray[np.float32]
     weight: NDArray[np.float32]
+    std: NDArray[np.float32]
     canvas: Homography
     white_flux: float
     noise: CanvasNoise
 
     @classmethod
     def of(cls, folder: Path, panorama: RenderedPanorama) -> StoredPanorama:
-        """Open panorama.tiff and coverage.tiff in a folder."""
-        flux, weight = (tifffile.memmap(folder / name, mode="r") for name in ("panorama.tiff", "coverage.tiff"))
-        assert panorama.noise is not None
-        return cls(flux, weight, panorama.canvas.transform, panorama.white_flux, panorama.noise)
+        """Open the maps of a panorama in a folder."""
+        flux, weight, std = (tifffile.memmap(folder / name, mode="r") for name in MAPS)
+        return cls(flux, weight, std, panorama.canvas.transform, panorama.white_flux, panorama.dynamic_range.noise)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -194,8 +197,8 @@ class StoredPanorama:
 
     def rows(self, start: int, stop: int) -> PanoramaRows:
         """Return some rows, as arrays of their own."""
-        flux, weight = (np.array(image[start:stop], np.float32) for image in (self.flux, self.weight))
-        return PanoramaRows(flux, weight, self.noise.std(flux, weight, top=start), self.noise.saturated(flux, weight))
+        flux, weight, std = (np.array(image[start:stop], np.float32) for image in (self.flux, self.weight, self.std))
+        return PanoramaRows(flux, weight, std, self.noise.saturated(flux, weight))
 
 
 @dataclass(frozen=True, slots=True)

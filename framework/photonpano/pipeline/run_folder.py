@@ -32,7 +32,7 @@ from photonpano.geometry import Canvas
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
-from photonpano.record.contents import RECORD, contents_of, names_of_results, recorded_contents, recorded_json
+from photonpano.record.contents import MAPS, RECORD, contents_of, names_of_results, recorded_contents, recorded_json
 from photonpano.record.schema import FileContent, RunRecord
 from photonpano.values import FluxImage, Panorama
 
@@ -60,11 +60,11 @@ class RunFolder:
                 "Make room, or choose another folder with --output"
             ) from error
 
-    def write_tile(self, tile: Tile, rendered: Panorama, canvas: Canvas) -> None:
-        """Write a part of panorama.tiff and coverage.tiff (float32); the parts make up the canvas."""
+    def write_tile(self, tile: Tile, rendered: Panorama, std: FluxImage, canvas: Canvas) -> None:
+        """Write a part of panorama.tiff, coverage.tiff and panorama-std.tiff (float32); the parts make up the canvas."""
         with self.writing():
-            _write_box(self.staging / "panorama.tiff", rendered.flux, tile, canvas)
-            _write_box(self.staging / "coverage.tiff", rendered.weight, tile, canvas)
+            for name, image in zip(MAPS, (rendered.flux, rendered.weight, std), strict=True):
+                _write_box(self.staging / name, image, tile, canvas)
 
     def write_results(self, panorama: RenderedPanorama, motion: FrameMotion) -> None:
         """Write panorama.png (8 bits, sRGB) and trajectory.npz."""

@@ -21,10 +21,11 @@ from photonpano.record.schema import FileContent
 logger = logging.getLogger(__name__)
 
 RECORD = "run.json"
+MAPS = ("panorama.tiff", "coverage.tiff", "panorama-std.tiff")  # flux, frames, and standard deviation of the flux of each pixel
 # The files of a run. Runs of older versions do not list theirs.
 RESULTS = frozenset(
     {
-        *("panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "report.html"),
+        *(*MAPS, "panorama.png", "trajectory.npz", "report.html"),
         *("light.npz", "layers.npz", "vignette.npz"),
         RECORD,
     }

@@ -204,10 +204,10 @@ def panorama_record(plan: Plan, panorama: RenderedPanorama, rendered: Sequence[D
         "seconds": round(panorama.seconds, 3),
         "decisions": [each.what for each in rendered],
     }
-    if (found := panorama.dynamic_range) is not None:
-        record["dynamic_range_db"] = _rounded(found.decibels)
-        record["measurable_range_db"] = _rounded(found.measurable_decibels)
-        record["saturated_share"] = found.saturated_share
+    found = panorama.dynamic_range
+    record["dynamic_range_db"] = _rounded(found.decibels)
+    record["measurable_range_db"] = _rounded(found.measurable_decibels)
+    record["saturated_share"] = found.saturated_share
     return record
 
 

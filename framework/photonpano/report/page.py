@@ -116,6 +116,7 @@ _CONTENTS = {
     "panorama.tiff": "linear flux in photons per pixel per frame, float32; NaN where nothing was seen",
     "panorama.png": "the panorama to look at, 8 bits",
     "coverage.tiff": "the number of frames that saw each pixel of the panorama, float32",
+    "panorama-std.tiff": "the standard deviation of the flux of each pixel, float32",
     "trajectory.npz": "the motion of every frame",
     "light.npz": "the gain of the light in each frame",
     "layers.npz": "which parts of the frames show the background, and which something that hides it",

@@ -17,7 +17,7 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
-from photonpano.photometry import balanced, flux_std, tone_mapped
+from photonpano.photometry import balanced, tone_mapped
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
 from photonpano.report.figures import centre_of, instants_of, places_on
@@ -56,7 +56,7 @@ def viewer_data(
         "size": [panorama.canvas.width, panorama.canvas.height],
         "linear": linear_data(balanced(panorama.thumbnail.flux, balance), white),
         "picture": None if (render.get("tone") or "srgb") == "srgb" else jpeg_uri(shrunk(panorama.picture, VIEW_PIXELS)),
-        "maps": [*panorama_maps(panorama, source), *_chi2_map(explained, panorama.canvas)],
+        "maps": [*panorama_maps(panorama), *_chi2_map(explained, panorama.canvas)],
         "path": path_data(motion, panorama),
         "rate": record["source"]["frame_rate_hz"],
         "glimpses": glimpses(source, int(np.median(spans)), white),
@@ -97,24 +97,20 @@ def linear_data(flux: FluxImage, white: float) -> dict[str, Any]:
     }
 
 
-def panorama_maps(panorama: RenderedPanorama, source: Source) -> list[dict[str, Any]]:
-    """Return the coverage, and the relative standard deviation of the flux by photon noise, as maps over the panorama."""
+def panorama_maps(panorama: RenderedPanorama) -> list[dict[str, Any]]:
+    """Return the coverage, and the standard deviation of the flux relative to it, as maps over the panorama."""
     flux, weight = panorama.thumbnail.flux, panorama.thumbnail.weight
     height, width = panorama.canvas.shape
     box = [0, 0, width, height]
-    if panorama.noise is not None and panorama.reduction == 1:
-        std = panorama.noise.std(flux, weight)
-    else:
-        std = flux_std(flux, weight, source.response)
     with np.errstate(invalid="ignore", divide="ignore"):
-        relative = 100 * std / flux
+        relative = 100 * panorama.std / flux
     if flux.ndim == 3:
         weight, relative = weight.sum(axis=-1), relative.mean(axis=-1)
     seen = weight > 0
     percent = np.where(seen & np.isfinite(relative), relative, np.nan)
     return [
         _map("Coverage", np.where(seen, weight, np.nan), "frames", box, "viridis", low=0.0),
-        _map("Uncertainty", percent, "% of the flux, by photon noise", box, "magma"),
+        _map("Uncertainty", percent, "% of the flux", box, "magma"),
     ]
 
 

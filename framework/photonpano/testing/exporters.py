@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano.merging.canvas_noise import CanvasNoise
-from photonpano.photometry import BinaryResponse
+from photonpano.photometry import BinaryResponse, flux_std
 from photonpano.pipeline.rendering import AttributedExporter, StoredPanorama
 from photonpano.plugins.contributions import ExporterContribution
 from photonpano.testing.conformance import passing
@@ -27,7 +27,8 @@ def panorama(in_colour: bool = False, nothing_seen: bool = False) -> StoredPanor
     flux[-1] = np.log(200_001)
     if nothing_seen:
         flux[:], weight[:] = np.nan, 0
-    return StoredPanorama(flux, weight, np.eye(3), 1.0, CanvasNoise(BinaryResponse()))
+    response = BinaryResponse()
+    return StoredPanorama(flux, weight, flux_std(flux, weight, response), np.eye(3), 1.0, CanvasNoise(response))
 
 
 class ExporterConformance(StageConformance):

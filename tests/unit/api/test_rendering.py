@@ -25,7 +25,7 @@ def test_rendering_is_that_of_a_whole_run(small_run: RunResult, tmp_path: Path) 
     changes = ["render.scale=1.5", "render.extent=[10, 20, 90, 80]", "output.formats=[hdr]"]
     whole = run(parse_spec(dict(small_run.record["spec"]), overrides=changes, output=tmp_path / "whole"))
     again = render(small_run.directory, tmp_path / "again", changes)
-    names = {"panorama.tiff", "panorama.png", "panorama.hdr", "coverage.tiff", "trajectory.npz"}
+    names = {"panorama.tiff", "panorama.png", "panorama.hdr", "panorama-std.tiff", "coverage.tiff", "trajectory.npz"}
     assert set(again.record["files"]) == names
     assert {name: again.record["files"][name] for name in names} == {name: whole.record["files"][name] for name in names}
     differing = {key for key, value in whole.record.items() if again.record.get(key) != value}
@@ -50,7 +50,7 @@ def test_turn_through_a_lens_is_rendered_again_on_a_sphere(tmp_path: Path) -> No
     }
     first = run(parse_spec(spec, output=tmp_path / "first"))
     again = render(first.directory, tmp_path / "again")
-    names = "panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz"
+    names = "panorama.tiff", "panorama-std.tiff", "panorama.png", "coverage.tiff", "trajectory.npz"
     assert [again.record["files"][name] for name in names] == [first.record["files"][name] for name in names]
 
 

@@ -99,7 +99,7 @@ def copied(small_run: RunResult, tmp_path: Path) -> Path:
 
 def test_verify_accepts_a_finished_run(small_run: RunResult) -> None:
     found = verify(small_run.directory)
-    assert (found.n_files, found.problems, found.capture) == (5, (), "the same frames")
+    assert (found.n_files, found.problems, found.capture) == (6, (), "the same frames")
     assert found.n_bytes == sum(path.stat().st_size for path in small_run.directory.iterdir() if path.name != "run.json")
 
 

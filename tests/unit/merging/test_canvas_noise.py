@@ -3,26 +3,29 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from photonpano import FrameSpan
 from photonpano.capture import capture_of
 from photonpano.corrections.colour_filter import with_colours
 from photonpano.geometry import Canvas, rescaling, translation
-from photonpano.merging import accumulate
+from photonpano.merging import accumulate, canvas_noise
 from photonpano.merging.averaging import Averaging
-from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
+from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange, squared_gradient
 from photonpano.merging.chunks import chunks_of
 from photonpano.photometry import BinaryResponse, flux_std
 from photonpano.testing import KnownMotion, MemorySource
+from photonpano.values import Light
 
 SHAPE = (24, 32)
 STILL = KnownMotion(lambda _: np.eye(3))
 
 
 def factor(motion: KnownMotion, canvas: Canvas, n_frames: int = 400) -> np.ndarray:
-    return Averaging.of(motion, FrameSpan(0, n_frames), SHAPE, canvas).std_factor(canvas.shape)
+    return Averaging.of(motion, FrameSpan(0, n_frames), SHAPE, canvas).over(canvas.shape).std_factor
 
 
 @pytest.mark.parametrize(("shift", "expected"), [(0.0, 1.0), (0.5, 0.5)])
@@ -44,7 +47,7 @@ def test_averaging_of_a_part_is_the_part() -> None:
     motion = KnownMotion(lambda frame: translation(0.02 * frame, 0.01 * frame))
     canvas = Canvas(28, 40, np.eye(3))
     averaging = Averaging.of(motion, FrameSpan(0, 400), SHAPE, canvas)
-    np.testing.assert_allclose(averaging.std_factor((6, 7), 9, 12), averaging.std_factor(canvas.shape)[9:15, 12:19], rtol=0.01)
+    np.testing.assert_allclose(averaging.over((6, 7), 9, 12).std_factor, factor(motion, canvas)[9:15, 12:19], rtol=0.01)
 
 
 def test_averaging_is_that_of_merged_photons() -> None:
@@ -117,7 +120,7 @@ def test_dynamic_range_is_that_of_flux_above_its_noise(colours: int) -> None:
     flux[0, 2] = 0.005
     flux[0, 3] = np.log(20_001)  # lit in every frame
     found = DynamicRange(CanvasNoise(BinaryResponse()))
-    found.add(flux, weight, 0, 0)
+    found.add(flux, weight, found.noise.std(flux, weight))
     assert found.decibels == pytest.approx(20 * np.log10(np.log(20_001) / 0.005), abs=0.01)
     assert found.saturated_share == pytest.approx(1 / 19)
     assert found.measurable_decibels == pytest.approx(99.9, abs=0.1)
@@ -128,14 +131,14 @@ def test_range_that_was_measured_can_be_measured() -> None:
     flux, weight = image(1.0), image(100)
     flux[0, 0], weight[0, 0] = 2e-7, 1e7
     found = DynamicRange(CanvasNoise(BinaryResponse()))
-    found.add(flux, weight, 0, 0)
+    found.add(flux, weight, found.noise.std(flux, weight))
     assert found.decibels == pytest.approx(20 * np.log10(5e6))
     assert found.measurable_decibels == found.decibels
 
 
 def test_dynamic_range_of_nothing_is_unknown() -> None:
     found = DynamicRange(CanvasNoise(BinaryResponse()))
-    found.add(image(np.nan), image(0), 0, 0)
+    found.add(image(np.nan), image(0), image(np.nan))
     assert (found.decibels, found.measurable_decibels, found.saturated_share) == (None, None, 0)
 
 
@@ -145,3 +148,59 @@ def test_noise_of_weighted_pixels_is_that_of_their_counts(pan: Callable) -> None
     noise = CanvasNoise.of(replace(capture_of(DarkCounts(rates)), weight=weights), pan(0), SPAN, CANVAS)
     std = noise.std(image(0.1), weights * np.float32(1e6))
     np.testing.assert_allclose(std, np.sqrt(np.expm1(0.3) / 1e6), rtol=0.01)
+
+
+SMOOTH = cv2.GaussianBlur(np.random.default_rng(0).random((60, 80)).astype(np.float32), (0, 0), 2.5)
+
+
+def whole_std(flux: np.ndarray, source: MemorySource | None = None, size: float = 1.0, std_px: float = 0.0) -> np.ndarray:
+    """Return the standard deviation of flux without photon noise that all frames show in the same place."""
+    source = source or MemorySource(np.zeros((N, *flux.shape)))
+    canvas = Canvas(*flux.shape, rescaling(size))
+    noise = CanvasNoise.of(source, STILL, SPAN, canvas, np.full(N, std_px))
+    parts = [found.whole for _, found in noise.of_tile(flux, np.full_like(flux, 1e12), 0, 0)]
+    return np.concatenate(parts)
+
+
+@pytest.mark.parametrize("size", [1.0, 2.0])
+def test_uncertain_motion_changes_flux_by_its_gradient(size: float) -> None:
+    """Shifted by errors of half the expected corner error along each direction, the flux scatters as expected."""
+    angles = np.arange(12) * np.pi / 6
+    errors = 0.5 * 0.1 * size * np.sqrt(2) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    moves = [ndimage.shift(SMOOTH, error) for error in errors]
+    inner = np.s_[4:-4, 4:-4]
+    scatter, found = np.std(moves, axis=0)[inner], whole_std(SMOOTH, size=size, std_px=0.1)[inner]
+    assert np.sqrt(np.mean(found**2) / np.mean(scatter**2)) == pytest.approx(1, abs=0.05)
+    assert np.corrcoef(found.ravel(), scatter.ravel())[0, 1] > 0.97
+
+
+def test_uncertainty_does_not_depend_on_the_parts_it_is_computed_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    at_once = whole_std(SMOOTH, std_px=0.3)
+    monkeypatch.setattr(canvas_noise, "_BLOCK", 7 * 80)
+    np.testing.assert_allclose(whole_std(SMOOTH, std_px=0.3), at_once, rtol=1e-5)
+
+
+def test_uncertainty_is_infinite_where_that_of_the_motion_is() -> None:
+    assert np.isinf(whole_std(SMOOTH, std_px=np.inf)).all()
+
+
+def test_noise_is_no_gradient() -> None:
+    """A gradient that photon noise alone makes does not count as one that errors of the motion move."""
+    flux = np.random.default_rng(0).normal(1, 0.01, (60, 80)).astype(np.float32)
+    noise = CanvasNoise.of(MemorySource(np.zeros((N, 60, 80))), STILL, SPAN, Canvas(60, 80, np.eye(3)), np.full(N, 1.0))
+    (found,) = [found for _, found in noise.of_tile(flux, np.full_like(flux, np.expm1(1) / 0.01**2), 0, 0)]
+    assert np.median(found.photons) == pytest.approx(0.01, rel=0.02)
+    assert np.sqrt(np.mean(found.whole**2)) == pytest.approx(0.01, rel=0.1)
+
+
+def test_uncertain_light_changes_flux_in_proportion() -> None:
+    light = Light.of_frames(np.ones(N), std=np.full(N, 0.03))
+    source = replace(capture_of(MemorySource(np.zeros((N, 60, 80)))), light=light)
+    np.testing.assert_allclose(whole_std(np.full((60, 80), 0.5, np.float32), source), 0.015, rtol=1e-3)
+
+
+def test_gradient_at_the_border_is_that_of_the_neighbours_that_are_known() -> None:
+    ramp = np.tile(3 * np.arange(6, dtype=np.float32), (4, 1))
+    ramp[:, 3] = np.nan
+    squares = squared_gradient(ramp)
+    np.testing.assert_allclose(squares[:, [0, 1, 2, 4, 5]], 9, rtol=1e-5)

@@ -155,11 +155,12 @@ def test_render_tiles_equals_render(panning: Any, known_motion: type, motion: tu
     for tile, part in zip(tiles, parts, strict=True):
         box = np.s_[tile.top : tile.top + tile.canvas.height, tile.left : tile.left + tile.canvas.width]
         flux[box], weight[box] = part.flux, part.weight
-        shown.add(tile, part)
+        shown.add(tile, part, 0.1 * part.flux)
     np.testing.assert_allclose(weight, whole.weight, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(flux, whole.flux, rtol=1e-3, atol=1e-4)
     single = Thumbnail(canvas, reduction)
-    single.add(Tile(0, 0, canvas), Panorama(flux.astype(np.float32), weight.astype(np.float32), canvas.transform))
+    flux, weight = flux.astype(np.float32), weight.astype(np.float32)
+    single.add(Tile(0, 0, canvas), Panorama(flux, weight, canvas.transform), 0.1 * flux)
     np.testing.assert_allclose(shown.panorama.flux, single.panorama.flux, rtol=1e-6)
     np.testing.assert_allclose(shown.panorama.weight, single.panorama.weight, rtol=1e-6)
 
@@ -187,9 +188,11 @@ def test_thumbnail_averages_seen_pixels() -> None:
     flux = np.array([[1, 3, np.nan], [np.nan, 5, np.nan], [4, 4, 8]], np.float32)
     canvas = Canvas(3, 3, translation(2, 1))
     shown = Thumbnail(canvas, 2)
-    shown.add(Tile(0, 0, canvas), Panorama(flux, np.where(np.isnan(flux), 0, 8).astype(np.float32), canvas.transform))
+    weight = np.where(np.isnan(flux), 0, 8).astype(np.float32)
+    shown.add(Tile(0, 0, canvas), Panorama(flux, weight, canvas.transform), flux / 2)
     np.testing.assert_array_equal(shown.panorama.flux, [[3, np.nan], [4, 8]])
     np.testing.assert_array_equal(shown.panorama.weight, [[6, 0], [4, 2]])
+    np.testing.assert_array_equal(shown.std, [[1.5, np.nan], [2, 4]])
     # The centre of the first square lies between the pixels 0 and 1.
     np.testing.assert_allclose(transform_points(shown.panorama.canvas, [[-1.5, -0.5]]), [[0, 0]], atol=1e-12)
 

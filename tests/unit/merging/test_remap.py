@@ -187,9 +187,9 @@ def test_noise_on_a_sphere_is_lowered_by_interpolation(camera: Camera) -> None:
     canvas = around(turns, camera)
     span = FrameSpan(0, len(turns))
     averaging = Averaging.of(FrameTrajectory(CAMERA.homographies(turns)), span, SHAPE, canvas, camera)
-    factor = averaging.std_factor(canvas.shape)
+    factor = averaging.over(canvas.shape).std_factor
     assert np.median(factor) == pytest.approx(2 / 3, abs=0.04)
-    part = averaging.std_factor((10, 20), 15, 60)
+    part = averaging.over((10, 20), 15, 60).std_factor
     assert np.allclose(part, factor[15:25, 60:80], atol=0.02)
 
 

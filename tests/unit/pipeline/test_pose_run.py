@@ -186,7 +186,7 @@ def test_panorama_in_the_same_folder_replaces_the_poses(
         run(panorama)
     run(panorama, overwrite=True)
     assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == {
-        *("panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"),
+        *("panorama.tiff", "panorama-std.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"),
         *("sparse", "sparse/mine.txt"),
     }
     run(plan_of(), overwrite=True)

@@ -22,8 +22,10 @@ import tifffile
 
 from photonpano import FrameSpan, OutputError, Panorama
 from photonpano.geometry import Canvas, translation
+from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run_folder import RunFolder, run_folder
 from photonpano.record.contents import changed_files, finish_run_folder
 from photonpano.testing import KnownMotion
@@ -31,9 +33,10 @@ from photonpano.testing import KnownMotion
 FLUX = np.random.default_rng(0).random((60, 90), np.float32)
 FLUX[:, :5] = np.nan
 PANORAMA = Panorama(FLUX, np.where(np.isnan(FLUX), np.float32(0), np.float32(7)), translation(3, 4))
+STD = np.full_like(FLUX, 0.1)
 CANVAS = Canvas(60, 90, PANORAMA.canvas)
 PICTURE = np.arange(60 * 90, dtype=np.uint8).reshape(60, 90)
-FILES = {"panorama.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"}
+FILES = {"panorama.tiff", "panorama-std.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"}
 MOTION = FrameMotion(
     KnownMotion(lambda _: np.eye(3)),
     FrameSpan(0, 500),
@@ -43,13 +46,14 @@ MOTION = FrameMotion(
     250,
     (48, 64),
 )
-RENDERED = RenderedPanorama(CANVAS, PANORAMA, 1, PICTURE, 1.0, 0.9, 2.0)
+RANGE = DynamicRange(CanvasNoise(BinaryResponse()))
+RENDERED = RenderedPanorama(CANVAS, PANORAMA, 1, PICTURE, 1.0, 0.9, 2.0, STD, RANGE)
 RECORD: Any = {"photonpano": "0", "spec": {}, "warnings": ["a line"] * 2000}
 NOTE = {"host": socket.gethostname(), "pid": 7, "process_start": "1", "since": "2026-01-01T00:00:00+00:00"}  # of a lock
 
 
 WRITERS: Mapping[str, Callable[[RunFolder], object]] = {
-    "panorama": lambda folder: folder.write_tile(Tile(0, 0, CANVAS), PANORAMA, CANVAS),
+    "panorama": lambda folder: folder.write_tile(Tile(0, 0, CANVAS), PANORAMA, STD, CANVAS),
     "results": lambda folder: folder.write_results(RENDERED, MOTION),
     "record": lambda folder: folder.commit(RECORD),
 }

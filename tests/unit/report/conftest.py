@@ -9,6 +9,7 @@ import pytest
 
 from photonpano import FrameSpan, Group, Panorama, VirtualExposure
 from photonpano.geometry import canvas_of, normalised, translation
+from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.photometry import BinaryResponse
@@ -20,6 +21,7 @@ from photonpano.testing import KnownMotion
 
 FRAME_SHAPE = (254, 496)
 N_FRAMES = 10_000
+RANGE = DynamicRange(CanvasNoise(BinaryResponse()))
 
 
 def make_results(n_frames: int = N_FRAMES) -> tuple[FrameMotion, RenderedPanorama]:
@@ -52,7 +54,8 @@ def make_results(n_frames: int = N_FRAMES) -> tuple[FrameMotion, RenderedPanoram
     motion = FrameMotion(trajectory, span, homographies, located, std_px, reference, FRAME_SHAPE)
     preview, weight = np.clip(picture, 0, 255).astype(np.uint8), coverage.astype(np.float32)
     thumbnail = Panorama(weight, weight, canvas.transform)
-    return motion, RenderedPanorama(canvas, thumbnail, 1, preview, 1.8342, float((weight > 0).mean()), 4.18)
+    share, std = float((weight > 0).mean()), 0.1 * weight
+    return motion, RenderedPanorama(canvas, thumbnail, 1, preview, 1.8342, share, 4.18, std, RANGE)
 
 
 def make_residuals(n_frames: int = N_FRAMES, tremor_px: float = 0.0, period: float = 100.0) -> Residuals:

@@ -14,14 +14,17 @@ import photonpano.report
 from photonpano import FrameSpan, Group, Panorama, StreamInfo, VirtualExposure
 from photonpano.capture import before, in_light
 from photonpano.geometry import Canvas, rescaling, translation
+from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.photometry import BinaryResponse
 from photonpano.report import OpenCapture, render_report, viewer
 from photonpano.report.preview import still_exposure
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano.values import CELL_PX, Background, Light
 
 SCRIPT = Path(photonpano.report.__file__).parent / "templates" / "viewer.js"
+RANGE = DynamicRange(CanvasNoise(BinaryResponse()))
 
 
 def decoded(linear: dict) -> np.ndarray:
@@ -77,19 +80,12 @@ def test_path_has_outlines_on_the_panorama(motion, panorama):
 
 
 def test_maps_are_transparent_where_nothing_was_seen(panorama):
-    source = SimpleNamespace(response=panorama_response())
-    coverage, uncertainty = viewer.panorama_maps(panorama, source)
+    coverage, uncertainty = viewer.panorama_maps(panorama)
     weight = panorama.thumbnail.weight
     assert coverage["low"] == 0
     assert coverage["high"] == pytest.approx(np.quantile(weight[weight > 0], 0.99), rel=1e-3)
     assert uncertainty["unit"].startswith("% of the flux")
     assert coverage["box"] == [0, 0, panorama.canvas.width, panorama.canvas.height]
-
-
-def panorama_response():
-    from photonpano.photometry import BinaryResponse
-
-    return BinaryResponse()
 
 
 def test_shared_instant_is_near_an_exposure_of_each_level(motion):
@@ -122,7 +118,7 @@ def test_views_of_an_instant_show_one_place(instant):
 
     class Source:
         info = StreamInfo(n_frames, *shape, None)
-        response = panorama_response()
+        response = BinaryResponse()
 
     flux = seen(instant, 0.5)
     exposure = VirtualExposure(flux, np.ones_like(flux), Group(FrameSpan(0, 20), instant), 0.5, Source.response)
@@ -135,7 +131,7 @@ def test_views_of_an_instant_show_one_place(instant):
     motion = FrameMotion(trajectory, FrameSpan(0, n_frames), homographies, located, np.zeros(n_frames), 0, shape)
     canvas = Canvas(80, 160, np.eye(3))
     whole = Panorama(scene, np.ones_like(scene), np.eye(3))
-    rendered = RenderedPanorama(canvas, whole, 1, np.zeros((80, 160), np.uint8), 1.0, 1.0, 0.1)
+    rendered = RenderedPanorama(canvas, whole, 1, np.zeros((80, 160), np.uint8), 1.0, 1.0, 0.1, 0.1 * scene, RANGE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(viewer, "still_exposure", lambda _, span: seen(span.start, 1.0))
         views = viewer.views_of_instant(here, motion, rendered, Source, [level])
