@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -11,17 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
+from photonpano import Config, FrameSpan, InputError, Recognised, Source, SourceContribution, SpecPath
 from photonpano.photometry import packed_along_width
 from photonpano.reading import (
     FrameFile,
     FrameLayout,
     PackedFileSource,
+    ThreeChannels,
     npy_header,
     objections,
+    of_channel,
     read_json,
     require_whole,
-    with_channel,
 )
 
 _TRANSFORMS = "transforms.json"
@@ -31,7 +33,9 @@ class VisionsimConfig(Config):
     """A capture simulated by visionsim."""
 
     path: SpecPath = Field(description=f"the {_TRANSFORMS} beside the .npy file, or their folder")
-    channel: int | None = Field(None, ge=0, le=2, description="channel of a colour capture: 0, 1 or 2")
+    channel: int | None = Field(
+        None, ge=0, le=2, description="the one channel that is read of a capture in colour: 0, 1 or 2; by default all"
+    )
     frame_rate_hz: float | None = Field(
         None, gt=0, description=f"frames a second, in Hz; by default `fps` of {_TRANSFORMS}, if it is there"
     )
@@ -58,26 +62,27 @@ class _Transforms(_Part):
     frames: tuple[_Part, ...] = Field(min_length=1)
 
 
-def _open(config: VisionsimConfig) -> PackedFileSource:
-    files, layout, fps = _read(config)
-    return PackedFileSource(files, layout, config.frame_rate_hz or fps)
+def _open(config: VisionsimConfig) -> Source:
+    files, layout_of, fps, in_colour = _read(config)
+
+    def opened(channel: int | None) -> PackedFileSource:
+        return PackedFileSource(files, layout_of(channel), config.frame_rate_hz or fps)
+
+    return ThreeChannels(opened) if in_colour and config.channel is None else opened(config.channel)
 
 
-def _read(config: VisionsimConfig) -> tuple[list[FrameFile], FrameLayout, float | None]:
-    """Return the files, the layout and the frame rate, without reading frames."""
+def _read(config: VisionsimConfig) -> tuple[list[FrameFile], Callable[[int | None], FrameLayout], float | None, bool]:
+    """Return the files, the layout of a channel, the frame rate, and whether there are three channels; frames are not read."""
     path = config.path / _TRANSFORMS if config.path.is_dir() else config.path
     transforms = read_json(path, _Transforms)
     frames = [_completed(each, transforms, path) for each in transforms.frames]
     packing = {each.bitpack_dim for each in frames}
     if len(packing) > 1:
         raise InputError(f"{path} describes frames that are packed along different dimensions, which this source cannot read")
-    if (transforms.c == 3) != (config.channel is not None):
-        raise InputError(f"{path} says that frames have c: {transforms.c}; " + _CHANNEL_REMEDIES[transforms.c])
-    layout = _layout(transforms, packing.pop(), config.channel, path)
-    return _files(frames, transforms, layout, path.parent), layout, transforms.fps
-
-
-_CHANNEL_REMEDIES = {1: "leave out the channel", 3: "choose a channel: 0, 1 or 2"}
+    if transforms.c == 1 and config.channel is not None:
+        raise InputError(f"{path} says that frames have c: 1; leave out the channel")
+    layout_of = partial(_layout, transforms, packing.pop(), path)
+    return _files(frames, transforms, layout_of(None), path.parent), layout_of, transforms.fps, transforms.c == 3
 
 
 def _completed(frame: _Part, transforms: _Transforms, path: Path) -> _Part:
@@ -136,18 +141,18 @@ def _header(path: Path, transforms: _Transforms, layout: FrameLayout) -> FrameFi
     return FrameFile(path, header.shape[0], header.offset)
 
 
-def _layout(transforms: _Transforms, packed_dim: int | None, channel: int | None, path: Path) -> FrameLayout:
-    """Return the layout of frames in the file. `channel` selects one of three; `path` is for error messages."""
-    height, width, last = transforms.h, transforms.w, channel or 0
+def _layout(transforms: _Transforms, packed_dim: int | None, path: Path, channel: int | None) -> FrameLayout:
+    """Return the layout of frames in the file. `channel` selects one of three, None all; `path` is for error messages."""
+    height, width = transforms.h, transforms.w
 
     def along_width(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return stored[..., last]
+        return of_channel(stored, channel)
 
     def along_height(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return packed_along_width(stored[..., last])[:, :height]
+        return packed_along_width(of_channel(stored, channel))[:, :height]
 
     def not_packed(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        values = stored[..., last]
+        values = of_channel(stored, channel)
         # 255 becomes 0 here, 0 becomes 1, 1 becomes 2.
         if (values + np.uint8(1)).max() > 2:
             raise InputError(f"{path} describes frames with values other than 0, 1 and 255: they are not binary")
@@ -167,20 +172,18 @@ def _recognise(path: Path) -> Recognised | None:
     if not transforms.is_file():
         return None
 
-    def read(channel: int | None) -> list[FrameFile]:
-        config = VisionsimConfig(path=transforms, channel=channel)
-        files, _, _ = _read(config)
+    config = VisionsimConfig(path=transforms)
+    try:
+        files, _, _, in_colour = _read(config)
         with _open(config) as source:
             source.frames(FrameSpan(0, 1))  # which fails if they are not binary
-        return files
-
-    if (found := with_channel(read)) is None:
+    except InputError:
         return None
-    files, channel = found
     if path not in (transforms, transforms.parent, *(file.path for file in files)):
         return None
-    because = f"a {_TRANSFORMS} and the .npy file of binary frames that it names{channel.clause}"
-    return Recognised({"path": str(transforms)} | channel.keys, because)
+    channels = ", in three channels" if in_colour else ""
+    because = f"a {_TRANSFORMS} and the .npy file of binary frames that it names{channels}"
+    return Recognised({"path": str(transforms)}, because)
 
 
 VISIONSIM = SourceContribution(

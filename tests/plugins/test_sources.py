@@ -119,9 +119,17 @@ TestPackedNpy = of(
     wrong=(NO_FILE, {"width": 33}),
     stored=lambda _, frames: np.packbits(frames, axis=-1),
 )
+TestPackedNpyInColour = of(
+    InOneFile,
+    "packed-npy",
+    config={"width": 27},
+    wrong=(NO_FILE, {"width": 33}),
+    stored=lambda _, frames: np.repeat(np.packbits(frames, axis=-1)[..., None], 3, axis=-1),
+)
 BITS, SUMS = {"holds": "bits"}, {"holds": "sums", "frames_per_sum": 1023}
 LAST = {"frame_axis": "last"}
 TestNpyBits = of(InOneFile, "npy", config=BITS, stored=lambda _, frames: frames.astype(bool))
+TestNpyBitsInColour = of(InOneFile, "npy", config=BITS, stored=lambda _, frames: np.repeat(frames[..., None], 3, axis=-1))
 TestNpyBitsFramesLast = of(
     InOneFile, "npy", config=BITS | LAST, grows=False, stored=lambda _, frames: frames_last(frames * np.uint8(255))
 )

@@ -25,10 +25,10 @@ _PER_FRAME = ("homographies", "rotations", "camera_from_world", "light", "taken"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Colours:
-    """The colours of a capture behind a filter array."""
+    """The colours of a capture behind a filter array, or in three channels."""
 
-    # a capture for each of "red", "green", "blue" and, if there are pixels without filter, "clear", in this order: the same
-    # frames, in which only the pixels behind filters of this colour are valid
+    # a capture for each of "red", "green", "blue" and, if there are pixels without filter, "clear", in this order: see
+    # `photonpano.ColouredSource`
     parts: Mapping[str, Capture]
     # (3,) the flux of a clear pixel is the sum of these factors times the flux of red, green and blue ones
     clear_mix: FloatArray
@@ -54,7 +54,7 @@ class Capture(Closing):
             behind a filter is 1, and that of a pixel of gain 1 of a sensor whose pixels differ in gain.
         light: the gain of each frame; None for steady light. Frames are weighted by it, and predicted flux is multiplied by it.
         camera: frames are warped through its lens, and homographies map ideal pixels; None if it is not known.
-        colour: what the filters of a filter array show; None for a grey capture.
+        colour: its colours; None for a grey capture.
         background: which parts of frames show the background; None if all do. Others are left out of merging, and of what is
             compared with the panorama.
         copies: (T,) True for frames that are copies of the one before; None if there are none.

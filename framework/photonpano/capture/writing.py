@@ -68,6 +68,10 @@ def _write_truth(path: Path, truth: Mapping[str, NDArray[Any]]) -> tuple[Path, .
 def _require_bits(source: Source, path: Path) -> None:
     if source.info.kind != "binary":
         raise InputError(f"cannot write {path}: packed captures hold binary frames, and this source gives intensities")
+    if capture_of(source).colour is not None and not capture_of(source).corrects_sums:
+        raise InputError(
+            f"cannot write {path}: a packed capture holds one channel, and this capture has three; write channel: 0, 1 or 2"
+        )
     if capture_of(source).corrects_sums:
         raise InputError(
             f"cannot write {path}: some corrections change sums of frames, and not the frames; "

@@ -10,6 +10,7 @@ import numpy as np
 from photonpano.capture import MISSING, Capture, Gather, Index, LinearCorrection, capture_of, numbered
 from photonpano.contracts.protocols import Source
 from photonpano.corrections.colour_filter import ColourFilter, with_colours
+from photonpano.corrections.dark import DarkCounts
 from photonpano.corrections.pixels import Correction, Decide, Pixels
 from photonpano.errors import InputError
 from photonpano.values import BoolArray, Decision, FluxImage
@@ -46,6 +47,12 @@ def corrected_source(
         corrected = replace(corrected, steps=(step,))
     valid.flags.writeable = False
     corrected = replace(corrected, valid=valid, decisions=tuple(decisions))
+    if capture.colour is not None:
+        parts = {
+            name: replace(_rearranged(part, pixels.index), valid=valid, steps=corrected.steps)
+            for name, part in capture.colour.parts.items()
+        }
+        corrected = replace(corrected, colour=replace(capture.colour, parts=parts))
     if any(isinstance(correction, ColourFilter) and correction.in_colour for correction in corrections):
         return with_colours(corrected, pixels.colour, look)
     return corrected
@@ -63,6 +70,8 @@ def _applied(
         try:
             if capture.corrects_sums:
                 raise InputError("this source corrects its sums itself, and cannot be corrected further")
+            if capture.colour is not None and isinstance(correction, ColourFilter | DarkCounts):
+                raise InputError(f"{correction.name} is for one channel, and this capture has three; leave it out")
             pixels = correction.applied(pixels, capture, decide)
             if not pixels.valid.any():
                 raise InputError(f"{correction.name} leaves no pixel that may be used")

@@ -17,6 +17,7 @@ from photonpano.robust import huber_weights, robust_std
 from photonpano.values import Decision, FrameSpan, Homography
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -87,9 +88,13 @@ def divided_by(source: Source, vignette: Vignette) -> Capture:
     Pixels of a flat field may differ so far in gain that faint ones, which are multiplied most, would add more noise than
     light: they are weighted by the photons that they count, relative to a pixel of gain 1.
     """
-    capture, correction = capture_of(source), vignette.correction()
+    capture = capture_of(source)
 
     def divided(each: Capture) -> Capture:
+        # Channels have frames of their own.
+        own = each.source is not capture.source
+        mean = _mean_count(each, each.info.spread(_SPANS, _SPAN_FRAMES)) if own else vignette.mean
+        correction = replace(vignette, mean=mean).correction()
         weight = each.weight
         if vignette.std is not None:
             weight = np.asarray(vignette.gain if weight is None else weight * vignette.gain, np.float32)
@@ -153,8 +158,13 @@ def estimate_vignette(source: Source, trajectory: Trajectory) -> Vignette | None
     # No lens brightens the borders.
     if np.std(log_gain) < _LEAST_RMS or np.max(log_gain) > _LEAST_RMS:
         return None
-    counts = np.sum(list(capture.chunks(spans)), axis=0) / sum(map(len, spans))
-    return Vignette(np.exp(log_gain).astype(np.float32), counts.astype(np.float32), tuple(spans))
+    return Vignette(np.exp(log_gain).astype(np.float32), _mean_count(capture, spans), tuple(spans))
+
+
+def _mean_count(capture: Capture, spans: Sequence[FrameSpan]) -> FluxImage:
+    """Return the mean count of a frame of each pixel in spans, (H, W), which corrections do not change."""
+    counts = sum(each.astype(np.float32) for each in capture.chunks(spans))
+    return np.asarray(counts / np.float32(sum(map(len, spans))), np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

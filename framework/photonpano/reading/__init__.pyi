@@ -18,18 +18,17 @@ from .files import require_readable as require_readable
 from .files import require_there as require_there
 from .files import size_of as size_of
 from .first_look import look_first as look_first
-from .guessed_layout import Channel as Channel
 from .guessed_layout import Content as Content
 from .guessed_layout import frames_are_last as frames_are_last
 from .guessed_layout import packed_frames_are_last as packed_frames_are_last
 from .guessed_layout import sampled_frames as sampled_frames
 from .guessed_layout import sampled_spans as sampled_spans
 from .guessed_layout import unpacked_content as unpacked_content
-from .guessed_layout import with_channel as with_channel
 from .npy import NpyHeader as NpyHeader
 from .npy import any_npy_header as any_npy_header
 from .npy import arrived_frames as arrived_frames
 from .npy import gzipped_npy_header as gzipped_npy_header
+from .npy import has_channels as has_channels
 from .npy import npy_header as npy_header
 from .npy import require_frames as require_frames
 from .npy import require_whole as require_whole
@@ -49,3 +48,5 @@ from .sources import BlockSource as BlockSource
 from .sources import Closing as Closing
 from .sources import FrameLayout as FrameLayout
 from .sources import SingleFrameSource as SingleFrameSource
+from .sources import ThreeChannels as ThreeChannels
+from .sources import of_channel as of_channel

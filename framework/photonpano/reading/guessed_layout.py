@@ -1,22 +1,19 @@
-"""Guess the layout of an array of frames from samples: packed bits, bits or sums, the axis of the frames, the channel."""
+"""Guess the layout of an array of frames from samples: packed bits, bits or sums, the axis of the frames."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, get_args
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import InputError
 from photonpano.files.paths import Location, Url
 from photonpano.reading.files import OpenFiles, is_gzip, size_of
 from photonpano.reading.npy import NpyHeader, local, unpacked_start
 from photonpano.reading.pixel_order import MIN_SCORE, other_order, score, units_of
 from photonpano.values import FrameSpan
-
-Capture = TypeVar("Capture")
 
 _VALUES = 3 * 1024**2  # values read, about
 _RUN = 128  # most frames of a run of consecutive frames
@@ -37,7 +34,6 @@ Eight: TypeAlias = Literal["pixels of a column", "pixels of a row", "frames"]
 _PACKED_AXES: tuple[Eight, ...] = get_args(Eight)  # the axis of an array whose last is that of the frames
 
 _MIN_LEAD = 4.0  # standard errors by which the correlation along the axis of the frames exceeds the others
-_MIDDLE = 1  # the channel of three that is chosen
 
 
 class Content(NamedTuple):
@@ -195,23 +191,3 @@ def _correlation(blocks: Sequence[NDArray[np.float64]], axis: int) -> tuple[floa
     x, y = (np.concatenate([each[part].ravel() for each in along]) for part in (slice(None, -1), slice(1, None)))
     scatter = float(x.std() * y.std()) if x.size else 0.0
     return (float(((x - x.mean()) * (y - y.mean())).mean()) / scatter if scatter > 0 else 0.0), x.size
-
-
-class Channel(NamedTuple):
-    """The channel that a recognised capture is read with."""
-
-    keys: dict[str, int]  # the key `channel` of the source, if the capture has channels
-    clause: str  # follows the reason why the capture was recognised
-
-
-def with_channel(read: Callable[[int | None], Capture]) -> tuple[Capture, Channel] | None:
-    """Return what `read` returns without a channel, or for the middle one of three; None if both raise an `InputError`."""
-    for channel in (None, _MIDDLE):
-        try:
-            found = read(channel)
-        except InputError:
-            continue
-        if channel is None:
-            return found, Channel({}, "")
-        return found, Channel({"channel": channel}, ", of whose channels the middle one is used")
-    return None

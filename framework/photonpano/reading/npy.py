@@ -26,6 +26,7 @@ from photonpano.reading.remote import read_range
 _HEADER_BYTES = 4096  # bytes of a URL that are read for the header; that of a capture has 128
 _SHORTEST_HEADER = 128  # bytes of the shortest header that numpy writes
 _BLOCK_BYTES = 1024**2
+_CHANNELS = 3
 
 
 class NpyHeader(NamedTuple):
@@ -94,6 +95,17 @@ def require_frames(path: Location, header: NpyHeader, axes: str) -> None:
         raise InputError(f"{path} is empty: its shape is {header.shape} ({axes})")
     if header.fortran_order:
         raise InputError(f"{path} is stored in Fortran order; save it again with numpy.ascontiguousarray(cube)")
+
+
+def has_channels(path: Location, header: NpyHeader) -> bool:
+    """Return whether an array has a fourth axis, of three channels; an `InputError` if they lie along another axis."""
+    if len(header.shape) == 4 and header.shape[3] != _CHANNELS and _CHANNELS in header.shape:
+        axis = header.shape.index(_CHANNELS)
+        raise InputError(
+            f"{path} has three channels along axis {axis} of its shape {header.shape}; they belong last: save "
+            f"numpy.moveaxis(numpy.load(path), {axis}, -1) to another file"
+        )
+    return len(header.shape) == 4 and header.shape[3] == _CHANNELS
 
 
 def arrived_frames(path: Location) -> int | None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from photonpano.contracts.protocols import Closing as Closing
 from photonpano.photometry import BinaryResponse, BitOrder, packed_counts, reversed_bits
 from photonpano.reading.files import OpenFiles
-from photonpano.values import Counts, Frames, FrameSpan, StreamInfo
+from photonpano.values import Counts, FloatArray, Frames, FrameSpan, StreamInfo
 
 Pixels = TypeVar("Pixels", bound=np.generic)
 
@@ -132,6 +133,39 @@ class BinarySource(Closing, ABC):
     def close(self) -> None:
         """Close the files."""
         self.files.close()
+
+
+class ThreeChannels(Closing):
+    """Binary frames whose pixels see red, green and blue at once: a `photonpano.ColouredSource`, which is packed.
+
+    A pixel of its grey frames is lit where it is lit in any channel. So they are the frames of pixels without filters: the flux
+    is the sum of the three.
+    """
+
+    def __init__(self, opened: Callable[[int | None], BinarySource]) -> None:
+        """Take what opens the frames of a channel, 0 to 2 for red, green and blue, or the grey ones for None."""
+        self._grey = opened(None)
+        self._channels = {name: opened(channel) for channel, name in enumerate(("red", "green", "blue"))}
+        self.info, self.response, self.valid = self._grey.info, self._grey.response, self._grey.valid
+        self.counts, self.frames, self.packed = self._grey.counts, self._grey.frames, self._grey.packed
+
+    def colours(self) -> Mapping[str, BinarySource]:
+        """Return a source for each channel: see `photonpano.ColouredSource`."""
+        return self._channels
+
+    def clear_mix(self) -> FloatArray:
+        """Return the flux of the grey frames as factors of that of the channels: see `photonpano.ColouredSource`."""
+        return np.ones(len(self._channels))
+
+    def close(self) -> None:
+        """Close the files."""
+        for source in (self._grey, *self._channels.values()):
+            source.close()
+
+
+def of_channel(values: NDArray[Any], channel: int | None) -> NDArray[Any]:
+    """Return a channel of values (..., 3), bits or bytes of eight bits; what is lit in any channel for None."""
+    return reduce(np.bitwise_or, np.moveaxis(values, -1, 0)) if channel is None else values[..., channel]
 
 
 class BlockSource(Closing, ABC):

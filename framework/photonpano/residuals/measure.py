@@ -309,16 +309,16 @@ def _measured(
     lever = middle - corners(shape).mean(axis=0)
     ideal = first.ideal(middle)
     colours = [_Colour.of(*part) for part in predictions.parts]
-    capture = colours[0].capture
     normal, gradient, reduced_chi2 = np.zeros((len(spans), 5, 5)), np.zeros((len(spans), 5)), np.zeros(len(spans))
     total = Totals.zeros(shape, first.canvas.shape)
-    # A pixel adds to the image of its colour, which fewer frames have seen.
-    frames_seen = max(predictions.frames_seen / len(colours), 1.0)
+    # A pixel adds to the image of its colour, which fewer frames may have seen.
+    frames_seen = max(float(np.mean([each.frames_seen for _, each in predictions.parts])), 1.0)
     images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
     for index, (span, homography) in enumerate(zip(spans, homographies, strict=True)):
-        raw = capture.chunk(span)
         sums[:] = 0
-        for colour in colours:
+        for place, colour in enumerate(colours):
+            if place == 0 or predictions.in_channels:
+                raw = colour.capture.chunk(span)
             counts = colour.counted(raw, span)
             colour.prediction.view(homography, images, span)
             noise = colour.noise_beside(images[0], images[1], span)

@@ -190,13 +190,22 @@ class Predictions:
     @property
     def frames_seen(self) -> float:
         """Frames that saw a place of the panorama, in any colour."""
-        return sum(prediction.frames_seen for _, prediction in self.parts)
+        seen = [prediction.frames_seen for _, prediction in self.parts]
+        return max(seen) if self.in_channels else sum(seen)
+
+    @property
+    def in_channels(self) -> bool:
+        """Whether every pixel sees all colours, in frames of their own; otherwise, each sees one."""
+        return self.parts[0][0].source is not self.parts[-1][0].source
 
     def predicted(self, instant: float) -> tuple[FluxImage, FluxImage]:
-        """Predict the frame of an instant, each pixel in its colour: see `PanoramaView`."""
+        """Predict the grey frame of an instant, each pixel in its colour: see `PanoramaView`."""
         images = [prediction.predicted(instant) for _, prediction in self.parts]
         if len(images) == 1:
             return images[0]
+        if self.in_channels:  # a pixel is dark if it is in all channels
+            dark = np.prod([1 - of_colour for of_colour, _ in images], axis=0)
+            return 1 - dark, dark * (1 - dark)
         mean, variance = (np.full(self.first.frame_shape, np.nan, np.float32) for _ in range(2))
         for (source, _), (of_colour, its_variance) in zip(self.parts, images, strict=True):
             mean[source.valid], variance[source.valid] = of_colour[source.valid], its_variance[source.valid]

@@ -20,12 +20,15 @@ from photonpano.reading import (
     NpyHeader,
     PackedFileSource,
     PixelOrder,
+    ThreeChannels,
     any_npy_header,
     arrived_frames,
     as_written,
     frames_are_last,
+    has_channels,
     is_gzip,
     objections,
+    of_channel,
     other_order,
     packed_frames_are_last,
     require_frames,
@@ -33,19 +36,21 @@ from photonpano.reading import (
     sampled_frames,
     unpacked,
     unpacked_content,
-    with_channel,
 )
 from photonpano_core.sources.npy_values import NpyBits, NpySums, Values
 
 _CHECKED = 16  # frames whose values are checked before a run
 _PLAIN = re.compile(r"[\w./~+-]+")  # paths that YAML takes without quotes
 _TYPES = {"bits": "bool", "sums": "numpy.uint16"}
-_CHANNELS = 3
+_IN_COLOUR = ", in three channels"
 _PATH = "the .npy file, or its URL; a file compressed with gzip is unpacked once, to a file beside it"
 
 
 class PackedNpyConfig(Config):
-    """A capture in one .npy file: uint8 (frames, height, ceil(width / 8)), as `numpy.packbits(cube, axis=-1)` makes it."""
+    """A capture in one .npy file: uint8 (frames, height, ceil(width / 8)), as `numpy.packbits(cube, axis=-1)` makes it.
+
+    In colour, the array is (frames, height, ceil(width / 8), 3): three channels, each packed along the width.
+    """
 
     path: SpecLocation = Field(description=_PATH)
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
@@ -56,8 +61,8 @@ class PackedNpyConfig(Config):
         None,
         ge=0,
         le=2,
-        description="channel of a colour capture (frames, height, ceil(width / 8), 3): 0, 1 or 2; leave it out for "
-        "other captures",
+        description="the one channel that is read of (frames, height, ceil(width / 8), 3): 0, 1 or 2; by default all, red, "
+        "green and blue, for a panorama in colour",
     )
     bit_order: Literal["big", "little"] | None = Field(
         None,
@@ -78,7 +83,10 @@ class PackedNpyConfig(Config):
 
 
 class NpyConfig(Config):
-    """A capture in one .npy file: integers or bool (frames, height, width), a pixel to a value."""
+    """A capture in one .npy file: integers or bool (frames, height, width), a pixel to a value.
+
+    Bits in colour are (frames, height, width, 3): three channels.
+    """
 
     path: SpecLocation = Field(description=_PATH)
     holds: Literal["bits", "sums"] = Field(
@@ -104,7 +112,7 @@ class NpyConfig(Config):
 
 
 AnyConfig: TypeAlias = PackedNpyConfig | NpyConfig
-AnySource: TypeAlias = PackedFileSource | NpyBits | NpySums
+AnySource: TypeAlias = PackedFileSource | NpyBits | NpySums | ThreeChannels
 
 
 def _open(config: AnyConfig) -> AnySource:
@@ -126,13 +134,17 @@ def _arrived(config: AnyConfig) -> Arrived:
 
 
 def _source(config: AnyConfig, path: Location, header: NpyHeader) -> AnySource:
-    if isinstance(config, PackedNpyConfig):
+    if isinstance(config, NpyConfig) and config.frames_per_sum is not None:
+        return NpySums(Values(path, header, config.frame_axis == "last"), config.frames_per_sum, config.frame_rate_hz)
+
+    def opened(channel: int | None) -> PackedFileSource | NpyBits:
+        if isinstance(config, NpyConfig):
+            return NpyBits(Values(path, header, config.frame_axis == "last"), config.frame_rate_hz, channel)
         file = FrameFile(path, header.shape[0], header.offset)
-        return PackedFileSource([file], _layout(config, header), config.frame_rate_hz)
-    values = Values(path, header, config.frame_axis == "last")
-    if config.frames_per_sum is None:
-        return NpyBits(values, config.frame_rate_hz)
-    return NpySums(values, config.frames_per_sum, config.frame_rate_hz)
+        return PackedFileSource([file], _layout(config, header, channel), config.frame_rate_hz)
+
+    channel = config.channel if isinstance(config, PackedNpyConfig) else None
+    return ThreeChannels(opened) if has_channels(path, header) and channel is None else opened(channel)
 
 
 def _whole_header(config: AnyConfig) -> NpyHeader:
@@ -160,8 +172,17 @@ def _header(config: AnyConfig) -> NpyHeader:
             f"{path} holds {header.dtype} values; {config.holds} are bool or whole numbers: convert them with "
             f"cube.astype({_TYPES[config.holds]})"
         )
-    if len(header.shape) != 3:
-        raise InputError(f"{path} has the shape {header.shape}; a capture has 3 dimensions, frames, height and width")
+    if has_channels(path, header):
+        if config.holds == "sums" or config.frame_axis == "last":
+            key, remedy = "frame_axis: last", "numpy.moveaxis(numpy.load(path), 2, 0) to another file, and leave it out"
+            if config.holds == "sums":
+                key, remedy = "holds: sums", "one of them, such as numpy.load(path)[..., 1], to another file"
+            raise InputError(f"{path} has three channels, in the shape {header.shape}, and {key} reads one only; save {remedy}")
+    elif len(header.shape) != 3:
+        raise InputError(
+            f"{path} has the shape {header.shape}; a capture has 3 dimensions, frames, height and width, and one in colour a "
+            "fourth, of 3 channels"
+        )
     require_frames(path, header, "height, width, frames" if config.frame_axis == "last" else "frames, height, width")
     return header
 
@@ -170,34 +191,32 @@ def _require_packed(config: PackedNpyConfig, header: NpyHeader) -> None:
     path, channel = config.path, config.channel
     if header.dtype != np.uint8:
         raise InputError(f"{path} holds {header.dtype} values, not bytes of eight pixels; {_remedy(path, header)}")
-    colour = len(header.shape) == 4 and header.shape[3] == _CHANNELS
+    colour = has_channels(path, header)
     if len(header.shape) != 3 and not colour:
         raise InputError(
             f"{path} has the shape {header.shape}; a packed capture has 3 dimensions, frames, height and bytes of a row, and "
             "one of colour a fourth, of 3 channels"
         )
     require_frames(path, header, "frames, height, bytes of a row")
-    if colour and channel is None:
-        raise InputError(f"{path} is a capture in colour, of shape {header.shape}; choose a channel: 0, 1 or 2")
     if not colour and channel is not None:
         raise InputError(f"{path} has the shape {header.shape} and no channels; leave out channel: {channel}")
     _frame_shape(config, header)
 
 
-def _layout(config: PackedNpyConfig, header: NpyHeader) -> FrameLayout:
-    channel, bit_order = config.channel, config.bit_order or "big"
+def _layout(config: PackedNpyConfig, header: NpyHeader, channel: int | None) -> FrameLayout:
+    bit_order = config.bit_order or "big"
 
-    def of_channel(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return stored if channel is None else stored[..., channel]
+    def grey(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return of_channel(stored, channel) if len(header.shape) == 4 else stored
 
     def along_width(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        columns = np.ascontiguousarray(of_channel(stored))
+        columns = np.ascontiguousarray(grey(stored))
         return packed_along_width(reversed_bits(columns) if bit_order == "little" else columns)[:, : config.height]
 
     shapes = _frame_shape(config, header), header.shape[1:]
     if config.packed_along == "height":
         return FrameLayout(*shapes, to_rows=along_width)
-    return FrameLayout(*shapes, bit_order, to_rows=None if channel is None else of_channel)
+    return FrameLayout(*shapes, bit_order, to_rows=grey if len(header.shape) == 4 else None)
 
 
 def _frame_shape(config: PackedNpyConfig, header: NpyHeader) -> tuple[int, int]:
@@ -247,15 +266,17 @@ def _section(path: Location, holds: str, highest: int = 1) -> str:
 
 def _contents(path: Location, header: NpyHeader) -> Content | None:
     """Return the content of an array of bool or whole numbers; None if it is something else, or bytes of eight pixels each."""
-    if header.dtype.kind not in "bui" or len(header.shape) != 3 or min(header.shape) < 1 or header.fortran_order:
+    if header.dtype.kind not in "bui" or min(header.shape, default=0) < 1 or header.fortran_order:
         return None
-    samples = sampled_frames(path, header)
+    if len(header.shape) != 3 and not has_channels(path, header):
+        return None
+    samples = _samples(path, header)
     return unpacked_content(samples) if samples else None
 
 
 def _frames_are_last(path: Location, header: NpyHeader) -> bool:
-    samples = sampled_frames(path, header)
-    return bool(samples) and frames_are_last(samples, header.shape)
+    samples = _samples(path, header)
+    return bool(samples) and len(header.shape) == 3 and frames_are_last(samples, header.shape)
 
 
 def _require_order(config: PackedNpyConfig) -> None:
@@ -290,9 +311,9 @@ def _frames_last(path: Location, header: NpyHeader, a_byte_holds: str, remedy: s
     )
 
 
-def _samples(path: Location, header: NpyHeader, channel: int | None) -> list[NDArray[np.uint8]]:
-    samples: list[NDArray[Any]] = sampled_frames(path, header)
-    return samples if channel is None else [each[..., channel] for each in samples]
+def _samples(path: Location, header: NpyHeader, channel: int | None = None) -> list[NDArray[Any]]:
+    samples = sampled_frames(path, header)
+    return [of_channel(each, channel) for each in samples] if len(header.shape) == 4 else samples
 
 
 def _keys_of(order: PixelOrder) -> dict[str, str]:
@@ -318,13 +339,13 @@ def _is_alone(path: Location) -> bool:
 def _recognise_packed(path: Location) -> Recognised | None:
     if not _is_alone(path):
         return None
-    found = with_channel(lambda channel: _header(PackedNpyConfig(path=path, channel=channel)))
-    if found is None:
+    try:
+        header = _header(PackedNpyConfig(path=path))
+    except InputError:
         return None
-    header, channel = found
-    keys: dict[str, Any] = {"path": as_written(path)} | channel.keys
-    because = f"uint8 of shape {header.shape} in a .npy file{channel.clause}"
-    samples = _samples(path, header, channel.keys.get("channel"))
+    keys: dict[str, Any] = {"path": as_written(path)}
+    because = f"uint8 of shape {header.shape} in a .npy file{_IN_COLOUR if len(header.shape) == 4 else ''}"
+    samples = _samples(path, header)
     if not samples:
         return Recognised(keys, because)
     shape = header.shape[:3]
@@ -349,7 +370,8 @@ def _recognise_bits(path: Location) -> Recognised | None:
     if content is None or content.holds != "bits":
         return None
     keys = {"path": as_written(path), "holds": "bits"}
-    because = f"{header.dtype} of shape {header.shape} in a .npy file, with the values 0 and {content.highest} only"
+    colour = _IN_COLOUR if len(header.shape) == 4 else ""
+    because = f"{header.dtype} of shape {header.shape} in a .npy file{colour}, with the values 0 and {content.highest} only"
     if not _frames_are_last(path, header):
         return Recognised(keys, because)
     return Recognised(keys | {"frame_axis": "last"}, f"{because}, and values are most alike along the last axis")

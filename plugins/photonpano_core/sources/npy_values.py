@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError, Location, StreamInfo, Url
 from photonpano.photometry import BinarySumResponse
-from photonpano.reading import BinarySource, BlockSource, FrameFile, FrameLayout, NpyHeader, StoredFrames
+from photonpano.reading import BinarySource, BlockSource, FrameFile, FrameLayout, NpyHeader, StoredFrames, of_channel
 
 _BLOCK_BYTES = 4 * 1024**2  # read at once of frames along the last axis, which are scattered over the file
 _NO_BIT = "bits are 0 and 1, or 0 and 255; write holds: sums for sums, or use packed-npy for bytes of eight pixels"
@@ -20,19 +20,26 @@ class Values:
     """Reads the values of frames in a .npy file, from any thread."""
 
     def __init__(self, path: Location, header: NpyHeader, frames_last: bool) -> None:
-        """Take an array whose first or last axis is that of frames; raises an `InputError` if it is the last at a URL."""
-        n_frames, height, width = header.shape[-1:] + header.shape[:-1] if frames_last else header.shape
+        """Take an array whose first or last axis is that of frames; raises an `InputError` if it is the last at a URL.
+
+        If the frames are first, there may be a fourth axis, of channels.
+        """
+        n_frames, height, width, *_ = header.shape[-1:] + header.shape[:-1] if frames_last else header.shape
         self.path, self.shape, self._dtype = path, (n_frames, height, width), header.dtype
         self._stored: StoredFrames | None = None
         if not frames_last:
-            self._stored = StoredFrames([FrameFile(path, n_frames, header.offset)], (height, width * header.dtype.itemsize))
+            stored_shape = *header.shape[1:-1], header.shape[-1] * header.dtype.itemsize
+            self._stored = StoredFrames([FrameFile(path, n_frames, header.offset)], stored_shape)
         elif isinstance(path, Url):
             raise InputError(f"{path} has its frames along the last axis, scattered over the file; download it, and convert it")
         else:
             self._scattered = np.memmap(path, header.dtype, "r", header.offset, header.shape)
 
     def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
-        """Yield some frames of a span at a time, (n, H, W), and their place in it; the next step may overwrite them."""
+        """Yield some frames of a span at a time, (n, H, W) or (n, H, W, 3), and their place in it.
+
+        The next step may overwrite them.
+        """
         if self._stored is not None:
             yield from ((place, stored.view(self._dtype)) for place, stored in self._stored.blocks(span))
             return
@@ -44,10 +51,9 @@ class Values:
     def require(self, wrong: NDArray[np.bool_], values: NDArray[Any], first: int, remedy: str) -> None:
         """Raise for the first of the values, of frames from `first` on, that is wrong."""
         if wrong.any():
-            frame, row, column = np.argwhere(wrong)[0].tolist()
+            frame, row, column, *_ = np.argwhere(wrong)[0].tolist()
             raise InputError(
-                f"{self.path} holds the value {values[frame, row, column]} in frame {first + frame}, row {row}, column "
-                f"{column}; {remedy}"
+                f"{self.path} holds the value {values[wrong][0]} in frame {first + frame}, row {row}, column {column}; {remedy}"
             )
 
     def close(self) -> None:
@@ -59,10 +65,11 @@ class Values:
 class NpyBits(BinarySource):
     """Binary frames, a pixel to a value; reading them raises an `InputError` for a value that is not a bit."""
 
-    def __init__(self, values: Values, frame_rate_hz: float | None) -> None:
+    def __init__(self, values: Values, frame_rate_hz: float | None, channel: int | None = None) -> None:
+        """Take values, and the channel of those with channels, or None for what is lit in any."""
         n_frames, height, width = values.shape
         super().__init__(n_frames, FrameLayout((height, width), (height, -(-width // 8))), frame_rate_hz)
-        self._values = values
+        self._values, self._channel = values, channel
 
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Yield the frames of a span, packed: see `BinarySource`."""
@@ -70,7 +77,8 @@ class NpyBits(BinarySource):
             if values.max() > 1 or values.min() < 0:
                 wrong = (values != 0) & (values != 1) & (values != 255)
                 self._values.require(wrong, values, span.start + place.start, _NO_BIT)
-            yield place, np.packbits(values != 0, axis=2)
+            lit = values != 0
+            yield place, np.packbits(of_channel(lit, self._channel) if lit.ndim == 4 else lit, axis=2)
 
     def close(self) -> None:
         """Close the file."""

@@ -103,10 +103,11 @@ def test_packed_npy_is_recognised_by_header(tmp_path: Path) -> None:
     assert set(recognised(tmp_path / "cube.npy.gz")) == {"packed-npy"}
     np.save(tmp_path / "colour.npy", np.repeat(np.packbits(FRAMES, axis=-1)[..., None], 3, axis=-1))
     found = recognised(tmp_path / "colour.npy")
-    assert found["packed-npy"].keys == {"path": str(tmp_path / "colour.npy"), "channel": 1}
-    assert (
-        found["packed-npy"].because == "uint8 of shape (6, 10, 2, 3) in a .npy file, of whose channels the middle one is used"
-    )
+    assert found["packed-npy"].keys == {"path": str(tmp_path / "colour.npy")}
+    assert found["packed-npy"].because == "uint8 of shape (6, 10, 2, 3) in a .npy file, in three channels"
+    bits = np.repeat(np.tile(FRAMES, (2, 1, 1))[..., None], 3, axis=-1)
+    np.save(tmp_path / "bits.npy", bits)
+    assert recognised(tmp_path / "bits.npy")["npy"].keys == {"path": str(tmp_path / "bits.npy"), "holds": "bits"}
 
 
 @pytest.mark.parametrize("dtype", [bool, np.uint8, np.int32])

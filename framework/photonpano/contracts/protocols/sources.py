@@ -139,13 +139,14 @@ class WeightedSource(Source, Protocol, metaclass=_Optional):
 
 @runtime_checkable
 class ColouredSource(Source, Protocol, metaclass=_Optional):
-    """A source behind a colour filter array. By itself it is grey: its corrected sums are those of pixels of one colour.
+    """A source in colour. By itself it is grey, for the motion; the panorama is rendered from the sources of its colours.
 
-    Motion is estimated from this grey source, and the panorama is rendered from the sources of its colours.
+    Behind a colour filter array, each pixel has one colour, and corrected sums are those of pixels of one colour. In binary
+    frames of several channels, all pixels are valid in all of them, and a pixel of the grey source is lit where it is in any.
     """
 
     def colours(self) -> Mapping[str, Source]:
-        """Return a source for each colour: the same frames, in which only the pixels behind filters of this colour are valid.
+        """Return a source for each colour: its frames, in which only pixels that see this colour are valid.
 
         Returns:
             Sources of "red", "green", "blue", and if there are pixels without filter, "clear", in this order.
