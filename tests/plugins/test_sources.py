@@ -150,6 +150,26 @@ class TestPackedRaw(SourceConformance):
         return {"path": folder / "capture.raw"}
 
 
+class SpikeDat(SourceConformance):
+    contribution = CATALOG.find("source", "spike-dat").contribution
+    frame_shape = (18, 28)
+    config = {"frame_shape": [18, 28]}
+    wrong = (NO_FILE, {"frame_shape": [1000, 1000]})
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        (folder / "capture.dat").write_bytes(np.packbits(frames.ravel(), bitorder="little").tobytes())
+        return {"path": folder / "capture.dat"}
+
+
+class TestSpikeDat(SpikeDat):
+    pass
+
+
+class TestSpikeDatInWholeBytes(SpikeDat):
+    frame_shape = (18, 32)
+    config = {"frame_shape": [18, 32]}
+
+
 class ZarrConformance(SourceConformance):
     wrong = (NO_FILE, {"width": 80})
     compressed = False

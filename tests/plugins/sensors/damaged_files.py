@@ -272,6 +272,10 @@ CASES: dict[str, Arrange] = {
             "in no folder": files({}, "x"),
         }.items()
     },
+    "spike-dat that fits another shape": files({"cube.dat": bytes(3 * 480 * 640 // 8)}, "cube.dat", frame_shape=[250, 400]),
+    "spike-dat that fits no shape": files({"cube.dat": bytes(12_501)}, "cube.dat", frame_shape=[250, 400]),
+    "spike-dat that is empty": files({"cube.dat": b""}, "cube.dat", frame_shape=[250, 400]),
+    "spike-dat without a file": files({}, "cube.dat", frame_shape=[250, 400]),
     "spad512-sparse that is empty": words(),
     "spad512-sparse of a byte": words(more=b"\0"),
     "spad512-sparse within a frame": words(5, 262144, 7),

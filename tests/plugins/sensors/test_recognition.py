@@ -19,7 +19,7 @@ from photonpano.photometry import BinaryResponse
 
 NAMES = (
     "packed-npy npy zarr swissspad-half swissspad-full spad512 spad512-sparse mat-parts visionsim ubicept-h5 "
-    "video fastcam-mraw image-folder"
+    "spike-dat video fastcam-mraw image-folder"
 )
 SOURCES = {name: discover().find("source", name).contribution for name in NAMES.split()}
 PHOTRON = Path(__file__).parents[2] / "data" / "photron"
@@ -92,6 +92,19 @@ def test_spad512_sparse_is_recognised_by_last_word(tmp_path: Path, bin_file: Cal
     frames = np.random.default_rng(0).random((4, 512, 512)) < 0.01
     (tmp_path / "sparse.bin").write_bytes(bin_file("spad512-sparse", frames))
     assert set(recognised(tmp_path)) == {"spad512-sparse"}
+
+
+@pytest.mark.parametrize("shape", [(250, 400), (1000, 1000), (480, 640), (360, 640), (396, 640)])
+def test_spike_dat_is_recognised_by_rows_and_frames_that_are_alike(
+    tmp_path: Path, street: np.ndarray, shape: tuple[int, int]
+) -> None:
+    scene = cv2.resize(street[:400, :640], shape[::-1])
+    frames = recorded(scene, 60)  # whole frames of 250x400 px in any shape
+    (tmp_path / "capture.dat").write_bytes(np.packbits(frames.ravel(), bitorder="little").tobytes())
+    keys = {"path": str(tmp_path / "capture.dat"), "frame_shape": list(shape)}
+    assert recognised(tmp_path / "capture.dat")["spike-dat"].keys == keys
+    (tmp_path / "noise.dat").write_bytes(np.random.default_rng(0).bytes(1_000_000))
+    assert not recognised(tmp_path / "noise.dat")
 
 
 def test_packed_npy_is_recognised_by_header(tmp_path: Path) -> None:
