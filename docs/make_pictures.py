@@ -16,7 +16,7 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "benchmarks"))
 from harness import IMAGES, Study, chosen, command
 from picture_parts import encoded
-from pictures import movers, scan, scenes, street, tremor
+from pictures import instant, movers, scan, scenes, street, tremor
 
 PICTURES = {
     "readme levels interpolation": street.pictures,
@@ -24,6 +24,7 @@ PICTURES = {
     "tremor video": tremor.pictures,
     "what-moves action-shot": movers.pictures,
     "real-world": movers.real_world,
+    "one-instant": instant.pictures,
     "night depth": scenes.pictures,
     "room": scenes.room,
     "mandrill": scan.mandrill,

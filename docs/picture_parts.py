@@ -80,7 +80,7 @@ def all_labelled(images: Mapping[str, Picture]) -> list[Picture]:
 def beside(pictures: Sequence[Picture]) -> Picture:
     """Put pictures side by side, as high as the lowest."""
     height = min(len(each) for each in pictures)
-    gap = np.full((height, GAP), 255, np.uint8)
+    gap = np.full((height, GAP, *pictures[0].shape[2:]), 255, np.uint8)
     return np.hstack([part for each in pictures for part in (each[:height], gap)][:-1])
 
 
