@@ -8,7 +8,9 @@ from photonpano.record.poses.formats import (
     colmap,
     in_standard_world,
     nerfstudio,
+    openmvg,
     ply,
+    read_colmap,
     tum,
 )
 
@@ -20,6 +22,8 @@ __all__ = [
     "colmap",
     "in_standard_world",
     "nerfstudio",
+    "openmvg",
     "ply",
+    "read_colmap",
     "tum",
 ]

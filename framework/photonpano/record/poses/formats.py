@@ -9,19 +9,20 @@ Convention:
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import LocationError
+from photonpano.errors import InputError, LocationError
 from photonpano.geometry import Camera
-from photonpano.photometry import tone_mapped
+from photonpano.photometry import srgb_to_linear, tone_mapped
 from photonpano.values import FloatArray, PoseEstimate, ScenePoints
 
-PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "tum"]
+PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "openmvg", "tum"]
 
 _GRAPHICS = np.diag([1.0, -1.0, -1.0])  # axes of a camera in OpenGL, x right, y up, z back, to ours
 _WHITE_QUANTILE = 0.995  # quantile of the flux of points that is white
@@ -51,10 +52,14 @@ class Poses:
 
 
 def colmap(poses: Poses) -> dict[str, str]:
-    """Return the text files of a COLMAP model by name: one OPENCV camera, the images, and the points that are known."""
+    """Return the text files of a COLMAP model by name: one camera, the images, and the points that are known.
+
+    The camera is OPENCV, or PINHOLE without distortion, which is all that many readers know.
+    """
     camera, (height, width) = poses.camera, poses.frame_shape
+    model, distortion = ("OPENCV", camera.distortion) if camera.distorts else ("PINHOLE", ())
     centre = (each + 0.5 for each in camera.centre_px)
-    numbers = (camera.matrix[0, 0], camera.matrix[1, 1], *centre, *camera.distortion)
+    numbers = (camera.matrix[0, 0], camera.matrix[1, 1], *centre, *distortion)
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then its points"]
     from_world = np.swapaxes(poses.rotations, -1, -2)
     moved = -(from_world @ poses.places[..., None])[..., 0] + 0.0  # without negative zeros
@@ -66,8 +71,8 @@ def colmap(poses: Poses) -> dict[str, str]:
         images += [f"{place} {_line(w, x, y, z, *shift)} 1 {name}", " ".join(seen)]
         for index, point in enumerate(points.tolist()):
             tracks.setdefault(point, []).append(f"{place} {index}")
-    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY, K1, K2, P1, P2"]
-    cameras.append(f"1 OPENCV {width} {height} {_line(*numbers)}")
+    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY; of OPENCV also K1, K2, P1, P2"]
+    cameras.append(f"1 {model} {width} {height} {_line(*numbers)}")
     cloud = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK"]
     if poses.points is not None:
         greys, errors = greys_of(poses.points), point_errors(poses)
@@ -113,8 +118,84 @@ def tum(poses: Poses) -> dict[str, str]:
     return {"trajectory.txt": "\n".join(lines) + "\n"}
 
 
+def openmvg(poses: Poses) -> dict[str, str]:
+    """Return the `sfm_data.json` of OpenMVG: views, one camera, poses, and the points that are known.
+
+    Integers are pixel centres in OpenMVG, too. Ids with bit 31 set are those of the objects that cereal, its library, reads.
+    """
+    camera, (height, width) = poses.camera, poses.frame_shape
+    new = 2**31 + 1
+
+    def pointer(number: int, data: dict[str, Any]) -> dict[str, Any]:
+        return {"ptr_wrapper": {"id": new + number, "data": data}}
+
+    size, (k1, k2, p1, p2) = {"width": width, "height": height}, camera.distortion.tolist()
+    pinhole = {**size, "focal_length": camera.focal_px, "principal_point": list(camera.centre_px)}
+    intrinsic = pointer(len(poses.names), {"value0": pinhole, "disto_t2": [k1, k2, 0.0, p1, p2]})
+    views, seen = [], dict[int, list[dict[str, Any]]]()
+    for place, name in enumerate(poses.names):
+        data = {"local_path": "", "filename": name, **size, "id_view": place, "id_intrinsic": 0, "id_pose": place}
+        views.append({"polymorphic_id": 2**30, **pointer(place, data)})
+    for place, (points, xy) in enumerate(poses.observed):
+        for number, (point, at) in enumerate(zip(points.tolist(), xy.tolist(), strict=True)):
+            seen.setdefault(point, []).append({"key": place, "value": {"id_feat": number, "x": at}})
+    from_world = np.swapaxes(poses.rotations, -1, -2).tolist()
+    known = [] if poses.points is None else sorted(seen)
+    content = {
+        "sfm_data_version": "0.3",
+        "root_path": "images",
+        "views": _keyed(views),
+        "intrinsics": _keyed([{"polymorphic_id": new, "polymorphic_name": "pinhole_brown_t2", **intrinsic}]),
+        "extrinsics": _keyed([{"rotation": r, "center": c} for r, c in zip(from_world, poses.places.tolist(), strict=True)]),
+        "structure": [
+            {"key": point, "value": {"X": poses.points.positions[point].tolist(), "observations": seen[point]}}
+            for point in known
+            if poses.points is not None
+        ],
+        "control_points": [],
+    }
+    return {"sfm_data.json": json.dumps(content, indent=1) + "\n"}
+
+
+def _keyed(values: Sequence[Any]) -> list[dict[str, Any]]:
+    """Return values as cereal writes a map from their places."""
+    return [{"key": key, "value": value} for key, value in enumerate(values)]
+
+
 # Each returns the content of files by name.
-POSE_FORMATS: Mapping[PoseFormat, Callable[[Poses], dict[str, str]]] = {"colmap": colmap, "nerfstudio": nerfstudio, "tum": tum}
+POSE_FORMATS: Mapping[PoseFormat, Callable[[Poses], dict[str, str]]] = {
+    "colmap": colmap,
+    "nerfstudio": nerfstudio,
+    "openmvg": openmvg,
+    "tum": tum,
+}
+
+
+def read_colmap(folder: Path, camera: Camera, frame_shape: tuple[int, int]) -> Poses:
+    """Read what `colmap` has written of images of a camera, with their points; times are not known, and 0.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    from scipy.spatial.transform import Rotation
+
+    try:
+        images, cloud = ((folder / name).read_text("utf-8").splitlines()[1:] for name in ("images.txt", "points3D.txt"))
+        heads = [line.split() for line in images[::2]]
+        seen = [np.array(line.split(), float).reshape(-1, 3) for line in images[1::2]]
+        numbers = np.array([head[1:8] for head in heads], float).reshape(-1, 7)
+        rows = np.array([line.split()[:5] for line in cloud], float).reshape(-1, 5)
+        from_world = Rotation.from_quat(np.roll(numbers[:, :4], -1, axis=1)).as_matrix()
+        places = centres(np.concatenate([from_world, numbers[:, 4:, None]], axis=-1))
+        names = tuple(head[9] for head in heads)
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(f"{folder} is no COLMAP model of a run: {error}") from error
+    positions, flux = np.zeros((int(rows[:, 0].max(initial=0)), 3)), np.full(int(rows[:, 0].max(initial=0)), np.nan, np.float32)
+    at = rows[:, 0].astype(int) - 1
+    positions[at], flux[at] = rows[:, 1:4], srgb_to_linear(rows[:, 4] / 255)
+    observed = tuple((each[:, 2].astype(np.intp) - 1, each[:, :2] - 0.5) for each in seen)
+    seconds, to_world = np.zeros(len(names)), np.swapaxes(from_world, -1, -2)
+    return Poses(camera, frame_shape, names, to_world, seconds, places, observed, ScenePoints(positions, flux))
 
 
 def ply(points: ScenePoints) -> bytes:
