@@ -40,14 +40,14 @@ def pictures(study: Study) -> Iterator[tuple[str, draw.Picture]]:
 def uncertainty(folder: Path) -> draw.Picture:
     """Return the panorama of a run, its standard deviation, and the ratio of both."""
     flux, std = load_panorama(folder).flux, tifffile.imread(folder / "panorama-std.tiff")
-    figure, panels = draw.panels(11, 2.6, columns=3)
+    figure, panels = draw.panels(11, 1.9, columns=3)
     maps = {
         "flux": (flux, "gray"),
         "standard deviation": (std, "magma"),
         "flux in standard deviations": (flux / std, "viridis"),
     }
     for panel, (name, (image, colours)) in zip(panels, maps.items(), strict=True):
-        shown = panel.imshow(image, colours, vmin=0, vmax=float(np.nanquantile(image, 0.99)))
+        shown = panel.imshow(image, colours, vmin=0, vmax=float(np.nanquantile(image, 0.97)))
         panel.set_title(name, fontsize=10)
         panel.set_axis_off()
         figure.colorbar(shown, ax=panel, shrink=0.8)
