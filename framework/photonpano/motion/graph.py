@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -47,6 +48,14 @@ class GraphOptions(Protocol):
     @property
     def closure_overlap(self) -> float | None:
         """Least overlap of a loop closure, as a share of the field of view; None registers no loop closures."""
+
+    @property
+    def exclude(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of frames: exposures that hold them are not registered with each other."""
+
+    @property
+    def tie(self) -> Path | None:
+        """A file of points that are tied by hand, see `photonpano.motion.ties`; None if there are none."""
 
     @property
     def disconnected(self) -> Literal["error", "largest"]:

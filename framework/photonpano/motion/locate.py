@@ -17,11 +17,13 @@ from photonpano.geometry import corner_displacements, inverse
 from photonpano.motion.closures import MIN_SIMILARITY, closure_candidates, exposure_similarity
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.evidence import Evidence
+from photonpano.motion.exposure_tasks import Pair
 from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
 from photonpano.motion.level import FrameHomography, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
-from photonpano.motion.pairs import alike, instants_of, pairs_of
+from photonpano.motion.pairs import alike, excluded_pairs, instants_of, pairs_of
 from photonpano.motion.registration import Registrar
+from photonpano.motion.ties import TiedPair, tied_pairs, ties_of
 from photonpano.motion.tracking import StartingMotion
 from photonpano.text import listed
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated
@@ -85,7 +87,8 @@ def locate(
 
     Each exposure is merged and described once, in order, a few ahead of the pairs that need it, and released after its last
     pair. At the first level, pairs begin with the `start` that short spans show, if any. A pair that the first locator does not
-    locate is passed to the next. Once the graph is solved, pairs of exposures that overlap at different times are registered as
+    locate is passed to the next. Pairs that are tied by hand are registered from there. Once the graph is solved, pairs of
+    exposures that overlap at different times are registered as
     loop closures, and the graph is solved again. Fallback locators and loop closures need exposures that were released; these
     are merged again.
 
@@ -94,14 +97,17 @@ def locate(
         PluginError: a locator failed, or broke its contract.
     """
     level, groups, shape = exposures.level, exposures.groups, exposures.frame_shape
-    pairs, previous = pairs_of(groups, graph.skips), exposures.previous
+    excluded, previous = excluded_pairs(groups, graph.exclude), exposures.previous
+    by_hand = tied_pairs(ties_of(graph.tie, exposures.source), groups, previous or exposures.start)
+    excluded |= {(each.moving, each.fixed) for each in by_hand}
+    pairs = [pair for pair in pairs_of(groups, graph.skips) if pair not in excluded]
     if previous is not None:
         pairs = alike(pairs, previous.at(instants_of(groups)), shape)
     known = None if previous is None else previous.at(np.arange(exposures.source.info.n_frames))
     given = groups, pairs, known, exposures.timeline, camera_of(exposures.source)
     log = context.checkpoints.log(f"level-{level.number}", *given)
     with thread_pool(context.threads) as pool:
-        registrar = Registrar(exposures, log, context, start)
+        registrar = Registrar(exposures, log, context, start, excluded)
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
@@ -117,6 +123,12 @@ def locate(
             )
         with exposures.clock("locate"), solving(level.number):
             edges = _checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
+        if by_hand:
+            starts = [_started(each, registrar.to_plane) for each in by_hand]
+            kept = context.checkpoints.log(f"level-{level.number}-ties", groups, [each.expected for each in starts])
+            registered = registrar.closures(starts, pool, kept)
+            edges += tuple(each.checked(edge) for each, edge in zip(by_hand, registered, strict=True))
+        with exposures.clock("locate"), solving(level.number):
             labels = components(len(groups), edges)
             foreseen = np.array([exposures.is_foreseen(index) for index in range(len(groups))])
             tied = level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged, foreseen
@@ -126,9 +138,13 @@ def locate(
             to_plane = registrar.to_plane
             solution = solve(len(groups), edges, anchor, shape, to_plane, model)
             evidence = solution.compare()
-            candidates = closure_candidates(groups, solution, shape, graph)
+            candidates = [pair for pair in closure_candidates(groups, solution, shape, graph) if pair not in excluded]
+            between = [inverse(solution.homographies[fixed]) @ solution.homographies[moving] for moving, fixed in candidates]
         revisits = context.checkpoints.log(f"level-{level.number}-revisits", groups, candidates, solution.homographies)
-        closures = tuple(registrar.closures(candidates, solution.homographies, pool, revisits))
+        returning = [
+            Pair(*pair, FrameHomography(motion), closure=True) for pair, motion in zip(candidates, between, strict=True)
+        ]
+        closures = tuple(registrar.closures(returning, pool, revisits))
     log.finish()
     with exposures.clock("locate"), solving(level.number):
         if closures:
@@ -150,6 +166,12 @@ def locate(
         evidence,
         _ambiguity(level.number, registrar.alternatives_px, edges),
     )
+
+
+def _started(tied: TiedPair, to_plane: FloatArray | None) -> Pair:
+    """Return a tied pair to register: from the (N, 3, 3) motion known so far, at the first level from that of its points."""
+    motion = tied.motion if to_plane is None else inverse(to_plane[tied.fixed]) @ to_plane[tied.moving]
+    return Pair(tied.moving, tied.fixed, FrameHomography(motion), closure=True)
 
 
 def _alike_across_cuts(exposures: VirtualExposures, edge: Edge) -> Edge:

@@ -18,6 +18,7 @@ from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.refined_motion import Knots, RefinedMotion
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
+from photonpano.motion.ties import require_agreement, ties_of
 from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking import starting_motion
 from photonpano.motion.uncertainty import Uncertainty
@@ -104,6 +105,7 @@ def estimate_motion(
         exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start, known)
         located = locate(exposures, graph, context, model, start)
         trajectory = interpolate(level, located, timeline, reference, clock, previous if corrects else None)
+        require_agreement(ties_of(graph.tie, seen), groups, located.solution.located, trajectory)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
         context.progress.note(_summary(results[-1]))

@@ -54,6 +54,15 @@ def alike(pairs: Sequence[tuple[int, int]], to_plane: FloatArray, shape: tuple[i
     return seen if labels.max() == component_labels(len(to_plane), np.array(pairs, dtype=int)).max() else list(pairs)
 
 
+def excluded_pairs(groups: Sequence[Group], frames: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Return the pairs (moving, fixed) of exposures of which one holds the first and the other the second of two `frames`."""
+
+    def holding(frame: int) -> list[int]:
+        return [index for index, group in enumerate(groups) if group.span.start <= frame < group.span.stop]
+
+    return {(max(one, other), min(one, other)) for a, b in frames for one in holding(a) for other in holding(b) if one != other}
+
+
 def shared_share(first: FrameSpan, second: FrameSpan) -> float:
     """Return the share of the shorter of two spans that lies in the other."""
     common = min(first.stop, second.stop) - max(first.start, second.start)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -18,7 +18,7 @@ from photonpano.motion.exposure_tasks import Descriptions, ExposureTasks, Notes,
 from photonpano.motion.level import FrameHomography, VirtualExposures
 from photonpano.motion.pairs import independent_share, instants_of
 from photonpano.motion.tracking import Place, StartingMotion
-from photonpano.values import Decision, Edge, FloatArray, Located, NotLocated
+from photonpano.values import Decision, Edge, Located, NotLocated
 
 ResultT = TypeVar("ResultT")
 
@@ -45,11 +45,19 @@ class Registrar:
         to_plane: (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level.
     """
 
-    def __init__(self, exposures: VirtualExposures, log: Log, context: Context, start: StartingMotion | None = None) -> None:
+    def __init__(
+        self,
+        exposures: VirtualExposures,
+        log: Log,
+        context: Context,
+        start: StartingMotion | None = None,
+        excluded: Set[tuple[int, int]] = frozenset(),
+    ) -> None:
         """Prepare to register; `log` has the first exposures in order, as `Registered`, and receives the others.
 
-        `start` is what short spans show of the motion, at the first level.
+        `start` is what short spans show of the motion, at the first level; `excluded` are pairs that are not to be registered.
         """
+        self._excluded = excluded
         self._executor, self._exposures, self._clock, self._log = context.executor, exposures, exposures.clock, log
         self._at_once = context.executor.at_once(len(exposures.groups))
         tasks = ExposureTasks(exposures, independent_share(exposures.groups))
@@ -104,26 +112,22 @@ class Registrar:
                 del self._kept[index]
             advance(1)
 
-    def closures(
-        self, pairs: Sequence[tuple[int, int]], homographies: FloatArray, pool: ThreadPoolExecutor, log: Log
-    ) -> Iterator[Edge]:
-        """Register candidates (moving, fixed) for loop closures; pairs that are not similar once aligned are not located.
+    def closures(self, pairs: Sequence[Pair], pool: ThreadPoolExecutor, log: Log) -> Iterator[Edge]:
+        """Register candidates for loop closures, and tied pairs; pairs that are not similar once aligned are not located.
 
-        Both exposures of a pair are merged and described again, at the same time. The pairs are ordered by the moving exposure;
-        `homographies` (N, 3, 3), frame pixels to a common plane, are those without them. `log` has the first pairs in order, as
-        `Edge`, and receives the others.
+        Both exposures of a pair are merged and described again, at the same time. The pairs are ordered by the moving exposure.
+        `log` has the first pairs in order, as `Edge`, and receives the others.
         """
         self._kept.clear()
-        needed_until = {index: position for position, pair in enumerate(pairs) for index in pair}
+        needed_until = {index: position for position, pair in enumerate(pairs) for index in (pair.moving, pair.fixed)}
         yield from log.found
-        for position, (moving, fixed) in enumerate(pairs):
+        for position, pair in enumerate(pairs):
             if position < len(log.found):
                 continue
-            missing = [index for index in (moving, fixed) if index not in self._kept]
+            missing = [index for index in (pair.moving, pair.fixed) if index not in self._kept]
             for index, [(kept, _)] in zip(missing, pool.map(lambda each: self._describe([each], True), missing), strict=True):
                 self._kept[index] = kept
-            expected = FrameHomography(inverse(homographies[fixed]) @ homographies[moving])
-            closure = self._similar(self._register([Pair(moving, fixed, expected, closure=True)])[0])
+            closure = self._similar(self._register([pair])[0])
             log.add(closure)
             yield closure
             for index in [index for index in self._kept if needed_until[index] <= position]:
@@ -162,7 +166,7 @@ class Registrar:
     def _bridge(self, moving: int, tried: Sequence[int]) -> Iterator[Edge]:
         """Register an exposure with its predecessors, until one is located."""
         for fixed in range(moving - 1, max(moving - BRIDGE, 0) - 1, -1):
-            if fixed not in tried:
+            if fixed not in tried and (moving, fixed) not in self._excluded:
                 pair = Pair(moving, fixed, self._expected(moving, fixed))
                 [edge] = self._register_along({moving: [fixed]}) if self._tracks else self._register([pair])
                 yield edge

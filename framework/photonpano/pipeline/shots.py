@@ -105,6 +105,7 @@ def _narrowed(plan: Plan, shot: FrameSpan) -> Plan:
     config = plan.source.config
     first = config.frames[0] if isinstance(config, PartOfCapture) and config.frames is not None else 0
     plan = plan.having("source", frames=(first + shot.start, first + shot.stop))
+    plan = plan.having("graph", exclude=(), tie=None)  # their frames count from that of the whole
     for key, default in (("reference", "middle"), ("movers", "hide")):
         if isinstance(frame := getattr(plan.render, key), int):
             plan = plan.having("render", **{key: frame - shot.start if shot.start <= frame < shot.stop else default})

@@ -23,7 +23,7 @@ _PLACES, _FRAMES = 16, 4  # 4 frames at each of 16 places are hashed: at the mos
 
 
 class FileRecord(TypedDict):
-    """A file, or a folder of files, that the source or a correction reads.
+    """A file, or a folder of files, that the source, a correction or the motion graph reads.
 
     `bytes` is the size of all its files, `modified` the latest of their times, ISO 8601 in UTC; None where there is none.
     `etag` is the mark that a server gives the content of a URL; None for other files.
@@ -62,12 +62,12 @@ def fingerprint(plan: Plan, source: Source) -> CaptureRecord:
 
 
 def capture_files(plan: Plan) -> list[Path]:
-    """Return the files and folders that the source and the corrections of a plan name; URLs are none."""
+    """Return the files and folders that a plan names for its source, its corrections and its motion graph; URLs are none."""
     return [path for path in _locations(plan) if isinstance(path, Path)]
 
 
 def _locations(plan: Plan) -> list[Location]:
-    return list(dict.fromkeys([*_paths(plan.source.config), *_paths(plan.corrections)]))
+    return list(dict.fromkeys([*_paths(plan.source.config), *_paths(plan.corrections), *_paths(plan.graph)]))
 
 
 def frames_sha256(source: Source) -> str:

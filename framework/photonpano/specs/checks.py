@@ -7,8 +7,9 @@ from itertools import islice
 from typing import Any
 
 from photonpano.corrections import Correction, FlatField
-from photonpano.errors import Problem, described
+from photonpano.errors import InputError, Problem, described
 from photonpano.execution.interrupts import is_interrupt
+from photonpano.motion.ties import read_ties
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.settings import CameraSettings, MotionSettings
@@ -36,6 +37,15 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
         if isinstance(frame, int) and frame >= info.n_frames:
             message = f"expected a frame of the capture, 0 to {info.n_frames - 1}, got {frame}"
             problems.append(plan.place(f"render.{key}").problem(message))
+    outside = [frame for pair in plan.graph.exclude for frame in pair if frame >= info.n_frames]
+    if outside:
+        message = f"expected frames of the capture, 0 to {info.n_frames - 1}, got {outside[0]}"
+        problems.append(plan.place("graph.exclude").problem(message))
+    if plan.graph.tie is not None:
+        try:
+            read_ties(plan.graph.tie, info)
+        except InputError as error:
+            problems.append(plan.place("graph.tie").problem(str(error)))
     return problems
 
 

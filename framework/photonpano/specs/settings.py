@@ -35,6 +35,16 @@ class GraphSettings(Config):
         description="loop closures: exposures of different times are registered if they share at least this fraction "
         "of the field of view; null disables them",
     )
+    exclude: tuple[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], ...] = Field(
+        (),
+        description="pairs of frames, as [[120, 900]]: exposures of which one holds the first frame and one the second are "
+        "registered with each other at no level",
+    )
+    tie: SpecPath | None = Field(
+        None,
+        description="a .csv file of points that show one place in two frames: columns frame_a, x_a, y_a, frame_b, x_b, y_b, "
+        "and std_px if they are not exact to 1 px. Exposures are registered from there; where that fails, the points count",
+    )
     disconnected: Literal["error", "largest"] = Field(
         "error",
         description="if some exposures are not connected to the others: stop with an error that names them, or "
