@@ -121,7 +121,7 @@ def export(
             poses, pictures = pictures_of_poses(folder, every, undistorted=undistorted)
         elif images:
             stack.enter_context(one_thread_inside())
-            made = pictures_of_turn(folder, every, bits, capture, catalog, undistorted=undistorted)
+            made = pictures_of_turn(folder, output, every, bits, capture, catalog, undistorted=undistorted)
             poses, pictures = stack.enter_context(made)
         files = {name: text.encode() for name, text in POSE_FORMATS[file_format](poses).items()}
         if images and file_format == "colmap":

@@ -16,10 +16,12 @@ from photonpano.capture import before
 from photonpano.errors import InputError
 from photonpano.evaluation import load_run_poses
 from photonpano.execution.threads import thread_count
+from photonpano.files.folders import require_new
 from photonpano.geometry import Camera, canvas_of_box, nearest_rotations, outline_of
 from photonpano.pipeline.film import Film
 from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import require_one_run
+from photonpano.record.fingerprint import capture_files
 from photonpano.record.picture_files import Picture
 from photonpano.record.poses import Poses, read_colmap
 from photonpano.values import FloatArray
@@ -59,14 +61,23 @@ def pictures_of_poses(folder: Path, every: int, *, undistorted: bool) -> PosedPi
 
 @contextmanager
 def pictures_of_turn(
-    folder: Path, every: int, bits: Literal[8, 16], capture: Path | str | None, catalog: Catalog | None, *, undistorted: bool
+    folder: Path,
+    output: Path,
+    every: int,
+    bits: Literal[8, 16],
+    capture: Path | str | None,
+    catalog: Catalog | None,
+    *,
+    undistorted: bool,
 ) -> Iterator[PosedPictures]:
     """Merge groups of frames side by side, as long as those of the last level, as the camera sees them in their middle.
 
     Raises:
         InputError: the motion is no rotation, or the capture cannot be opened or is another one now.
+        OutputError: the capture lies in the folder `output`, whose pictures are replaced.
     """
     with opened_run(folder, catalog, moved=capture) as opened:
+        require_new(output, True, capture_files(opened.plan))
         motion, rate, camera = opened.motion, opened.source.info.frame_rate_hz, opened.motion.camera
         assert camera is not None
         group_frames = round(opened.record["levels"][-1]["group_frames"])
