@@ -9,10 +9,15 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from photonpano import Arrived, Config, InputError, Location, Recognised, SourceContribution, SpecLocation, Url
+from photonpano.photometry import IntensityResponse
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, as_written, objections, read_start, size_of
 
 # Rows and columns of the cameras and simulators whose files are public.
 _SHAPES = ((250, 400), (1000, 1000), (480, 640), (360, 640), (396, 640))
+# The flux is spikes per pixel per frame. A pixel keeps the light that is left when it fires, so that spikes are proportional
+# to the light. Their variance is taken to be their number, as of single photons, which is too large: that of a visit of many
+# may be a fifth. In the dark, what is left at the ends of a visit counts: 1/6 spike squared, here in 200 frames.
+RESPONSE = IntensityResponse(photons_per_level=1.0, black_level=0.0, saturation_level=1.0, read_noise=(1 / 6 / 200) ** 0.5)
 _COMPARED = 16  # frames at the beginning of a file that are compared to recognise its shape, at most
 _SURE = 5.0  # standard errors by which the correlations of a shape exceed those of all others
 
@@ -60,7 +65,9 @@ def _open(config: SpikeDatConfig) -> PackedFileSource:
 
 
 def _source(config: SpikeDatConfig, n_frames: int) -> PackedFileSource:
-    return PackedFileSource([FrameFile(config.path, n_frames)], layout_of(config.frame_shape), config.frame_rate_hz)
+    source = PackedFileSource([FrameFile(config.path, n_frames)], layout_of(config.frame_shape), config.frame_rate_hz)
+    source.response = RESPONSE
+    return source
 
 
 def _arrived(config: SpikeDatConfig) -> Arrived:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from photonpano.contracts.protocols import Closing as Closing
 from photonpano.photometry import BinaryResponse, BitOrder, packed_counts, reversed_bits
 from photonpano.reading.files import OpenFiles
-from photonpano.values import Counts, FloatArray, Frames, FrameSpan, StreamInfo
+from photonpano.values import Counts, FloatArray, Frames, FrameSpan, Response, StreamInfo
 
 Pixels = TypeVar("Pixels", bound=np.generic)
 
@@ -84,7 +84,7 @@ class BinarySource(Closing, ABC):
 
     Attributes:
         info: frames, size, rate.
-        response: that of binary frames.
+        response: that of binary frames of single photons, unless the subclass, or who makes the source, sets another.
         valid: (H, W) mask, True everywhere: files do not mark bad pixels.
         layout: order of the pixels of a frame in its bytes.
         files: reads pieces of files.
@@ -92,7 +92,7 @@ class BinarySource(Closing, ABC):
 
     def __init__(self, n_frames: int, layout: FrameLayout, frame_rate_hz: float | None = None) -> None:
         self.info = StreamInfo(n_frames, *layout.frame_shape, frame_rate_hz)
-        self.response = BinaryResponse()
+        self.response: Response = BinaryResponse()
         self.valid = np.ones(layout.frame_shape, np.bool_)
         self.valid.flags.writeable = False
         self.layout = layout
