@@ -18,6 +18,7 @@ from .api.info import CaptureInfo as CaptureInfo
 from .api.info import info as info
 from .api.opened_run import load_panorama as load_panorama
 from .api.opened_run import load_trajectory as load_trajectory
+from .api.opened_run import load_xarray as load_xarray
 from .api.preview import Preview as Preview
 from .api.preview import preview as preview
 from .api.render import RenderResult as RenderResult
@@ -28,6 +29,7 @@ from .api.verify import verify as verify
 from .api.video import Video as Video
 from .api.video import video as video
 from .api.warm_up import warm_up as warm_up
+from .api.warp import warp as warp
 from .capture import Capture as Capture
 from .capture import capture_of as capture_of
 from .contracts.protocols import Arrived as Arrived

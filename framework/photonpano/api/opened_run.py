@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from photonpano.corrections.movers import before_background_of
 from photonpano.errors import InputError, SpecError
 from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.evaluation import load_panorama as read_panorama
+from photonpano.evaluation.inputs import read_tiff
 from photonpano.files.paths import location
 from photonpano.geometry import FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion
@@ -25,11 +27,15 @@ from photonpano.motion.loop import through_lens
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.state import model_of
 from photonpano.plugins.registry import Catalog
+from photonpano.reading import library
 from photonpano.record.contents import require_one_run, require_same_frames
 from photonpano.record.run_json import read_record
 from photonpano.record.schema import RunRecord
 from photonpano.specs import Plan, parse_spec
 from photonpano.values import FrameSpan, Panorama
+
+if TYPE_CHECKING:
+    import xarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,3 +153,37 @@ def load_trajectory(run_folder: Path | str) -> RunTrajectory:
     folder = Path(run_folder)
     require_one_run(folder, ["trajectory.npz"])
     return load_run_trajectory(folder, needs_std_px=False)
+
+
+def load_xarray(run_folder: Path | str) -> xarray.Dataset:
+    """Read the panorama of a finished run as a dataset of xarray: `flux`, its standard deviation `std`, and `coverage`.
+
+    Dimensions are `y`, `x`, and `colour` where there is one. Coordinates are pixels of the reference frame, or degrees on a
+    sphere; on a cylinder, x are degrees and y the tangent of the angle. The attribute `units` of each says which.
+
+    Args:
+        run_folder: written by `run` or `render`.
+
+    Raises:
+        InputError: xarray is not installed, the folder is no run folder, or a file is missing or damaged.
+    """
+    module = library("xarray", "photonpano[xarray]", "load_xarray")
+    folder = Path(run_folder)
+    panorama, motion = load_panorama(folder), load_run_trajectory(folder, needs_std_px=False)
+    (height, width), place, planar = panorama.flux.shape[:2], panorama.canvas, motion.projection == "planar"
+    x, y = ((np.arange(side) - place[axis, 2]) / place[axis, axis] for axis, side in enumerate((width, height)))
+    units = "px of the reference frame" if planar else "degrees"
+    down = "tangent of the angle" if motion.projection == "cylindrical" else units
+    coordinates: dict[str, object] = {
+        "x": ("x", x if planar else np.degrees(x), {"units": units}),
+        "y": ("y", np.degrees(y) if motion.projection == "spherical" else y, {"units": down}),
+    }
+    dimensions = ("y", "x") if panorama.flux.ndim == 2 else ("y", "x", "colour")
+    if panorama.flux.ndim > 2:
+        coordinates["colour"] = ["red", "green", "blue"]
+    photons = {"units": "photons per pixel per frame"}
+    require_one_run(folder, ["panorama-std.tiff"])
+    std = read_tiff(folder / "panorama-std.tiff")
+    variables = {"flux": (panorama.flux, photons), "std": (std, photons), "coverage": (panorama.weight, {"units": "frames"})}
+    found: xarray.Dataset = module.Dataset({name: (dimensions, *each) for name, each in variables.items()}, coordinates)
+    return found

@@ -175,7 +175,7 @@ def load_panorama(folder: Path) -> tuple[FluxImage, FluxImage]:
     Raises:
         InputError: a file is missing or damaged, or the two differ in size.
     """
-    flux, weight = (_read_tiff(folder / name) for name in ("panorama.tiff", "coverage.tiff"))
+    flux, weight = (read_tiff(folder / name) for name in ("panorama.tiff", "coverage.tiff"))
     if flux.ndim < 2 or flux.shape[2:] not in ((), (3,)) or flux.shape != weight.shape:
         raise InputError(
             f"{folder}: panorama.tiff and coverage.tiff must be images of one size, "
@@ -184,7 +184,8 @@ def load_panorama(folder: Path) -> tuple[FluxImage, FluxImage]:
     return flux, weight
 
 
-def _read_tiff(path: Path) -> FluxImage:
+def read_tiff(path: Path) -> FluxImage:
+    """Read an image of float32; `InputError` if it is missing or damaged."""
     import tifffile
 
     if not path.exists():
