@@ -1,1 +1,1 @@
-"""Captures in zarr arrays."""
+"""Captures in zarr arrays, and panoramas as OME-Zarr."""

@@ -1,4 +1,4 @@
-"""The config of zarr arrays."""
+"""The configs of zarr arrays and of OME-Zarr."""
 
 from __future__ import annotations
 
@@ -22,3 +22,7 @@ class ZarrConfig(Config):
         description="big if the first of eight pixels is the highest bit of its byte, little if it is the lowest; by default "
         "from the array, or else big, and frames that show another order are refused",
     )
+
+
+class OmeZarrConfig(Config):
+    """A panorama as OME-Zarr, which needs no keys."""

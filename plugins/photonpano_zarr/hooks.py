@@ -4,9 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from photonpano import Location, Recognised, SourceContribution, Url, hookimpl
+from photonpano import (
+    Exporter,
+    ExporterContribution,
+    Location,
+    Recognised,
+    Requirement,
+    SourceContribution,
+    StageContext,
+    Url,
+    hookimpl,
+)
 from photonpano.reading import as_written, objections
-from photonpano_zarr.configs import ZarrConfig
+from photonpano_zarr.configs import OmeZarrConfig, ZarrConfig
 from photonpano_zarr.source import opened, require_layout
 from photonpano_zarr.writing import write
 
@@ -24,6 +34,12 @@ def _recognise(path: Location) -> Recognised | None:
     return Recognised({"path": as_written(path)}, "an array of packed frames of zarr version 3")
 
 
+def _exporter(_config: OmeZarrConfig, _context: StageContext) -> Exporter:
+    from photonpano_zarr.ome import OmeZarrExporter
+
+    return OmeZarrExporter()
+
+
 @hookimpl
 def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer the source of zarr arrays."""
@@ -37,4 +53,17 @@ def photonpano_sources() -> Iterator[SourceContribution]:
         recognises_urls=True,
         suffixes=(".zarr",),
         write=write,
+    )
+
+
+@hookimpl
+def photonpano_exporters() -> Iterator[ExporterContribution]:
+    """Offer a file for panoramas that exceed the memory of viewers."""
+    yield ExporterContribution(
+        name="ome-zarr",
+        summary="OME-Zarr: flux, weight, standard deviation and saturated pixels in tiles of several scales, for viewers",
+        config=OmeZarrConfig,
+        suffix=".ome.zarr",
+        requires=(Requirement("zarr", "photonpano[zarr]"),),
+        build=_exporter,
     )

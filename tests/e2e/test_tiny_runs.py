@@ -87,7 +87,7 @@ def test_run_without_report_keeps_its_results(
     assert warning.startswith("the report could not be drawn (")
     assert warning.endswith("); all other files of the run are written")
     assert json.loads((tmp_path / "run" / "run.json").read_text()) == json.loads(json.dumps(record))
-    assert set(record["files"]) == {"trajectory.npz", "panorama.tiff", "coverage.tiff", "panorama.png"}
+    assert set(record["files"]) == {"trajectory.npz", "panorama.tiff", "panorama-std.tiff", "coverage.tiff", "panorama.png"}
     assert photonpano.verify(tmp_path / "run").problems == ()
 
 
@@ -104,16 +104,20 @@ def test_resumed_run_writes_exposures_that_were_not_kept(run: Callable[..., RunR
 @pytest.mark.usefixtures("without_report")
 def test_run_writes_formats_and_records_their_hashes(run: Callable[..., RunResult], tmp_path: Path) -> None:
     folder, render = tmp_path / "run", {"extent": "reference", "tone": "local", "exposure_stops": 0.5}
-    record = run(output={"formats": ["hdr"]}, render=render).record
+    record = run(output={"formats": ["hdr", "ome-zarr"]}, render=render).record
     flux = tifffile.imread(folder / "panorama.tiff")
     assert flux.shape == (record["source"]["height"], record["source"]["width"])
     hdr = cv2.imread(str(folder / "panorama.hdr"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_allclose(hdr[..., 0], np.nan_to_num(flux), rtol=0.005)
     assert "panorama.hdr" in json.loads((folder / "run.json").read_text())["files"]
+    assert "panorama.ome.zarr/0/c/0/0/0" in record["files"]
     assert changed_files(folder) == []
-    assert {"stage": "output", "use": "hdr"}.items() <= record["plugins"][-1].items()
+    assert {"stage": "output", "use": "ome-zarr"}.items() <= record["plugins"][-1].items()
+    (folder / "panorama.ome.zarr/0/c/0/0/0").write_bytes(b"damaged")
+    assert photonpano.verify(folder).problems != ()
     run()
     assert not (folder / "panorama.hdr").exists()
+    assert not (folder / "panorama.ome.zarr").exists()
 
 
 class Keys(Config):
@@ -141,10 +145,10 @@ class Odd:
 @pytest.mark.parametrize(
     ("what", "message"),
     [
-        ("two", "broke its contract at panorama.odd: expected the one file panorama.odd, got panorama.txt as well"),
-        ("empty", "broke its contract at panorama.odd: expected a file panorama.odd with content, got none"),
+        ("two", "broke its contract at panorama.odd: expected panorama.odd alone, got panorama.txt as well"),
+        ("empty", "broke its contract at panorama.odd: expected a file or folder panorama.odd with content, got none"),
         ("fails", "failed at panorama.odd: LookupError: no such colour"),
-        ("nothing", "broke its contract at panorama.odd: expected a file panorama.odd with content, got none"),
+        ("nothing", "broke its contract at panorama.odd: expected a file or folder panorama.odd with content, got none"),
     ],
 )
 def test_exporter_that_misbehaves_is_named(run: Callable[..., RunResult], tmp_path: Path, what: str, message: str) -> None:

@@ -99,6 +99,7 @@ TestSuperResolution = of(RendererConformance, "super-resolution", scales=(2.0,))
 
 TestExr = of(ExporterConformance, "exr")
 TestHdr = of(ExporterConformance, "hdr")
+TestOmeZarr = of(ExporterConformance, "ome-zarr")
 
 TestColmapAverages = of(PoseEstimatorConformance, "colmap-averages", config={"group_size": 32})
 TestStratifiedPose = of(

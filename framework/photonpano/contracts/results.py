@@ -103,17 +103,18 @@ def require_panorama(found: object, canvas: Canvas) -> Panorama:
 
 
 def _no_content(_: Collection[str], path: Path) -> object:
-    return not (path.is_file() and not path.is_symlink() and path.stat().st_size) and (path.name,)
+    files = [path] if path.is_file() else [*path.rglob("*")]
+    return not any(each.is_file() and not each.is_symlink() and each.stat().st_size for each in files) and (path.name,)
 
 
-# The names of the files that an exporter wrote. Facts: the path that it was given.
+# The names of the files and folders that an exporter wrote. Facts: the path that it was given.
 FILES: Contract[Collection[str]] = Contract(
     [
         (
-            "expected the one file {}, got {} as well",
+            "expected {} alone, got {} as well",
             lambda written, path: (others := sorted({*written} - {path.name})) and (path.name, ", ".join(others)),
         ),
-        ("expected a file {} with content, got none", _no_content),
+        ("expected a file or folder {} with content, got none", _no_content),
     ]
 )
 

@@ -184,8 +184,9 @@ def _put_in_place(pending: Path, directory: Path) -> None:
         for name in removed.read_text(encoding="utf-8").splitlines():
             with suppress(NotADirectoryError):
                 (directory / name).unlink(missing_ok=True)
-            with suppress(OSError):  # other files may lie in it
-                (directory / name).parent.rmdir()
+            with suppress(OSError):  # other files may lie in a folder
+                for parent in PurePosixPath(name).parents[:-1]:
+                    (directory / parent).rmdir()
         removed.unlink()
     for path in _files(pending):
         target = directory / path.relative_to(pending)

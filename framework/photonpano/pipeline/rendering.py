@@ -168,7 +168,7 @@ class StoredPanorama:
         flux: (H, W) or (H, W, 3) float32, on disk.
         weight: the same shape, on disk.
         std: the same shape, on disk.
-        canvas: (3, 3), pixels of the reference plane to pixels of the panorama.
+        canvas: (3, 3), pixels of the reference plane to pixels of the panorama: see `FinishedPanorama`.
         white_flux: flux that is white in the picture.
     """
 
@@ -178,12 +178,14 @@ class StoredPanorama:
     canvas: Homography
     white_flux: float
     noise: CanvasNoise
+    projection: str = "planar"
 
     @classmethod
     def of(cls, folder: Path, panorama: RenderedPanorama) -> StoredPanorama:
         """Open the maps of a panorama in a folder."""
         flux, weight, std = (tifffile.memmap(folder / name, mode="r") for name in MAPS)
-        return cls(flux, weight, std, panorama.canvas.transform, panorama.white_flux, panorama.dynamic_range.noise)
+        canvas, noise = panorama.canvas, panorama.dynamic_range.noise
+        return cls(flux, weight, std, canvas.transform, panorama.white_flux, noise, canvas.projection)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -197,13 +199,20 @@ class StoredPanorama:
 
     def rows(self, start: int, stop: int) -> PanoramaRows:
         """Return some rows, as arrays of their own."""
-        flux, weight, std = (np.array(image[start:stop], np.float32) for image in (self.flux, self.weight, self.std))
+        flux, weight, std = (_rows(image, start, stop) for image in (self.flux, self.weight, self.std))
         return PanoramaRows(flux, weight, std, self.noise.saturated(flux, weight))
+
+
+def _rows(image: NDArray[np.float32], start: int, stop: int) -> NDArray[np.float32]:
+    """Copy rows of an image. A file is mapped anew, for what was read of it counts as memory while it stays mapped."""
+    if isinstance(image, np.memmap) and image.filename is not None:
+        image = np.memmap(image.filename, np.float32, "r", image.offset, image.shape)
+    return np.array(image[start:stop], np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class AttributedExporter:
-    """An exporter whose errors name its `origin`, such as "exporter 'exr' of photonpano 0.1.0", and whose file is checked."""
+    """An exporter whose errors name its `origin`, such as "exporter 'exr' of photonpano 0.1.0", and whose result is checked."""
 
     component: Exporter
     origin: str
@@ -218,7 +227,10 @@ class AttributedExporter:
                 self.component.export(panorama, path)
             except OSError as error:
                 reason = f"{path.name} could not be written ({error.strerror or error})"
-                raise OutputError(f"{reason}; what was in the run folder before is unchanged") from error
+                raise OutputError(
+                    f"{reason}; what was in the run folder before is unchanged. Make room, or choose another folder with "
+                    "--output"
+                ) from error
             FILES.require({each.name for each in folder.iterdir()} - before, path)
 
 

@@ -123,6 +123,7 @@ _CONTENTS = {
     "vignette.npz": "the relative sensitivity of each pixel",
     "panorama.exr": "linear flux, for programs that work with a large range",
     "panorama.hdr": "linear flux, for programs that work with a large range",
+    "panorama.ome.zarr/": "flux, weight, standard deviation and saturated pixels in tiles, for viewers",
     "exposures/": "the exposures of each level, linear flux and pictures",
     RECORD: "the record: inputs, versions, choices and results",
 }

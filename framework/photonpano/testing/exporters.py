@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -12,6 +13,8 @@ from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.photometry import BinaryResponse, flux_std
 from photonpano.pipeline.rendering import AttributedExporter, StoredPanorama
 from photonpano.plugins.contributions import ExporterContribution
+from photonpano.record.contents import contents_of
+from photonpano.record.schema import FileContent
 from photonpano.testing.conformance import passing
 from photonpano.testing.stages import StageConformance
 
@@ -38,17 +41,18 @@ class ExporterConformance(StageConformance):
 
     contribution: ExporterContribution
 
-    def exported(self, of: StoredPanorama, folder: Path) -> bytes:
-        """Write a panorama as a run does, and return the content of the file."""
+    def exported(self, of: StoredPanorama, folder: Path) -> Mapping[str, FileContent]:
+        """Write a panorama as a run does, and return the hashes of its files."""
         self.require_libraries()
         folder.mkdir()
-        suffix = self.contribution.suffix
         with passing("what export() does"):
-            AttributedExporter(self.built(), f"exporter {self.contribution.name!r}", suffix).export(of, folder)
-        return (folder / f"panorama{suffix}").read_bytes()
+            AttributedExporter(self.built(), f"exporter {self.contribution.name!r}", self.contribution.suffix).export(
+                of, folder
+            )
+        return contents_of(folder)
 
     @pytest.mark.parametrize("in_colour", [False, True])
-    def test_export_writes_one_file_with_content(self, tmp_path: Path, in_colour: bool) -> None:
+    def test_export_writes_one_file_or_folder_with_content(self, tmp_path: Path, in_colour: bool) -> None:
         """Panoramas are grey, or have red, green and blue; some pixels were not seen."""
         self.exported(panorama(in_colour), tmp_path / "run")
 

@@ -64,7 +64,11 @@ class FinishedPanorama(Protocol):
 
     @property
     def canvas(self) -> Homography:
-        """(3, 3), pixels of the reference plane to pixels of the panorama."""
+        """(3, 3), pixels of the reference plane to pixels of the panorama; from (a, b, 1) in radians if it is not planar."""
+
+    @property
+    def projection(self) -> str:
+        """Of the canvas: planar, cylindrical or spherical."""
 
     @property
     def white_flux(self) -> float:
@@ -75,14 +79,14 @@ class FinishedPanorama(Protocol):
 
 
 class Exporter(Protocol):
-    """Writes the panorama as a file of another format."""
+    """Writes the panorama as a file of another format, or a folder of files."""
 
     def export(self, panorama: FinishedPanorama, path: Path) -> None:
-        """Write one file, and nothing else.
+        """Write one file or folder, and nothing else.
 
-        The framework puts it into the run folder with the other results, and records its hash.
+        The framework puts it into the run folder with the other results, and records the hash of each file.
 
         Args:
             panorama: what to write.
-            path: the file; it does not exist yet.
+            path: the file or folder; it does not exist yet.
         """

@@ -300,7 +300,7 @@ class ExporterContribution(
     """Offers an exporter.
 
     Attributes:
-        suffix: the ending of its file, in small letters, such as ".exr": the run folder gets `panorama.exr`.
+        suffix: the ending of its file or folder, in small letters, such as ".exr": the run folder gets `panorama.exr`.
     """
 
     build: Callable[[Any, StageContext], Exporter]
