@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from photonpano import FinishedPanorama, FluxImage
 
 _MAPS = ("flux", "weight", "std", "saturated")
-_CHUNK = 256  # sides of a chunk, in px, which viewers read one by one
-_SHARD_COLUMNS = 32 * _CHUNK  # columns of the chunks that share a file; a file holds one row of chunks, of all channels
+_CHUNK = 256  # sides of a chunk, in px, which viewers read one by one; in colour, half as high
+_SHARD_COLUMNS = 16 * _CHUNK  # columns of the chunks that share a file; a file holds one row of chunks, of all channels
 _FILLED = 1e-6  # frames as which known flux without frames counts
 _READ_ROWS = 32  # rows that are read at once: their noise takes several times their memory
 
@@ -27,11 +27,13 @@ class OmeZarrExporter:
         n_channels, (height, width) = len(_MAPS) * len(colours), panorama.shape
         level = _array(path / "0", n_channels, height, width)
         highest = np.zeros(n_channels)
-        for top in range(0, height, _CHUNK):
-            band = _band(panorama, n_channels, top, min(top + _CHUNK, height))
+        _, rows, columns = level.shards
+        for top in range(0, height, rows):
+            band = _band(panorama, n_channels, top, min(top + rows, height))
             highest = np.fmax(highest, np.fmax.reduce(band, axis=(1, 2)))
-            for left in range(0, width, _SHARD_COLUMNS):
-                level[:, top : top + _CHUNK, left : left + _SHARD_COLUMNS] = band[:, :, left : left + _SHARD_COLUMNS]
+            for left in range(0, width, columns):
+                level[:, top : top + rows, left : left + columns] = band[:, :, left : left + columns]
+        del band
         n_levels = 1
         while max(level.shape[1:]) > _CHUNK:
             level = _next_level(level, path / str(n_levels))
@@ -83,9 +85,10 @@ def _next_level(level: Any, path: Path) -> Any:
     """Write the level after another, and return its array."""
     n_channels, height, width = level.shape
     smaller = _array(path, n_channels, -(-height // 2), -(-width // 2))
-    for top in range(0, height, 2 * _CHUNK):
-        for left in range(0, width, 2 * _SHARD_COLUMNS):
-            part = halved(level[:, top : top + 2 * _CHUNK, left : left + 2 * _SHARD_COLUMNS])
+    _, rows, columns = smaller.shards
+    for top in range(0, height, 2 * rows):
+        for left in range(0, width, 2 * columns):
+            part = halved(level[:, top : top + 2 * rows, left : left + 2 * columns])
             y, x = top // 2, left // 2
             smaller[:, y : y + part.shape[1], x : x + part.shape[2]] = part
     return smaller
@@ -93,11 +96,12 @@ def _next_level(level: Any, path: Path) -> Any:
 
 def _array(path: Path, n_channels: int, height: int, width: int) -> Any:
     """Make the array of a level; chunks of which nothing is written are NaN."""
+    rows = _CHUNK if n_channels == len(_MAPS) else _CHUNK // 2  # colours take three times the memory
     return zarr.create_array(
         path,
         shape=(n_channels, height, width),
-        chunks=(1, _CHUNK, _CHUNK),
-        shards=(n_channels, _CHUNK, min(_SHARD_COLUMNS, -(-width // _CHUNK) * _CHUNK)),
+        chunks=(1, rows, _CHUNK),
+        shards=(n_channels, rows, min(_SHARD_COLUMNS, -(-width // _CHUNK) * _CHUNK)),
         dtype="float32",
         fill_value=np.nan,
         dimension_names=("c", "y", "x"),

@@ -9,7 +9,6 @@ from typing import Any
 from photonpano.corrections import Correction, FlatField
 from photonpano.errors import InputError, Problem, described
 from photonpano.execution.interrupts import is_interrupt
-from photonpano.motion.ties import read_ties
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.settings import CameraSettings, MotionSettings
@@ -42,6 +41,8 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
         message = f"expected frames of the capture, 0 to {info.n_frames - 1}, got {outside[0]}"
         problems.append(plan.place("graph.exclude").problem(message))
     if plan.graph.tie is not None:
+        from photonpano.motion.ties import read_ties  # with OpenCV, which other specs need not import
+
         try:
             read_ties(plan.graph.tie, info)
         except InputError as error:
