@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,8 +163,8 @@ def _array_of(path: Path) -> tuple[Literal["half", "full"] | None, str]:
     sums = np.unpackbits(frames, axis=-1, bitorder="little").sum(axis=0, dtype=np.float64)
     first, second = np.split(np.minimum(sums, np.quantile(sums, _CLIP_QUANTILE)), 2)
     halves, rows = (
-        _correlation(first, second),
-        _correlation(np.stack([first[:-2], second[:-2]]), np.stack([first[2:], second[2:]])),
+        correlation(first, second),
+        correlation(np.stack([first[:-2], second[:-2]]), np.stack([first[2:], second[2:]])),
     )
     numbers = f"correlations of {np.tanh(halves):.2f} between the halves of their frames, {np.tanh(rows):.2f} between rows"
     if abs(halves - rows) < _STANDARD_ERRORS * np.sqrt(2 / first.size):
@@ -172,9 +172,9 @@ def _array_of(path: Path) -> tuple[Literal["half", "full"] | None, str]:
     return ("half", numbers) if halves > rows else ("full", numbers)
 
 
-def _correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Return the Fisher transform of the correlation, whose standard error is 1 / sqrt(pixels)."""
-    if not first.std() or not second.std():
+def correlation(first: NDArray[Any], second: NDArray[Any]) -> float:
+    """Return the Fisher transform of the correlation, whose standard error is 1 / sqrt(pixels); 0 if one does not vary."""
+    if not first.size or not first.std() or not second.std():
         return 0.0
     return float(np.arctanh(min(np.corrcoef(first.ravel(), second.ravel())[0, 1], 0.999999)))
 

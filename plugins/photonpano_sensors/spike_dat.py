@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -11,6 +12,7 @@ from pydantic import Field, field_validator
 from photonpano import Arrived, Config, InputError, Location, Recognised, SourceContribution, SpecLocation, Url
 from photonpano.photometry import IntensityResponse
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, as_written, objections, read_start, size_of
+from photonpano_sensors.bin_files import correlation
 
 # Rows and columns of the cameras and simulators whose files are public.
 _SHAPES = ((250, 400), (1000, 1000), (480, 640), (360, 640), (396, 640))
@@ -102,14 +104,8 @@ def _likeness(path: Location, shape: tuple[int, int]) -> float:
     start = np.frombuffer(read_start(path, _COMPARED * layout.stored_bytes), np.uint8)
     frames = layout.unpacked(layout.rows(start.reshape(-1, *layout.stored_shape)))
     total = frames.sum(axis=0, dtype=np.float32)
-    return min(_correlation(total[1:], total[:-1]), _correlation(frames[1:], frames[:-1]))
-
-
-def _correlation(first: NDArray[np.number], second: NDArray[np.number]) -> float:
-    """Return the correlation of two arrays in its standard errors; 0 if one does not vary."""
-    a, b = (each.astype(np.float32) for each in (first, second))
-    scatter = float(a.std() * b.std()) if a.size else 0.0
-    return float(np.mean((a - a.mean()) * (b - b.mean()))) / scatter * a.size**0.5 if scatter else 0.0
+    neighbours = (total[1:], total[:-1]), (frames[1:], frames[:-1])
+    return min(correlation(first, second) * math.sqrt(first.size) for first, second in neighbours)
 
 
 SPIKE_DAT = SourceContribution(

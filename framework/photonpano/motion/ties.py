@@ -149,6 +149,8 @@ def read_ties(file: Path, info: StreamInfo) -> Ties:
     Raises:
         InputError: the file cannot be read, or holds anything but points in frames of the capture.
     """
+    if not file.exists():
+        raise InputError(f"there is no file {file}; check the path")
     try:
         with file.open(encoding="utf-8-sig", newline="") as text:
             reader = csv.DictReader(text)

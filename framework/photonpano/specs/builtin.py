@@ -94,7 +94,7 @@ def recognised_source(section: Written, spec: Spec) -> Written | None:
             message = f"{path} is recognised by {listed(several)}; name the right one"
         else:
             # The path is named once; each line begins with its last part.
-            near = list(_near_misses(spec, keys, path))
+            near = _near_misses(spec, keys, path)
             lines = [f"{name}: {line.replace(str(path), path.name or str(path), 1)}" for name, line in near]
             lines = [*(lines or _known_endings(spec.catalog)), *failures]
             message = "\n  ".join([f"no source recognises {path}, {_contents(path)}; name the one that reads it", *lines])
@@ -139,11 +139,12 @@ def ask_sources(catalog: Catalog, path: Location) -> tuple[list[tuple[Entry, Rec
     return recognised, failures
 
 
-def _near_misses(spec: Spec, keys: Written, path: Location) -> Iterator[tuple[str, str]]:
-    """Yield the problems that sources have with a capture whose files end as theirs do, with the name of each source.
+def _near_misses(spec: Spec, keys: Written, path: Location) -> list[tuple[str, str]]:
+    """Return the problems that sources have with a capture whose files end as theirs do, with the name of each source.
 
-    Only sources count that accept the keys.
+    Only sources count that accept the keys; if none has a problem, those that need others.
     """
+    problems, needing = list[tuple[str, str]](), list[tuple[str, str]]()
     files = [path] if isinstance(path, Url) or path.is_file() else islice(path.rglob("*"), _SEARCHED)
     endings = {path.suffix.lower(), *(each.suffix.lower() for each in files)}
     for entry in spec.catalog.rows:
@@ -154,6 +155,10 @@ def _near_misses(spec: Spec, keys: Written, path: Location) -> Iterator[tuple[st
             continue
         if isinstance(path, Url) and not contribution.recognises_urls:
             continue
+        needed = [name for name, field in contribution.config.model_fields.items() if field.is_required()]
+        if contribution.suffixes and (missing := [name for name in needed if keys.at(name).data is None]):
+            needing.append((entry.name, f"reads such files if it is given {listed(missing)} beside the path"))
+            continue
         try:
             config = validate(contribution.config, keys, replace(spec, problems=[]))
         except BaseException as error:  # what is wrong with the config is reported once the source is named
@@ -161,7 +166,8 @@ def _near_misses(spec: Spec, keys: Written, path: Location) -> Iterator[tuple[st
                 raise
             config = None
         if config is not None:
-            yield from ((entry.name, each) for each in complaints(Choice(contribution, config, entry.origin)))
+            problems += ((entry.name, each) for each in complaints(Choice(contribution, config, entry.origin)))
+    return problems or needing
 
 
 def _known_endings(catalog: Catalog) -> list[str]:
