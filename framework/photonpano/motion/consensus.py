@@ -29,9 +29,7 @@ def agreeing(motions: Sequence[Located], residuals: FloatArray, tolerance_px: fl
 
     `residuals` (E, P, 2) are what that leaves of where patches lie, in px of frames of (height, width).
     """
-    squares = (residuals**2).sum(axis=-1)
-    weights = 1 / (1 + squares / (2 * tolerance_px**2)) ** 2  # of Geman and McClure
-    return [_by_patches(*each, tolerance_px, shape) for each in zip(motions, weights, strict=True)]
+    return [_by_patches(*each, tolerance_px, shape) for each in zip(motions, residuals, strict=True)]
 
 
 def contradicting(motions: Sequence[Located], residuals: FloatArray) -> float:
@@ -85,17 +83,24 @@ def travelled(pairs: NDArray[np.integer], motions: Sequence[Located], residuals:
     return float(np.median(steps)) * (len(layers) - 1) if steps else 0.0
 
 
-def _by_patches(motion: Located, weights: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> Located:
-    """Return the homography that patches with these weights, (P,), show, with its information."""
+def _by_patches(motion: Located, residuals: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> Located:
+    """Return the homography that patches show which agree to a tolerance, and to their noise, with its information.
+
+    `residuals` (P, 2) are those of `agreeing`.
+    """
     patches = motion.patches
     if patches is None or motion.information is None:
         return motion
+    covariances = _covariances(patches.information)
+    allowed = covariances + tolerance_px**2 * np.eye(2)
+    squares = np.einsum("pi,pi->p", residuals, np.linalg.solve(allowed, residuals[..., None])[..., 0])
+    weights = 1 / (1 + squares / 2) ** 2  # of Geman and McClure
     middles = patch_centres(shape)
     there = motion.homography @ np.concatenate([middles, np.ones((len(middles), 1))], axis=1).T
     moves = generators(shape)
     by_points = slopes(there, moves @ there).reshape(len(middles), 2, 8)
     shown = patches.information[:, 0, 0] > 0
-    limited = _covariances(patches.information) + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
+    limited = covariances + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
     information = np.where(shown[:, None, None], weights[:, None, None] * np.linalg.inv(limited), 0)
     if (weights * shown).sum() < _FEWEST:
         return replace(motion, information=motion.information * _UNCERTAIN, patches=Patches(patches.shifts, information))
