@@ -13,7 +13,8 @@ from photonpano.values import BoolArray, FloatArray, Located, Patches
 
 # Residuals of patches, in px, within which they agree: all of them at first, and then those of the background alone
 # (graduated non-convexity, Black and Rangarajan 1996).
-TOLERANCES_PX = (2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+_TOLERANCES_PX = (2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+_LEAST_TOLERANCE = 0.5  # of the usual photon noise of patches: below that, chance decides which of them agree
 _CERTAIN = 0.5  # least error of a patch beside photon noise, as a share of the tolerance
 _TELLING = 48  # patches of most pairs that must show something
 _FEWEST = 8.0  # patches, by their weights, that determine the motion of a pair
@@ -24,12 +25,22 @@ APART = 9.0  # mean square of the residuals of a patch that does not follow the 
 _DAMPING, _TINY = 1e-6, 1e-12
 
 
+def tolerances_px(motions: Sequence[Located]) -> tuple[float, ...]:
+    """Return the residuals within which patches agree, coarse to fine, as far as their noise lets them agree."""
+    information = [each.patches.information for each in motions if each.patches is not None]
+    stds_px = [np.sqrt(np.trace(_covariances(each[each[:, 0, 0] > 0]), axis1=1, axis2=2) / 2) for each in information]
+    least_px = _LEAST_TOLERANCE * float(np.median(np.concatenate(stds_px))) if stds_px else 0.0
+    return tuple(each for each in _TOLERANCES_PX if each in _TOLERANCES_PX[:1] or each >= least_px)
+
+
 def agreeing(motions: Sequence[Located], residuals: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> list[Located]:
     """Return the motions of pairs by the patches that agree with a motion of the camera.
 
     `residuals` (E, P, 2) are what that leaves of where patches lie, in px of frames of (height, width).
     """
-    return [_by_patches(*each, tolerance_px, shape) for each in zip(motions, residuals, strict=True)]
+    squares = (residuals**2).sum(axis=-1)
+    weights = 1 / (1 + squares / (2 * tolerance_px**2)) ** 2  # of Geman and McClure
+    return [_by_patches(*each, tolerance_px, shape) for each in zip(motions, weights, strict=True)]
 
 
 def contradicting(motions: Sequence[Located], residuals: FloatArray) -> float:
@@ -83,24 +94,17 @@ def travelled(pairs: NDArray[np.integer], motions: Sequence[Located], residuals:
     return float(np.median(steps)) * (len(layers) - 1) if steps else 0.0
 
 
-def _by_patches(motion: Located, residuals: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> Located:
-    """Return the homography that patches show which agree to a tolerance, and to their noise, with its information.
-
-    `residuals` (P, 2) are those of `agreeing`.
-    """
+def _by_patches(motion: Located, weights: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> Located:
+    """Return the homography that patches with these weights, (P,), show, with its information."""
     patches = motion.patches
     if patches is None or motion.information is None:
         return motion
-    covariances = _covariances(patches.information)
-    allowed = covariances + tolerance_px**2 * np.eye(2)
-    squares = np.einsum("pi,pi->p", residuals, np.linalg.solve(allowed, residuals[..., None])[..., 0])
-    weights = 1 / (1 + squares / 2) ** 2  # of Geman and McClure
     middles = patch_centres(shape)
     there = motion.homography @ np.concatenate([middles, np.ones((len(middles), 1))], axis=1).T
     moves = generators(shape)
     by_points = slopes(there, moves @ there).reshape(len(middles), 2, 8)
     shown = patches.information[:, 0, 0] > 0
-    limited = covariances + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
+    limited = _covariances(patches.information) + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
     information = np.where(shown[:, None, None], weights[:, None, None] * np.linalg.inv(limited), 0)
     if (weights * shown).sum() < _FEWEST:
         return replace(motion, information=motion.information * _UNCERTAIN, patches=Patches(patches.shifts, information))

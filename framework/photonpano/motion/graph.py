@@ -24,7 +24,7 @@ from photonpano.geometry import (
     scaled_ahead,
 )
 from photonpano.motion.adjustment import OUTLIER, Adjustment, Assessment, Cost, Problem
-from photonpano.motion.consensus import TOLERANCES_PX, agreeing, contradicting, layers, travelled
+from photonpano.motion.consensus import agreeing, contradicting, layers, tolerances_px, travelled
 from photonpano.motion.evidence import Evidence, likeliest
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
 from photonpano.motion.pairs import adjacency, component_labels
@@ -170,7 +170,7 @@ def _of_background(
     if not turning.layered and contradicting(tied.motions, first.beside(fit.state)) < _CONTRADICTED:
         return tied, fits
     background = tied
-    for tolerance_px in TOLERANCES_PX:
+    for tolerance_px in tolerances_px(tied.motions):
         motions = agreeing(tied.motions, first.beside(fit.state), tolerance_px, tied.frame_shape)
         background = replace(tied, motions=motions)
         adjustment = RotationAdjustment(background.problem, turning.seen_by(tied.frame_shape), turning.unknown)

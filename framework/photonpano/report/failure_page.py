@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,7 @@ def render_failure(record: RunRecord, error: PhotonpanoError) -> str:
         n_failed=len(failed),
         parts=None if lost is None else figures.tied_parts(lost.groups, lost.parts),
         pairs=[] if lost is None else _shown(lost, failed, groups),
+        places=[] if lost is None else _ends_of_parts(lost),
         stages=figures.STAGE_NAMES,
         failures=failure_groups(record["levels"]),
     )
@@ -75,6 +77,17 @@ def _shown(lost: UntiedError, failures: Sequence[FailureRecord], groups: Sequenc
         moving, fixed = _pictures([lost.merged(edge.moving), lost.merged(edge.fixed)])
         found.append(ShownPair(failure, moving, fixed))
     return found
+
+
+def _ends_of_parts(lost: UntiedError) -> list[dict[str, Any]]:
+    """Return the first and the last exposure of each part that is tied together, where points can be clicked to tie parts."""
+    if lost.merged is None:
+        return []
+    parts = [np.flatnonzero(lost.parts == part) for part in np.flatnonzero(np.bincount(lost.parts) > 1)[:MAX_PAIRS]]
+    ends = sorted({int(part[end]) for part in parts for end in (0, -1)}) if len(parts) > 1 else []
+    spans = [lost.groups[index].span for index in ends]
+    pictures = [_pictures([lost.merged(index)])[0] for index in ends]
+    return [{"frame": int(span.centre), "uri": picture} for span, picture in zip(spans, pictures, strict=True)]
 
 
 def _spread(failures: Sequence[FailureRecord], most: int) -> list[FailureRecord]:

@@ -6,42 +6,41 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import patch_centres, transform_points, translation
-from photonpano.motion.consensus import TOLERANCES_PX, agreeing
+from photonpano.motion.consensus import agreeing, tolerances_px
 from photonpano.values import Located, Patches
 
 SHAPE = (120, 160)
 
 
-def _by_agreement(shifts: np.ndarray, std_px: float, tolerance_px: float = TOLERANCES_PX[-1]) -> Located:
-    """Return a pair by the patches that agree with a motion of none, where they lie at `shifts`, (P, 2) px."""
+def _pair(std_px: float, wrong: int = 0, seed: int = 5) -> Located:
+    """Return a pair that shows no motion, by patches with this noise, of which each `wrong`-th lies 1 px further."""
+    shifts = np.random.default_rng(seed).normal(0, std_px, (len(patch_centres(SHAPE)), 2))
+    if wrong:
+        shifts[::wrong, 0] += 1
     information = np.tile(np.eye(2) / std_px**2, (len(shifts), 1, 1))
-    motion = Located(translation(0, 0), np.eye(8), patches=Patches(shifts, information))
-    return agreeing([motion], shifts[None], tolerance_px, SHAPE)[0]
+    return Located(translation(0, 0), np.eye(8), patches=Patches(shifts, information))
 
 
-def _moved_px(found: Located) -> np.ndarray:
-    """Return how far a motion takes the middle of a frame: (2,)."""
+def _agreeing(motion: Located) -> Located:
+    """Return the pair by the patches that agree with no motion, to the finest tolerance that their noise admits."""
+    assert motion.patches is not None
+    return agreeing([motion], motion.patches.shifts[None], tolerances_px([motion])[-1], SHAPE)[0]
+
+
+@pytest.mark.parametrize("std_px", [0.05, 0.3, 3.0])
+def test_noise_does_not_choose_the_patches_that_agree(std_px: float) -> None:
+    """Of patches with 3 px of noise, a tolerance of 0.18 px would leave a few that agree by chance."""
+    motions = [_agreeing(_pair(std_px, seed=seed)) for seed in range(20)]
     height, width = SHAPE
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    return transform_points(found.homography, middle[None])[0] - middle
-
-
-@pytest.mark.parametrize("std_px", [0.05, 3.0])
-def test_patches_agree_within_their_noise(std_px: float) -> None:
-    """The finest tolerance, of 0.18 px, takes no patches with 3 px of noise for others: they tell half of what all tell."""
-    rng = np.random.default_rng(4)
-    noise = rng.normal(0, std_px, (20, len(patch_centres(SHAPE)), 2))
-    moved = np.array([_moved_px(_by_agreement(shifts, std_px)) for shifts in noise])
+    middle = np.array([[(width - 1) / 2, (height - 1) / 2]])
+    moved = np.array([transform_points(each.homography, middle)[0] - middle[0] for each in motions])
     # Eight parameters of all patches leave the middle uncertain by 1.5 times the error of a mean, weights by noise add a half.
-    assert np.sqrt((moved**2).mean()) < 2.2 * std_px / np.sqrt(noise.shape[1])
-    kept, known = (_by_agreement(each, std_px).information for each in (noise[0], 0 * noise[0]))
-    assert kept is not None
-    assert known is not None
-    assert np.trace(kept) > 0.3 * np.trace(known)
+    assert np.sqrt((moved**2).mean()) < 2.2 * std_px / np.sqrt(len(patch_centres(SHAPE)))
+    shown = [each.patches for each in motions]
+    assert all(each is not None and np.trace(each.information.sum(axis=0)) > 20 / std_px**2 for each in shown)
 
 
 def test_patches_of_another_motion_do_not_count() -> None:
     """A third of the patches that lie 1 px further move the middle by a hundredth of that."""
-    shifts = np.random.default_rng(5).normal(0, 0.05, (len(patch_centres(SHAPE)), 2))
-    shifts[::3, 0] += 1
-    assert np.abs(_moved_px(_by_agreement(shifts, 0.05))).max() < 0.02
+    found = _agreeing(_pair(0.05, wrong=3))
+    assert np.abs(transform_points(found.homography, np.array([[79.5, 59.5]])) - [79.5, 59.5]).max() < 0.02
