@@ -213,3 +213,11 @@ def rotations_between(camera: Camera, here: FloatArray, there: FloatArray) -> Fl
     """Return the rotations that bring (4, 2) ideal pixels to (N, 4, 2) others: (N, 3, 3), by least squares (Kabsch 1976)."""
     seen = [Camera(camera.matrix).directions(points) for points in (np.broadcast_to(here, there.shape), there)]
     return nearest_rotations(np.swapaxes(seen[1], -1, -2) @ seen[0])
+
+
+def right_handed_axes() -> dict[str, FloatArray]:
+    """Return the 24 ways to choose axes along others, such as "x, -y, -z": rotations (3, 3) whose rows are the axes."""
+    from scipy.spatial.transform import Rotation
+
+    every = np.rint(Rotation.create_group("O").as_matrix())
+    return {", ".join("-" * int(row.sum() < 0) + "xyz"[np.abs(row).argmax()] for row in each): each for each in every}

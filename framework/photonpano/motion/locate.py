@@ -19,6 +19,7 @@ from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.evidence import Evidence
 from photonpano.motion.exposure_tasks import Pair
 from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
+from photonpano.motion.gyroscope import Gyroscope
 from photonpano.motion.level import FrameHomography, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import alike, excluded_pairs, instants_of, pairs_of
@@ -82,15 +83,15 @@ def locate(
     context: Context,
     model: MotionModel = HOMOGRAPHIES,
     start: StartingMotion | None = None,
+    gyroscope: Gyroscope | None = None,
 ) -> LocatedLevel:
     """Register the pairs of a level, and solve the motion graph (paper, section 4, "Locate").
 
     Each exposure is merged and described once, in order, a few ahead of the pairs that need it, and released after its last
     pair. At the first level, pairs begin with the `start` that short spans show, if any. A pair that the first locator does not
-    locate is passed to the next. Pairs that are tied by hand are registered from there. Once the graph is solved, pairs of
-    exposures that overlap at different times are registered as
-    loop closures, and the graph is solved again. Fallback locators and loop closures need exposures that were released; these
-    are merged again.
+    locate is passed to the next. Pairs that are tied by hand are registered from there, and those of a `gyroscope` are added.
+    Once the graph is solved, pairs of exposures that overlap at different times are registered as loop closures, and the graph
+    is solved again. Fallback locators and loop closures need exposures that were released; these are merged again.
 
     Raises:
         LocationError: exposures cannot be tied to each other, and `graph.disconnected` is "error".
@@ -128,6 +129,8 @@ def locate(
             kept = context.checkpoints.log(f"level-{level.number}-ties", groups, [each.expected for each in starts])
             registered = registrar.closures(starts, pool, kept)
             edges += tuple(each.checked(edge) for each, edge in zip(by_hand, registered, strict=True))
+        if gyroscope is not None:
+            edges += gyroscope.edges(groups)
         with exposures.clock("locate"), solving(level.number):
             labels = components(len(groups), edges)
             foreseen = np.array([exposures.is_foreseen(index) for index in range(len(groups))])

@@ -13,6 +13,7 @@ from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
+from photonpano.motion.gyroscope import Gyroscope
 from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, locate
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
@@ -71,6 +72,7 @@ def estimate_motion(
     model: MotionModel = HOMOGRAPHIES,
     corrects: bool = False,
     known: FrameSpan | None = None,
+    gyroscope: Gyroscope | None = None,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level (paper, section 4).
 
@@ -81,14 +83,16 @@ def estimate_motion(
     The homography of the frame `reference` is the identity. With `until_converged`, the loop ends as soon as another level
     would gain nothing: see `converges`. `previous` is the motion known so far, which each level replaces; one that
     `corrects` keeps its tremor, and one that is `known` in some frames alone was extrapolated to the others. Without a
-    timeline, no frame is missing or repeated.
+    timeline, no frame is missing or repeated. A `gyroscope` ties exposures, and knows how they tremble.
 
     Raises:
+        InputError: the images contradict points that are tied by hand, or the gyroscope.
         LocationError: too few exposures could be located.
         PluginError: a component failed, or broke its contract.
     """
     results: list[LevelResult] = []
-    timeline = timeline or Timeline.regular(source.info.n_frames)
+    along = None if gyroscope is None else gyroscope.trajectory(reference)
+    previous, timeline = along if previous is None else previous, timeline or Timeline.regular(source.info.n_frames)
     for level in levels:
         if results and context.time_limit.leaves_out("further levels"):
             break
@@ -103,8 +107,8 @@ def estimate_motion(
                 start = context.checkpoints.once("level-1-start", partial(starting_motion, seen, groups, context), groups)
             start = start and replace(start, timeline=timeline)
         exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start, known)
-        located = locate(exposures, graph, context, model, start)
-        trajectory = interpolate(level, located, timeline, reference, clock, previous if corrects else None)
+        located = locate(exposures, graph, context, model, start, gyroscope)
+        trajectory = interpolate(level, located, timeline, reference, clock, previous if corrects else along)
         require_agreement(ties_of(graph.tie, seen), groups, located.solution.located, trajectory)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))

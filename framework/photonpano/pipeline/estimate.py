@@ -13,8 +13,10 @@ from photonpano.contracts.protocols import Source
 from photonpano.errors import LocationError
 from photonpano.execution.context import Context
 from photonpano.motion.diagnosis import UntiedError, also_tried
+from photonpano.motion.gyroscope import Gyroscope
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import Timeline
+from photonpano.motion.tracking.rates_fit import fit_rates
 from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels
@@ -46,7 +48,7 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
     if shots:
         return _along(timeline.in_shots(shots), plan, source, journal, context, plan.motion.start != "none")
     assert error is not None
-    if plan.motion.start == "none":
+    if plan.motion.start == "none" and plan.motion.prior is None:
         with also_tried(error, "motion: {start: constant-velocity} was tried, too"):
             return _along(timeline, plan, source, journal, context, True)
     raise error
@@ -57,7 +59,9 @@ def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decisio
     source = replace(leaving_out(source, timeline.shown), copies=timeline.copies)
     reference, levels = _reference_frame(plan, timeline.shot), build_levels(plan, source, journal)
     start = _start(plan, source, reference, journal, context) if started else None
-    state = State(plan, source, context, reference, levels, timeline, model_of(plan), start).located(levels[:1], start)
+    gyroscope = _gyroscope(plan, source, timeline, journal, context)
+    state = State(plan, source, context, reference, levels, timeline, model_of(plan), start, gyroscope)
+    state = state.located(levels[:1], start)
     tried: tuple[passes.Pass, ...] = (
         passes.through_found_lens,
         passes.without_shading,
@@ -72,6 +76,9 @@ def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decisio
             break
         state = passes.tried(state, each).state
     journal += [*state.decisions, *state.timeline.decisions, *_model_decisions(plan, state.results)]
+    if gyroscope is not None:
+        located = state.results[-1].located
+        journal.append(gyroscope.agreement(located.edges, located.solution, float(np.median(located.std_px))))
     return state
 
 
@@ -108,6 +115,17 @@ def _start(plan: Plan, source: Source, reference: int, journal: list[Decision], 
         reason += "; without it, pairs of exposures could not be located"
     journal.append(Decision(START, found.text, reason))
     return ConstantVelocity(found.velocity, reference)
+
+
+def _gyroscope(plan: Plan, source: Source, timeline: Timeline, journal: list[Decision], context: Context) -> Gyroscope | None:
+    """Fit the gyroscope of a spec to its capture; `InputError` or `LocationError` if it was not fixed to its camera."""
+    if (prior := plan.motion.prior) is None:
+        return None
+    camera, noise = model_of(plan).camera(source.info.frame_shape), float(np.radians(prior.noise_deg_s_sqrt_hz))
+    given = prior.imu, camera, timeline, context, noise, prior.axes, prior.time_offset_s
+    gyroscope, decision = fit_rates(source, *given)
+    journal.append(decision)
+    return gyroscope
 
 
 def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:

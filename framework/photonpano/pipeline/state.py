@@ -14,6 +14,7 @@ from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.corrections import Vignette
 from photonpano.execution.context import Context
 from photonpano.motion.frame_motion import FrameMotion, motion_of_frames
+from photonpano.motion.gyroscope import Gyroscope
 from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
@@ -41,6 +42,7 @@ class State:
         reference: the frame whose homography is the identity.
         timeline: repeated frames, and where the motion is cut.
         start: the motion known before the first level; None if there is none.
+        gyroscope: that turned with the camera; None if there is none.
         outdated: whether the source was corrected since these levels were located.
         watched: whether what hides the background was looked for.
         vignette: by which the source is divided.
@@ -56,6 +58,7 @@ class State:
     timeline: Timeline
     model: MotionModel = HOMOGRAPHIES
     start: Trajectory | None = None
+    gyroscope: Gyroscope | None = None
     results: tuple[LevelResult, ...] = ()
     outdated: bool = False
     watched: bool = False
@@ -71,7 +74,8 @@ class State:
         before = [each for each in self.results if each.level.number < levels[0].number]
         given = self.plan.graph, self.reference, self.context, self.plan.until_converged, previous, self.timeline, self.model
         known = self.results[-1].located.covered if self.results else None
-        return replace(self, results=(*before, *estimate_motion(self.source, levels, *given, corrects, known)), outdated=False)
+        results = estimate_motion(self.source, levels, *given, corrects, known, self.gyroscope)
+        return replace(self, results=(*before, *results), outdated=False)
 
     def relocated(self) -> State:
         """Run the last level again along the refined motion, which it corrects: its exposures are then sharper.

@@ -92,6 +92,9 @@ def _check_camera(motion: MotionSettings, camera: CameraSettings, posed: bool, s
     if motion.model == "rotation" and motion.start != "none":
         message = f"{motion.start} is a start of planar models, not of motion.model: rotation"
         spec.wrong(spec.root.at("motion", "start"), message)
+    if motion.prior is not None and (motion.model != "rotation" or camera.focal_px == "find"):
+        message = "a gyroscope needs motion.model: rotation, and the focal length of the camera: give camera.focal_px"
+        spec.wrong(spec.root.at("motion", "prior"), message)
     if motion.model in _TURNING and not posed:
         return
     unfindable = "find needs motion.model: rotation or auto, which measure the camera; give a number here"

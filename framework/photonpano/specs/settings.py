@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ByteSize, Field, field_validator
 
+from photonpano.geometry import right_handed_axes
 from photonpano.plugins.contributions import KINDS, Config, SpecPath
 
 _Factor = Annotated[float, Field(gt=0, le=1000)]
@@ -52,6 +53,38 @@ class GraphSettings(Config):
     )
 
 
+class PriorSettings(Config):
+    """A gyroscope that was fixed to the camera."""
+
+    imu: SpecPath = Field(
+        description="a .csv file of the gyroscope's rates: columns t_s, wx_rad_s, wy_rad_s, wz_rad_s, or wx_deg_s and so on; "
+        "others are ignored"
+    )
+    axes: str = Field(
+        "x, y, z",
+        description="the axes of the camera (x right, y down, z ahead) in those of the gyroscope: x, -y, -z for one whose y "
+        "points up and z backwards; find takes the ones along which photons fit together best",
+    )
+    time_offset_s: Literal["find"] | float = Field(
+        "find",
+        description="time of the gyroscope at the first frame, in s; find looks through all times for which the file covers "
+        "the capture",
+    )
+    noise_deg_s_sqrt_hz: float = Field(
+        0.01,
+        gt=0,
+        le=10,
+        description="density of its white noise, in deg/s per square root of Hz; the default is usual in phones",
+    )
+
+    @field_validator("axes", mode="after")
+    @classmethod
+    def _right_handed(cls, axes: str) -> str:
+        if axes != "find" and axes not in right_handed_axes():
+            raise ValueError(f"expected find, or three right-handed axes such as x, -y, -z, got {axes!r}")
+        return axes
+
+
 class MotionSettings(Config):
     """What the motion of the camera may be."""
 
@@ -67,6 +100,9 @@ class MotionSettings(Config):
         description="what is known of the motion before the first level: none, or the constant-velocity of the image, a turn "
         "about any point or a shift, that is found from all frames together, where groups of them are too dark or too blurred; "
         "with none, this is tried if pairs of exposures cannot be located",
+    )
+    prior: PriorSettings | None = Field(
+        None, description="a gyroscope, whose rates tie exposures that are too dark to be located; for motion.model: rotation"
     )
 
 

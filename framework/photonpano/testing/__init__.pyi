@@ -1,5 +1,6 @@
 from .captures import KnownMotion as KnownMotion
 from .captures import MemorySource as MemorySource
+from .captures import measured_rates as measured_rates
 from .captures import photographed as photographed
 from .captures import recorded as recorded
 from .executors import ExecutorConformance as ExecutorConformance

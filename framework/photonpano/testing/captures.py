@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photonpano.contracts.protocols import Closing, Trajectory
-from photonpano.geometry import translation
+from photonpano.geometry import rotation_vectors, translation
 from photonpano.photometry import BinaryResponse
 from photonpano.testing.scenes import Scene
 from photonpano.values import BoolArray, Counts, FloatArray, FrameSpan, Group, Homography, StreamInfo, VirtualExposure
@@ -118,3 +118,36 @@ def photographed(flux: FloatArray, n_frames: int = 1000, seed: int = 0, unseen: 
         estimate[unseen], weight[unseen] = np.nan, 0
     span = FrameSpan(0, n_frames)
     return VirtualExposure(estimate, weight, Group(span, span.centre), 1.0, response)
+
+
+def measured_rates(
+    rotations: ArrayLike,
+    frame_rate_hz: float,
+    *,
+    bias_deg_s: ArrayLike = (0.0, 0.0, 0.0),
+    offset_s: float = 0.0,
+    noise_deg_s_sqrt_hz: float = 0.01,
+    seed: int = 0,
+) -> str:
+    """Simulate a gyroscope on a camera, at 1,000 Hz, from 0.1 s before the first frame to 0.1 s after the last.
+
+    Args:
+        rotations: (T, 3, 3), from the camera at each frame to any other one, such as `rotations` of a simulated truth.
+        frame_rate_hz: of the frames.
+        bias_deg_s: constant error about x (to the right), y (down) and z (ahead).
+        offset_s: time of the gyroscope at the first frame.
+        noise_deg_s_sqrt_hz: density of its white noise.
+        seed: of the noise.
+
+    Returns:
+        The content of a CSV file for `motion.prior.imu`.
+    """
+    rotations = np.asarray(rotations)
+    between = rotation_vectors(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:]) * frame_rate_hz
+    times_s = np.arange(-0.1, len(rotations) / frame_rate_hz + 0.1, 1e-3)
+    middles_s = (np.arange(len(between)) + 0.5) / frame_rate_hz
+    rates = np.stack([np.interp(times_s, middles_s, each) for each in between.T], axis=1)
+    noise = noise_deg_s_sqrt_hz * np.sqrt(500) * np.random.default_rng(seed).normal(size=rates.shape)
+    rows = np.column_stack([times_s + offset_s, np.rad2deg(rates) + noise + np.asarray(bias_deg_s)])
+    lines = [",".join(f"{number:.9g}" for number in row) for row in rows]
+    return "\n".join(["t_s,wx_deg_s,wy_deg_s,wz_deg_s", *lines, ""])

@@ -249,6 +249,8 @@ GOOD = sorted((SPECS / "good").glob("*.yaml"))
 BAD = sorted((SPECS / "bad").glob("*.yaml"))
 BEYOND_A_SCHEMA = {
     "fallback_again",
+    "gyroscope",
+    "gyroscope_axes",
     "lens_of_homographies",
     "projection_of_homographies",
     "source_check",

@@ -6,6 +6,7 @@ adds to the contrast, too, by the product of each frame with itself; only produc
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import partial
 
@@ -128,17 +129,17 @@ def find_velocity(source: Source, context: Context) -> FoundVelocity:
         InputError: the capture has fewer than 8 frames, or they are tiny.
         LocationError: no velocity stands out, what stands out stands still, or the velocity changes.
     """
-    varying, seen, n_frames = _residuals(source, context)
-    velocity, significance = _searched(_structure(_halved(varying), _halved(seen[None])[0]), context)
+    varying, seen, n_frames = varying_spans(source, context)
+    velocity, significance = _searched(structure_of(_halved(varying), _halved(seen[None])[0]), context)
     velocity *= [1, 2, 2]
-    images = _structure(varying, seen)
+    images = structure_of(varying, seen)
     if significance < _SIGNIFICANT:
         raise LocationError(
             "motion.start: no constant velocity stands out from photon noise: the sharpest sum of photons is "
             f"{significance:.2g} standard deviations above those along other velocities, and {_SIGNIFICANT:g} are needed; "
             f"the scene may stand still or change its speed, or the capture is too dark or too short{_WITHOUT}"
         )
-    whole = _Contrast(images, len(images))
+    whole = _Turning(images, len(images))
     if whole.moved_px(velocity) < _LEAST_PX:
         raise LocationError(
             "motion.start: what varies over time stays at its place in the frame, and so shows no motion; "
@@ -146,7 +147,7 @@ def find_velocity(source: Source, context: Context) -> FoundVelocity:
         )
     size, before = min(4 * _LAGS, len(images)), -np.inf
     while True:
-        contrast = _Contrast(images, size)
+        contrast = _Turning(images, size)
         velocity = contrast.sharpest(velocity)
         if (height := contrast.height(velocity)) < _STEADY * before:
             raise LocationError(
@@ -158,7 +159,7 @@ def find_velocity(source: Source, context: Context) -> FoundVelocity:
             break
         size, before = min(2 * size, len(images)), height
     half = len(images) // 2
-    halves = tuple(_Contrast(each, half).sharpest(velocity) for each in (images[:half], images[-half:]))
+    halves = tuple(_Turning(each, half).sharpest(velocity) for each in (images[:half], images[-half:]))
     scale, factor = binning_of(source), 1 / n_frames
 
     def of_frames(found: FloatArray) -> Velocity:
@@ -169,7 +170,7 @@ def find_velocity(source: Source, context: Context) -> FoundVelocity:
     return FoundVelocity(of_frames(velocity), covariance, significance, (of_frames(halves[0]), of_frames(halves[1])))
 
 
-def _residuals(source: Source, context: Context) -> tuple[Images, Images, int]:
+def varying_spans(source: Source, context: Context) -> tuple[Images, Images, int]:
     """Return what varies over time, in binned pixels: (S, h, w), which pixels are seen: (h, w), and the frames of a span.
 
     What stands still, such as hot pixels and the light on the scene, is subtracted in proportion to the brightness of a span.
@@ -193,7 +194,7 @@ def _residuals(source: Source, context: Context) -> tuple[Images, Images, int]:
     return images, seen, n_frames
 
 
-def _structure(images: Images, seen: Images) -> Images:
+def structure_of(images: Images, seen: Images) -> Images:
     """Return the structure of images at the scales that fix a velocity: (S, h, w), with 0 where `seen`, (h, w), is 0."""
     share = cv2.GaussianBlur(seen, (0, 0), _COARSE) + np.float32(1e-6)
     found = [cv2.GaussianBlur(each, (0, 0), _FINE) - cv2.GaussianBlur(each, (0, 0), _COARSE) / share for each in images]
@@ -234,7 +235,7 @@ def _fits(
     height, width = images.shape[1:]
     middle, fits = (np.array([width, height]) - 1) / 2, np.zeros(len(velocities))
     for lag in range(1, min(_LAGS, len(images) - 1) + 1):
-        turned = np.stack([_warped(each, Velocity(turn, np.zeros(2), middle).after([lag])[0]) for each in images[lag:]])
+        turned = np.stack([warped(each, Velocity(turn, np.zeros(2), middle).after([lag])[0]) for each in images[lag:]])
         products = np.zeros_like(spectra[0])
         for later, earlier in zip(turned, spectra, strict=False):
             products += fft.rfft2(later, shape) * earlier.conj()
@@ -249,86 +250,102 @@ def _fits(
     return fits
 
 
-def _warped(image: Images, there: FloatArray) -> Images:
-    """Return an image at the points to which a rigid motion takes its pixels; 0 outside."""
+def warped(image: Images, there: FloatArray) -> Images:
+    """Return an image at the points to which a motion takes its pixels; 0 outside."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    if there[2, :2].any():
+        return np.asarray(cv2.warpPerspective(image, there, image.shape[::-1], flags=flags), np.float32)
     return np.asarray(cv2.warpAffine(image, there[:2], image.shape[::-1], flags=flags), np.float32)
 
 
-class _Contrast:
-    """The contrast of sums of spans (S, h, w) along a velocity, over windows of some spans, without that of each by itself."""
+class Contrast(ABC):
+    """The contrast of sums of spans (S, h, w) along a motion, over windows of some spans, without that of each by itself.
+
+    Subclasses define the motion by its (k,) unknowns.
+    """
 
     def __init__(self, images: Images, size: int) -> None:
         height, width = images.shape[1:]
         self.middle: FloatArray = (np.array([width, height]) - 1) / 2
         n_windows = len(images) // size
         start = (len(images) - n_windows * size) // 2
-        self._images = images[start : start + n_windows * size]
-        self._size, self._corners = size, corners((height, width))
-        self._times = np.arange(size) - (size - 1) / 2
+        self.spans, self._windows = slice(start, start + n_windows * size), n_windows
+        self._images, self.size, self._corners = images[self.spans], size, corners((height, width))
 
-    def of_spans(self, velocity: FloatArray) -> FloatArray:
-        """Return the products of each span with all others of its window: (S,). Their sum is the contrast."""
-        there = Velocity(float(velocity[0]), velocity[1:], self.middle).after(self._times)
-        products: list[float] = []
-        for start in range(0, len(self._images), self._size):
-            window = self._images[start : start + self._size]
-            warped = np.stack([_warped(*each) for each in zip(window, there, strict=True)]).reshape(self._size, -1)
-            products += (warped @ warped.sum(axis=0) - np.einsum("ij,ij->i", warped, warped)).tolist()
-        return np.array(products)
-
-    def height(self, velocity: FloatArray) -> float:
-        """Return the contrast in units of its noise, but for a factor that does not depend on the size of windows."""
-        return float(self.of_spans(velocity).sum()) / float(np.sqrt(len(self._images) * (self._size - 1)))
-
-    def moved_px(self, velocity: FloatArray) -> float:
-        """Return how far corners of the frame move within a window, at most, in binned pixels."""
-        there = Velocity(float(velocity[0]), velocity[1:], self.middle).after(self._times[[0, -1]])
-        return float(
-            np.linalg.norm(transform_points(there[1], self._corners) - transform_points(there[0], self._corners), axis=-1).max()
-        )
+    @abstractmethod
+    def there(self, motion: FloatArray) -> FloatArray:
+        """Return where pixels of the middle of each of W windows lie in each of its spans: (W, size, 3, 3) or (size, 3, 3)."""
 
     @property
+    @abstractmethod
     def steps(self) -> FloatArray:
-        """(3,) changes of the velocity by which the border of the frame moves by a binned pixel at the ends of a window."""
-        ahead = float(self._times[-1])
-        return np.array([1 / (float(self.middle.min()) * ahead), 1 / ahead, 1 / ahead])
+        """(k,) changes of the motion by which the border of the frame moves by about a binned pixel at the ends of a window."""
 
-    def sharpest(self, velocity: FloatArray) -> FloatArray:
-        """Return the velocity of highest contrast near another one (Nelder and Mead 1965)."""
-        simplex = velocity + np.concatenate([np.zeros((1, 3)), np.diag(self.steps)])
-        scale = abs(float(self.of_spans(velocity).sum())) or 1.0
+    def of_spans(self, motion: FloatArray) -> FloatArray:
+        """Return the products of each span with all others of its window: (S,). Their sum is the contrast."""
+        there = np.broadcast_to(self.there(motion), (self._windows, self.size, 3, 3))
+        products: list[float] = []
+        for start, maps in zip(range(0, len(self._images), self.size), there, strict=True):
+            window = self._images[start : start + self.size]
+            moved = np.stack([warped(*each) for each in zip(window, maps, strict=True)]).reshape(self.size, -1)
+            products += (moved @ moved.sum(axis=0) - np.einsum("ij,ij->i", moved, moved)).tolist()
+        return np.array(products)
+
+    def height(self, motion: FloatArray) -> float:
+        """Return the contrast in units of its noise, but for a factor that does not depend on the size of windows."""
+        return float(self.of_spans(motion).sum()) / float(np.sqrt(len(self._images) * (self.size - 1)))
+
+    def moved_px(self, motion: FloatArray) -> float:
+        """Return how far corners of the frame move within a window, at most, in binned pixels."""
+        there = self.there(motion)
+        ends = (transform_points(there[..., end, :, :], self._corners) for end in (-1, 0))
+        return float(np.linalg.norm(np.subtract(*ends), axis=-1).max())
+
+    def sharpest(self, motion: FloatArray) -> FloatArray:
+        """Return the motion of highest contrast near another one (Nelder and Mead 1965)."""
+        simplex = motion + np.concatenate([np.zeros((1, len(motion))), np.diag(self.steps)])
+        scale = abs(float(self.of_spans(motion).sum())) or 1.0
 
         def lost(units: FloatArray) -> float:
             return -float(self.of_spans(units * self.steps).sum()) / scale
 
         found = optimize.minimize(
             lost,
-            velocity / self.steps,
+            motion / self.steps,
             method="Nelder-Mead",
             options={"initial_simplex": simplex / self.steps, "xatol": 0.01, "fatol": 1e-5, "maxiter": 200},
         )
         return np.asarray(found.x * self.steps)
 
-    def covariance(self, velocity: FloatArray) -> FloatArray:
-        """Return the covariance of the sharpest velocity: (3, 3), by the infinitesimal jackknife over spans (Efron 1982).
+    def covariance(self, motion: FloatArray) -> FloatArray:
+        """Return the covariance of the sharpest motion: (k, k), by the infinitesimal jackknife over spans (Efron 1982).
 
         It is inv(H) J inv(H): H are the second derivatives of the contrast, and J is the sum over spans of the squares of what
         each adds to the first ones.
         """
         steps = self.steps / 2
-        centre = self.of_spans(velocity)
-        ahead, back = ([self.of_spans(velocity + sign * step) for step in np.diag(steps)] for sign in (1, -1))
+        centre = self.of_spans(motion)
+        ahead, back = ([self.of_spans(motion + sign * step) for step in np.diag(steps)] for sign in (1, -1))
         # The contrast loses twice the products of a span with all others if that is left out.
         slopes = np.stack([2 * (one - other) / 2 for one, other in zip(ahead, back, strict=True)], axis=-1)
-        curvature = np.zeros((3, 3))
-        for i in range(3):
+        curvature = np.zeros((len(motion), len(motion)))
+        for i in range(len(motion)):
             for j in range(i):
                 both = np.diag(steps)[i] + np.diag(steps)[j]
-                mixed = (
-                    self.of_spans(velocity + both) + self.of_spans(velocity - both) - ahead[i] - back[i] - ahead[j] - back[j]
-                )
+                mixed = self.of_spans(motion + both) + self.of_spans(motion - both) - ahead[i] - back[i] - ahead[j] - back[j]
                 curvature[i, j] = curvature[j, i] = float((mixed + 2 * centre).sum()) / 2
             curvature[i, i] = float((ahead[i] + back[i] - 2 * centre).sum())
         inverted = np.linalg.pinv(curvature)
         return np.asarray(inverted @ (slopes.T @ slopes) @ inverted * steps[:, None] * steps)
+
+
+class _Turning(Contrast):
+    """The contrast along a constant velocity: the turn, and the shift of the middle, from one span to the next."""
+
+    def there(self, motion: FloatArray) -> FloatArray:
+        return Velocity(float(motion[0]), motion[1:], self.middle).after(np.arange(self.size) - (self.size - 1) / 2)
+
+    @property
+    def steps(self) -> FloatArray:
+        ahead = (self.size - 1) / 2
+        return np.array([1 / (float(self.middle.min()) * ahead), 1 / ahead, 1 / ahead])

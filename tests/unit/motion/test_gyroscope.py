@@ -1,0 +1,136 @@
+"""A gyroscope: its file, the rotations by its rates, and the pairs that these tie, with their expected error."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan, Group, InputError, Located
+from photonpano.geometry import Camera, corner_displacements, right_handed_axes, rotation_matrices, rotation_vectors
+from photonpano.motion.graph import solve
+from photonpano.motion.gyroscope import GYROSCOPE, Gyroscope
+from photonpano.motion.model import MotionModel
+from photonpano.motion.rates import Rates, read_rates
+from photonpano.testing import measured_rates
+
+SHAPE, FOCAL_PX = (64, 96), 122.0
+HEADER = "t_s,wx_rad_s,wy_rad_s,wz_rad_s\n"
+COLUMNS = (
+    "the first line must name the columns t_s, wx_rad_s, wy_rad_s, wz_rad_s, or wx_deg_s, wy_deg_s, wz_deg_s for degrees; "
+    "it is "
+)
+UNREADABLE = "cannot be read (its rows of numbers count from 0): "
+SAMPLES = "".join(f"{time},0,0,0\n" for time in range(4))
+GROUPS = [Group(FrameSpan(start, start + 50), start + 24.5) for start in range(0, 1000, 50)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", COLUMNS + "''"),
+        ("t,wx,wy,wz\n" + SAMPLES, COLUMNS + "'t,wx,wy,wz'"),
+        ("t_s,wx_rad_s,wy_rad_s,wz_deg_s\n" + SAMPLES, COLUMNS + "'t_s,wx_rad_s,wy_rad_s,wz_deg_s'"),
+        (HEADER + "1,2,here,4\n", UNREADABLE + "could not convert string 'here' to float64 at row 0, column 3."),
+        (HEADER + "1,2,3\n", UNREADABLE + "invalid column index 3 at row 1 with 3 columns"),
+        (HEADER + "0,0,0,0\n", "must hold at least 4 samples, and no NaN or infinite numbers"),
+        (HEADER + SAMPLES + "4,nan,0,0\n", "must hold at least 4 samples, and no NaN or infinite numbers"),
+        (HEADER + SAMPLES + "2,0,0,0\n", "2 s follows 3 s; sort its lines by time"),
+        (
+            HEADER + SAMPLES + "4,0,60,0\n",
+            "holds rates up to 60 rad/s, more than any usual gyroscope measures; if they are in deg/s, name the columns "
+            "wx_deg_s, wy_deg_s, wz_deg_s",
+        ),
+    ],
+)  # fmt: skip
+def test_wrong_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (file := tmp_path / "imu.csv").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_rates(file)
+    assert str(caught.value).removeprefix(str(file)).lstrip(": ") == message
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"imu\.csv cannot be read .* No such file"):
+        read_rates(tmp_path / "imu.csv")
+
+
+def test_frames_without_rates_are_named() -> None:
+    rates = Rates(Path("imu.csv"), np.r_[0:0.5:0.01, 0.6:1.0:0.01], np.zeros((90, 3)))
+    rates.require_covered(np.arange(10) * 0.01)
+    with pytest.raises(InputError, match=r"holds rates from 0 to 0.99 s, .* 11 of them, from 90 to 100, are without; correct"):
+        rates.require_covered(np.arange(0.1, 1.101, 0.01))
+    with pytest.raises(InputError, match=r"no rates from 0.49 to 0.6 s, when the frames 40 to 50 were taken"):
+        rates.require_covered(np.arange(0.0945, 0.9, 0.01))
+
+
+def test_rates_in_degrees_without_their_bias_are_the_rotations(tmp_path: Path) -> None:
+    frames = np.arange(1000)[:, None] / 1000
+    truth = rotation_matrices(np.sin(frames * [3.0, 2.0, 5.0]) * [0.1, 0.5, 0.2])
+    (file := tmp_path / "imu.csv").write_text(
+        measured_rates(truth, 1000.0, bias_deg_s=(1, -2, 3), offset_s=5.0, noise_deg_s_sqrt_hz=0.0)
+    )
+    found = read_rates(file).rotations(frames[:, 0] + 5, np.deg2rad([1, -2, 3]))
+    away = np.swapaxes(truth, -1, -2) @ truth[0] @ found
+    assert np.abs(rotation_vectors(away)).max() < 2e-5
+
+
+def test_axes_are_the_24_rotations() -> None:
+    axes = right_handed_axes()
+    assert len(axes) == 24
+    assert axes["x, -y, -z"].tolist() == np.diag([1, -1, -1]).tolist()
+    assert "x, y, -z" not in axes
+    rates = Rates(Path("imu.csv"), np.arange(2.0), np.array([[1.0, 2.0, 3.0]] * 2))
+    assert rates.about(axes["y, -x, z"]).rad_s[0].tolist() == [2, -1, 3]
+
+
+def gyroscope_of(rad_s: np.ndarray, noise: float = 0.0, std_bias: float = 0.0) -> Gyroscope:
+    times_s = np.arange(0, 1.001, 0.001)
+    rates = Rates(Path("imu.csv"), times_s, np.broadcast_to(rad_s, (len(times_s), 3)))
+    camera, frames_s = Camera.of(FOCAL_PX, SHAPE), np.arange(1000) / 1000
+    return Gyroscope(rates, camera, SHAPE, frames_s, noise, np.zeros(3), np.full(3, std_bias), 0.0)
+
+
+def test_pairs_of_a_still_camera_scatter_as_expected() -> None:
+    noise, std_bias, rng = np.deg2rad(0.05), np.deg2rad(0.2), np.random.default_rng(4)
+    squares, ends, camera = [], [], Camera.of(FOCAL_PX, SHAPE)
+    for _ in range(60):
+        drift = rng.normal(0, noise * np.sqrt(1000), (1001, 3))
+        edges = gyroscope_of(drift, noise).edges(GROUPS)
+        motions = np.array([edge.motion.homography for edge in edges])
+        squares.append(np.mean(corner_displacements(motions, np.eye(3), SHAPE) ** 2))
+        biased = gyroscope_of(drift + rng.normal(0, std_bias, 3), noise, std_bias).edges(GROUPS)
+        turned = rotation_vectors(camera.rotations(np.array([edge.motion.homography for edge in biased])))
+        ends.append(np.sum(turned.sum(axis=0) ** 2))
+    expected = np.mean([edge.motion.evidence["std_px"] ** 2 for edge in edges])
+    assert np.mean(squares) == pytest.approx(expected, rel=0.1)
+    # Over the whole capture, a bias leads as far as the random walk that stands for it.
+    walked = gyroscope_of(np.zeros(3), noise, std_bias).edges(GROUPS)
+    variance = sum(edge.motion.evidence["std_px"] ** 2 for edge in walked) / expected * (noise**2 * 0.05) * 3
+    assert np.mean(ends) == pytest.approx(variance, rel=0.3)
+    assert [(edge.moving, edge.fixed, edge.locator) for edge in edges[:2]] == [(1, 0, GYROSCOPE), (2, 1, GYROSCOPE)]
+
+
+def test_a_graph_of_the_gyroscope_alone_drifts_by_its_expected_error() -> None:
+    gyroscope = gyroscope_of(np.array([0.1, 0.6, -0.2]), np.deg2rad(0.01), np.deg2rad(0.3))
+    edges, model = gyroscope.edges(GROUPS), MotionModel("rotation", FOCAL_PX)
+    solution = solve(
+        len(GROUPS), edges, len(GROUPS) // 2, SHAPE, gyroscope.trajectory(0).at([each.reference for each in GROUPS]), model
+    )
+    assert solution.located.all()
+    assert solution.residual_px < 1e-6
+    std_px = solution.assess().std_px
+    # Over half of the capture: 0.3 deg/s of bias, and 1 % of the turn, about each axis.
+    turns = np.hypot(np.deg2rad(0.3), 0.01 * np.array([0.1, 0.6])) * 0.95
+    assert std_px.max() < 2 * FOCAL_PX * np.linalg.norm(turns)
+    assert std_px.max() > 0.2 * FOCAL_PX * np.linalg.norm(turns)
+    assert gyroscope.agreement(edges, solution, 0.05).reason.startswith("of what pairs of exposures show of rotations, 100% is")
+
+
+def test_rates_that_contradict_the_images_are_refused() -> None:
+    seen, other = gyroscope_of(np.array([0.1, 0.6, 0.0])), gyroscope_of(np.array([0.3, -0.4, 0.0]), np.deg2rad(0.01))
+    located = solve(len(GROUPS), seen.edges(GROUPS), 0, SHAPE, None, MotionModel("rotation", FOCAL_PX))
+    assert all(isinstance(edge.motion, Located) for edge in other.edges(GROUPS))
+    with pytest.raises(
+        InputError, match=r"imu.csv: the rates contradict the images by \d\.?\d* px from one exposure to the next"
+    ):
+        other.agreement(other.edges(GROUPS), located, 0.05)
