@@ -130,6 +130,21 @@ def test_run_shows_picture_verdict_and_folder(small_run: Any, monkeypatch: pytes
     assert len(repr(small_run)) < 1000
 
 
+def test_viewer_of_a_run_is_its_report_in_a_frame(small_run: Any, tmp_path: Path, browser_page: Any) -> None:
+    (page := tmp_path / "cell.html").write_text(small_run.viewer(700)._repr_html_())
+    browser_page.open(page)
+    browser_page.wait_for('document.querySelector("iframe").contentDocument.querySelector("#viewer.live")')
+    assert browser_page.run('document.querySelector("iframe").clientHeight') == 700
+    assert (browser_page.messages, browser_page.requests) == ([], [])
+
+
+def test_viewer_needs_a_report(small_run: Any, tmp_path: Path) -> None:
+    import dataclasses
+
+    with pytest.raises(InputError, match=r"report\.html does not exist; the run was rendered without a report"):
+        dataclasses.replace(small_run, directory=tmp_path / "gone").viewer()
+
+
 def test_run_whose_files_are_gone_shows_the_rest(small_run: Any, tmp_path: Path) -> None:
     import dataclasses
 

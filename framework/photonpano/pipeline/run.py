@@ -27,7 +27,7 @@ from photonpano.record.run_json import record_of
 from photonpano.record.run_warnings import TIME_LIMIT
 from photonpano.record.schema import RunRecord
 from photonpano.report import LiveFigures, OpenCapture, render_report
-from photonpano.report.notebook import run_html
+from photonpano.report.notebook import ShownReport, run_html
 from photonpano.residuals.verdict import judge
 from photonpano.specs.plan import Plan
 from photonpano.text import listed
@@ -59,6 +59,14 @@ class RunResult:
     def _repr_html_(self) -> str:
         """Show picture, verdict and files in a notebook, and those of other shots."""
         return run_html(self.directory, self.record) + "".join(each._repr_html_() for each in self.others)
+
+    def viewer(self, height_px: int = 900) -> ShownReport:
+        """Return the report with its viewer, some megabytes, which a notebook shows as the last line of a cell.
+
+        Raises:
+            InputError: the run folder has no report.
+        """
+        return ShownReport(self.directory / "report.html", height_px)
 
 
 def run(

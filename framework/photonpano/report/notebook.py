@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from html import escape
 from pathlib import Path
 
+from photonpano.errors import InputError
 from photonpano.notebooks import facts, from_here, picture_of_png
 from photonpano.record.run_json import verdict_of
 from photonpano.record.schema import RunRecord
@@ -12,6 +14,20 @@ from photonpano.report.drawing import shrunk
 from photonpano.text import counted, duration, pixels, share
 
 _MAX_PIXELS = 900  # longer side of the picture
+
+
+class ShownReport:
+    """A report that a notebook shows as a page in a frame."""
+
+    def __init__(self, path: Path, height_px: int) -> None:
+        """Read the report; `InputError` if there is none."""
+        if not path.is_file():
+            raise InputError(f"{path} does not exist; the run was rendered without a report, or its folder is gone")
+        self._page, self._height_px = path.read_text(encoding="utf-8"), height_px
+
+    def _repr_html_(self) -> str:
+        style = f"width:100%;height:{self._height_px}px;border:0"
+        return f'<iframe title="report" style="{style}" srcdoc="{escape(self._page)}"></iframe>'
 
 
 def run_html(folder: Path, record: RunRecord) -> str:
