@@ -145,9 +145,17 @@ def writer_of(output: Path, catalog: Catalog) -> SourceContribution | None:
 
 
 def require_new_capture(source: Source, plan: Plan, output: Path, overwrite: bool) -> None:
-    """Refuse names of a capture and its truth under which there is something, unless it is to be overwritten."""
-    for path in (output, truth_path(output)) if isinstance(source, KnowsTruth) else (output,):
-        require_new(path, overwrite, capture_files(plan))
+    """Refuse names of a capture and its truth under which there is something, unless it is to be overwritten.
+
+    The truth of one capture must not stay beside another one.
+    """
+    files, truth = capture_files(plan), truth_path(output)
+    for path in (output, truth):
+        require_new(path, overwrite, files)
+    if truth.exists() and not isinstance(source, KnowsTruth) and output.absolute() not in files:
+        raise OutputError(
+            f"{truth} is the truth of the capture that {output} would replace; move it away, or choose another name"
+        )
 
 
 def write_capture(

@@ -62,12 +62,12 @@ def fingerprint(plan: Plan, source: Source) -> CaptureRecord:
 
 
 def capture_files(plan: Plan) -> list[Path]:
-    """Return the files and folders that a plan names for its source, its corrections and its motion graph; URLs are none."""
+    """Return the files and folders that a plan names, for its source, corrections, motion and pairs; URLs are none."""
     return [path for path in _locations(plan) if isinstance(path, Path)]
 
 
 def _locations(plan: Plan) -> list[Location]:
-    return list(dict.fromkeys([*_paths(plan.source.config), *_paths(plan.corrections), *_paths(plan.graph)]))
+    return list(dict.fromkeys(_paths([plan.source.config, plan.corrections, plan.motion, plan.graph])))
 
 
 def frames_sha256(source: Source) -> str:

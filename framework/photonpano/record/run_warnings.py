@@ -126,7 +126,7 @@ def uncertain_frames(motion: FrameMotion) -> list[str]:
         return []
     worst_px = {span: float(std_px[span.start : span.stop].max()) for span in true_spans(uncertain)}
     spans = sorted(worst_px, key=lambda span: -worst_px[span])
-    named = [f"{span} (up to {worst_px[span]:.1f} px)" for span in spans[:SHOWN_SPANS]]
+    named = [f"{span} (up to {worst_px[span]:.2g} px)" for span in spans[:SHOWN_SPANS]]
     more = f" and {len(spans) - SHOWN_SPANS} more spans" if len(spans) > SHOWN_SPANS else ""
     return [
         f"the motion of {int(uncertain.sum())} of {len(std_px)} frames is uncertain: its expected error exceeds "

@@ -271,8 +271,21 @@ def test_convert_continues_after_interrupt(cube: Path, invoke: Callable[..., Any
     assert not part.exists()
 
 
+def test_convert_leaves_no_truth_of_another_capture(cube: Path, invoke: Callable[..., Any]) -> None:
+    (truth := cube.with_name("out.truth.npz")).write_bytes(b"that of another one")
+    assert invoke("convert", "cube.npy", "out.npy").stderr == (
+        "error: out.truth.npz is there already; choose another name, or replace it with --overwrite\n"
+    )
+    assert invoke("convert", "cube.npy", "out.npy", "--overwrite").stderr == (
+        "error: out.truth.npz is the truth of the capture that out.npy would replace; move it away, or choose another name\n"
+    )
+    assert truth.read_bytes() == b"that of another one"
+
+
 def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any]) -> None:
     """The old file stays open until the new one replaces it."""
-    before = cube.read_bytes()
+    before, truth = cube.read_bytes(), cube.with_name("cube.truth.npz")
+    truth.touch()
     assert invoke("convert", "cube.npy", "cube.npy", "--overwrite").exit_code == 0
     assert cube.read_bytes() == before
+    truth.unlink()
