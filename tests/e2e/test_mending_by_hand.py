@@ -6,12 +6,13 @@ import math
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from photonpano import LocationError, load_trajectory, parse_spec, run
 from photonpano.geometry import corners, inverse, transform_points, translation
-from photonpano.testing import KnownMotion, Scene, recorded
+from photonpano.testing.scenes import detected, seen_along, textured
 from photonpano.values import FloatArray
 
 SHAPE, N_FRAMES, WALL = (96, 144), 1600, (500, 1100)
@@ -19,13 +20,14 @@ SHAPE, N_FRAMES, WALL = (96, 144), 1600, (500, 1100)
 
 def _to_scene(frame: float) -> FloatArray:
     """Return the motion of a frame: the camera drifts, and is elsewhere after a wall has passed."""
-    return translation(0.03 * frame + (50 if frame >= 800 else 0), 10 * math.sin(frame / 200))
+    return translation(4 + 0.03 * frame + (50 if frame >= 800 else 0), 14 + 10 * math.sin(frame / 200))
 
 
 @pytest.fixture(scope="module")
 def spec(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A capture whose middle shows a wall without texture."""
-    frames = recorded(Scene(3), KnownMotion(_to_scene), N_FRAMES, SHAPE, seed=1)
+    scene = cv2.GaussianBlur(textured((124, 252), 0.5, 0.8, 3), (0, 0), 1.5)
+    frames = detected(seen_along(scene, np.stack([_to_scene(frame) for frame in range(N_FRAMES)]), SHAPE), 1)
     frames[slice(*WALL)] = np.random.default_rng(0).random((WALL[1] - WALL[0], *SHAPE)) < 0.4
     path = tmp_path_factory.mktemp("mended") / "capture.npy"
     np.save(path, np.packbits(frames, axis=-1))
