@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import InputError, LocationError, evaluate, parse_spec, run, simulate
+from photonpano import InputError, LocationError, SpecError, evaluate, parse_spec, run, simulate
 from photonpano.geometry import rotation_matrices
 from photonpano.testing import measured_rates
 
@@ -59,6 +59,11 @@ def test_a_capture_too_dark_to_be_located_is_located_with_a_gyroscope(capture: P
     decisions = {each["what"]: each for each in json.loads((result.directory / "run.json").read_text())["decisions"]}
     assert decisions["gyroscope"]["value"].startswith("time offset 0.03")
     assert "is by the gyroscope" in decisions["gyroscope_agreement"]["reason"]
+
+
+def test_spec_names_a_file_that_is_not_there(capture: Path) -> None:
+    with pytest.raises(SpecError, match=r"motion\.prior\.imu: there is no file \S+none\.csv; check the path"):
+        parse_spec(spec_of(capture, "none", imu=str(capture.with_name("none.csv"))))
 
 
 @pytest.mark.parametrize("scale", [0.0175, 57.3, -1.0])

@@ -95,6 +95,8 @@ def _check_camera(motion: MotionSettings, camera: CameraSettings, posed: bool, s
     if motion.prior is not None and (motion.model != "rotation" or camera.focal_px == "find"):
         message = "a gyroscope needs motion.model: rotation, and the focal length of the camera: give camera.focal_px"
         spec.wrong(spec.root.at("motion", "prior"), message)
+    elif motion.prior is not None and not motion.prior.imu.is_file():
+        spec.wrong(spec.root.at("motion", "prior", "imu"), f"there is no file {motion.prior.imu}; check the path")
     if motion.model in _TURNING and not posed:
         return
     unfindable = "find needs motion.model: rotation or auto, which measure the camera; give a number here"
