@@ -19,6 +19,7 @@ from photonpano.api.command import (
     warn,
 )
 from photonpano.execution.context import Progress
+from photonpano.motion.gyroscope import GYROSCOPE
 from photonpano.motion.timeline import CUT, DARK_FRAMES, DARK_JUMP, REPEATED, SHOTS
 from photonpano.pipeline.estimate import START
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
@@ -45,7 +46,7 @@ def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
     for warning in record["warnings"]:
         warn(warning)
     for decision in record["decisions"]:
-        if decision["what"] in (START, SHOTS, DARK_FRAMES, CUT, DARK_JUMP, REPEATED):
+        if decision["what"] in (START, GYROSCOPE, SHOTS, DARK_FRAMES, CUT, DARK_JUMP, REPEATED):
             yield f"{decision['what']:<9} {decision['value']}: {decision['reason']}"
     for refinement in record["refinements"]:
         if refinement["rounds"]:  # the first of them is the largest
