@@ -139,7 +139,7 @@ def examples(tmp_path_factory, small_capture, simulated) -> Path:
         shutil.copy(truth_path(small_capture), truth_path(capture))
     frames = np.unpackbits(np.load(small_capture), axis=-1)
     np.save(folder / "sums.npy", frames[::2] + frames[1::2])
-    convert(capture_plan(small_capture, {"frame_rate_hz": 96800}, corrections=[]), folder / "capture.zarr")
+    convert(capture_plan(folder / "capture.npy", {"frame_rate_hz": 96800}, corrections=[]), folder / "capture.zarr")
     write_as_published(frames, folder)
     visionsim = folder / "visionsim"
     visionsim.mkdir()

@@ -150,9 +150,11 @@ def require_new_capture(source: Source, plan: Plan, output: Path, overwrite: boo
     The truth of one capture must not stay beside another one.
     """
     files, truth = capture_files(plan), truth_path(output)
-    for path in (output, truth):
-        require_new(path, overwrite, files)
-    if truth.exists() and not isinstance(source, KnowsTruth) and output.absolute() not in files:
+    require_new(output, overwrite, files)
+    if not isinstance(source, KnowsTruth) and truth.absolute() in map(truth_path, files):
+        return  # it is the truth of the frames that are converted
+    require_new(truth, overwrite, files)
+    if truth.exists() and not isinstance(source, KnowsTruth):
         raise OutputError(
             f"{truth} is the truth of the capture that {output} would replace; move it away, or choose another name"
         )

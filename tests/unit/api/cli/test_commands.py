@@ -282,6 +282,13 @@ def test_convert_leaves_no_truth_of_another_capture(cube: Path, invoke: Callable
     assert truth.read_bytes() == b"that of another one"
 
 
+def test_convert_keeps_the_truth_that_both_share(cube: Path, invoke: Callable[..., Any]) -> None:
+    (truth := cube.with_name("cube.truth.npz")).touch()
+    assert invoke("convert", "cube.npy", "cube.zarr", "--with", "frame_rate_hz=96800").exit_code == 0
+    assert truth.exists()
+    truth.unlink()
+
+
 def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any]) -> None:
     """The old file stays open until the new one replaces it."""
     before, truth = cube.read_bytes(), cube.with_name("cube.truth.npz")
