@@ -145,7 +145,11 @@ class AutoResampler:
         if self._size is None:
             stream = self._context.stream
             capture = self._context.capture()
-            size, reason = choose_group_size(capture, n_frames, min(stream.frame_shape), shortest_of(stream))
+            shortest = shortest_of(stream)
+            size, reason = choose_group_size(capture, n_frames, min(stream.frame_shape), shortest)
+            if capture.shortened > 1:
+                size = max(shortest, size // capture.shortened)
+                reason += f"; since such groups could not be located, they are shortened to {size}"
             if (lengthened := whole_periods(size, capture.period_frames, n_frames)) != size:
                 reason += f"; {lengthened} are whole periods of the light, which each group then sees alike"
                 size = lengthened

@@ -13,6 +13,7 @@ import pytest
 from photonpano import LocationError, OutputError
 from photonpano import run as run_plan
 from photonpano.specs import parse_spec
+from photonpano.values import CaptureSummary
 
 pytestmark = pytest.mark.usefixtures("without_report")
 
@@ -134,6 +135,21 @@ def test_failure_distinguishes_dark_from_blurred(run: Callable, simulated: Calla
         "(try smaller groups, such as resample.with.group_size=50), or they are too dark for what texture there is (try larger "
         "ones, such as resample.with.group_size=200).",
     ]
+
+
+def test_groups_that_are_chosen_too_long_are_shortened(
+    run: Callable, simulated: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The places at which the speed was measured showed hardly any motion."""
+    path = {"kind": "random-spline", "length_px": 700, "seed": 3}
+    capture = simulated(n_frames=480, frame_shape=[64, 96], path=path)
+    resting = CaptureSummary(0.5, 0.01, "measured where the image rests")
+    monkeypatch.setattr("photonpano.pipeline.summary.summarise", lambda *_: resting)
+    outcome = run(capture)
+    (size,) = (each for each in outcome.record["decisions"] if each["what"] == "group_size")
+    assert size["value"] == 16
+    assert size["reason"].endswith("; since such groups could not be located, they are shortened to 16")
+    assert outcome.located.all()
 
 
 def test_motion_blurred_exposures_are_not_located_by_chance(run: Callable, simulated: Callable) -> None:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import InputError, LocationError
+from photonpano.errors import LocationError
 from photonpano.geometry import corners
 from photonpano.motion.graph import GraphSolution
 from photonpano.photometry import signal_to_noise
@@ -38,6 +38,7 @@ class UntiedError(LocationError):
 
     Attributes:
         parts: (N,) number of the connected component of each exposure, 0 for the largest.
+        signal_to_noise: median of those that are lost; None if nothing can be seen in any.
         merged: returns an exposure by its number; None where they cannot be merged again.
     """
 
@@ -48,10 +49,17 @@ class UntiedError(LocationError):
         groups: Sequence[Group],
         edges: Sequence[Edge],
         parts: NDArray[np.integer],
+        signal_to_noise: float | None,
         merged: Callable[[int], VirtualExposure] | None,
     ) -> None:
         super().__init__(message)
         self.level, self.groups, self.edges, self.parts, self.merged = level, groups, edges, parts, merged
+        self.signal_to_noise = signal_to_noise
+
+    @property
+    def blurred(self) -> bool:
+        """Whether motion within the exposures may be the cause, rather than darkness."""
+        return self.signal_to_noise is not None and self.signal_to_noise >= _NOISY
 
 
 def contrast_of(exposure: VirtualExposure) -> Contrast:
@@ -101,7 +109,10 @@ def require_tied(
         if isinstance(edge.motion, NotLocated)
     ]
     more = [f"  ... and {len(reasons) - _SHOWN} more"] if len(reasons) > _SHOWN else []
-    lines = [*reasons[:_SHOWN], *more, *_advice(groups, tied, contrasts)]
+    lost_contrasts = [contrasts[int(index)] for index in np.flatnonzero(~tied)] if not tied.all() else list(contrasts.values())
+    ratios = [contrast.signal_to_noise for contrast in lost_contrasts if not contrast.blank]
+    ratio = float(np.median(ratios)) if ratios else None
+    lines = [*reasons[:_SHOWN], *more, *([] if ratio is None else _advice(groups, ratio))]
     if tied.sum() < 2:
         lines = [f"level {level}: none of the {len(edges)} pairs of exposures could be located", *lines]
     else:
@@ -113,18 +124,13 @@ def require_tied(
             *lines,
             "To go on with the largest part alone, set graph.disconnected to largest.",
         ]
-    raise UntiedError("\n".join(lines), level, groups, edges, parts, merged)
+    raise UntiedError("\n".join(lines), level, groups, edges, parts, ratio, merged)
 
 
-@contextmanager
-def also_tried(error: LocationError, what: str) -> Iterator[None]:
-    """Raise an error, with a sentence on what was tried in vain, if the block cannot locate exposures either."""
-    try:
-        yield
-    except (LocationError, InputError) as failure:
-        first_clause = str(failure).splitlines()[0].split("; ")[0].removeprefix("motion.start: ")
-        error.args = (f"{error}\n{what}: {first_clause}",)
-        raise error from failure
+def tell_attempt(error: LocationError, what: str, failure: Exception) -> None:
+    """Add to an error what was tried in vain."""
+    first_clause = str(failure).splitlines()[0].split("; ")[0].removeprefix("motion.start: ")
+    error.args = (f"{error}\n{what} was tried, too: {first_clause}",)
 
 
 @contextmanager
@@ -164,11 +170,7 @@ def _tied_together(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
     return "; ".join(named[:_SHOWN]) + ("; and others" if len(named) > _SHOWN else "")
 
 
-def _advice(groups: Sequence[Group], tied: BoolArray, contrasts: Mapping[int, Contrast]) -> list[str]:
-    lost = [contrasts[int(index)] for index in np.flatnonzero(~tied)] if not tied.all() else list(contrasts.values())
-    if all(contrast.blank for contrast in lost):
-        return []
-    ratio = float(np.median([contrast.signal_to_noise for contrast in lost if not contrast.blank]))
+def _advice(groups: Sequence[Group], ratio: float) -> list[str]:
     size = int(np.median([len(group.span) for group in groups]))
     varies = "does not stand out from" if ratio < _NOTHING else f"varies {ratio:.2g} times as much as"
     seen = f"In these exposures of {size} frames the scene {varies} a pixel's photon noise"

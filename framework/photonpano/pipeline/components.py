@@ -112,13 +112,17 @@ def _part(plan: Plan, capture: Capture) -> Capture:
     return part_of(capture, FrameSpan(start, stop))
 
 
-def build_levels(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[Level, ...]:
-    """Build the components of all levels; those with the same config are shared. `decisions` receives their choices."""
+def build_levels(plan: Plan, source: Source, decisions: list[Decision], shortened: int = 1) -> tuple[Level, ...]:
+    """Build the components of all levels; those with the same config are shared. `decisions` receives their choices.
+
+    Groups whose size is chosen from the capture are `shortened` that many times.
+    """
     from photonpano.pipeline.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
     light = light_of(source)
     period = 1 / light.frequency if light is not None and light.frequency else None
-    capture = _Once(lambda: replace(summarise(source, thread_count(plan.run.threads)), period_frames=period))
+    measured = partial(summarise, source, thread_count(plan.run.threads))
+    capture = _Once(lambda: replace(measured(), period_frames=period, shortened=shortened))
     recorder = Recorder(decisions)
     context = stage_context(plan, source, recorder, capture)
     made: list[tuple[Choice, Any]] = []

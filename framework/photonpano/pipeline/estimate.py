@@ -10,9 +10,9 @@ import numpy as np
 
 from photonpano.capture import leaving_out
 from photonpano.contracts.protocols import Source
-from photonpano.errors import LocationError
+from photonpano.errors import InputError, LocationError
 from photonpano.execution.context import Context
-from photonpano.motion.diagnosis import UntiedError, also_tried
+from photonpano.motion.diagnosis import UntiedError, tell_attempt
 from photonpano.motion.gyroscope import Gyroscope
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import Timeline
@@ -22,11 +22,12 @@ from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.obstacles import timeline_of
 from photonpano.pipeline.shots import ApartError, shots_of
-from photonpano.pipeline.state import State, model_of
+from photonpano.pipeline.state import State, model_of, within
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, FrameSpan
 
 _MOST_LENSES = 4  # times that the last level is run again, through the lens that it has found
+_SHORTENED = 2, 4  # how many times groups are shortened whose exposures are not located
 START = "start"  # name of the decision on the initial motion
 
 
@@ -37,30 +38,53 @@ def estimate(plan: Plan, source: Source, journal: list[Decision], context: Conte
     `run`.
     """
     require_centre(plan, source)
-    timeline, found = timeline_of(source, context), len(journal)
+    timeline, started, before = timeline_of(source, context), plan.motion.start != "none", len(journal)
     try:
-        return _along(timeline, plan, source, journal, context, plan.motion.start != "none")
-    except ApartError as apart:
-        shots, error = apart.shots, None
+        return _in_shots(timeline, plan, source, journal, context, started)
     except LocationError as unlocated:
-        shots, error = shots_of(source, unlocated) if isinstance(unlocated, UntiedError) else (), unlocated
-    del journal[found:]
-    if shots:
-        return _along(timeline.in_shots(shots), plan, source, journal, context, plan.motion.start != "none")
-    assert error is not None
-    if plan.motion.start == "none" and plan.motion.prior is None:
-        with also_tried(error, "motion: {start: constant-velocity} was tried, too"):
-            return _along(timeline, plan, source, journal, context, True)
+        error = unlocated
+    chosen = any(each.what == "group_size" for each in journal[before:])
+    others: list[tuple[str, bool, int]] = []
+    if not started and plan.motion.prior is None:
+        others.append(("motion: {start: constant-velocity}", True, 1))
+    if chosen and isinstance(error, UntiedError) and error.blurred:
+        others += [(f"1/{times} of the group size", started, times) for times in _SHORTENED]
+    for what, start, shortened in others:
+        del journal[before:]
+        try:
+            return _in_shots(timeline, plan, source, journal, context, start, shortened)
+        except (LocationError, InputError) as failure:
+            tell_attempt(error, what, failure)
     raise error
 
 
-def _along(timeline: Timeline, plan: Plan, source: Source, journal: list[Decision], context: Context, started: bool) -> State:
+def _in_shots(
+    timeline: Timeline, plan: Plan, source: Source, journal: list[Decision], context: Context, started: bool, shortened: int = 1
+) -> State:
+    """Estimate the motion of a capture as one, or in shots if its exposures fall into such."""
+    before = len(journal)
+    try:
+        return _along(timeline, plan, source, journal, context, started, shortened)
+    except ApartError as apart:
+        shots = apart.shots
+    except UntiedError as unlocated:
+        if not (shots := shots_of(source, unlocated)):
+            raise
+    del journal[before:]
+    return _along(timeline.in_shots(shots), plan, source, journal, context, started, shortened)
+
+
+def _along(
+    timeline: Timeline, plan: Plan, source: Source, journal: list[Decision], context: Context, started: bool, shortened: int
+) -> State:
     """Estimate the motion of the frames that a timeline shows, from a constant velocity if it is `started`."""
     source = replace(leaving_out(source, timeline.shown), copies=timeline.copies)
-    reference, levels = _reference_frame(plan, timeline.shot), build_levels(plan, source, journal)
+    if shortened > 1:
+        context = within(context, shortened)
+    reference, levels = _reference_frame(plan, timeline.shot), build_levels(plan, source, journal, shortened)
     start = _start(plan, source, reference, journal, context) if started else None
     gyroscope = _gyroscope(plan, source, timeline, journal, context)
-    state = State(plan, source, context, reference, levels, timeline, model_of(plan), start, gyroscope)
+    state = State(plan, source, context, reference, levels, timeline, model_of(plan), start, gyroscope, shortened)
     state = state.located(levels[:1], start)
     tried: tuple[passes.Pass, ...] = (
         passes.through_found_lens,

@@ -210,7 +210,7 @@ def later_levels(state: State, journal: list[Decision]) -> Proposal:
     levels, light = state.levels, light_of(state.source)
     if light is not None and light.frequency:
         journal[:] = [each for each in journal if each.what != "group_size"]
-        levels = build_levels(state.plan, state.source, journal)
+        levels = build_levels(state.plan, state.source, journal, state.shortened)
     left = levels if state.outdated and len(levels) == 1 else levels[1:]
 
     def make() -> State:
@@ -298,7 +298,7 @@ def cut_at_jumps(state: State) -> Proposal | None:
         return None
 
     def make(cuts: Sequence[Cut] = cuts) -> State | None:
-        levels = build_levels(state.plan, state.source, [])
+        levels = build_levels(state.plan, state.source, [], state.shortened)
         try:
             cut = _located_anew(replace(state, timeline=state.timeline.cut_at(cuts), levels=levels))
         except UntiedError as error:

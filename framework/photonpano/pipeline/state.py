@@ -43,6 +43,7 @@ class State:
         timeline: repeated frames, and where the motion is cut.
         start: the motion known before the first level; None if there is none.
         gyroscope: that turned with the camera; None if there is none.
+        shortened: groups whose size is chosen from the capture are shortened that many times.
         outdated: whether the source was corrected since these levels were located.
         watched: whether what hides the background was looked for.
         vignette: by which the source is divided.
@@ -59,6 +60,7 @@ class State:
     model: MotionModel = HOMOGRAPHIES
     start: Trajectory | None = None
     gyroscope: Gyroscope | None = None
+    shortened: int = 1
     results: tuple[LevelResult, ...] = ()
     outdated: bool = False
     watched: bool = False

@@ -82,12 +82,14 @@ class CaptureSummary:
         speed_px: upper quantile of the speed of the image, in px per frame; None if it could not be measured.
         how: a clause that says how the speed was measured, for the reasons of decisions.
         period_frames: period of light that flickers, in frames; None in steady light, or before the light is known.
+        shortened: groups are to be chosen this many times shorter, since exposures of longer ones could not be located.
     """
 
     flux: float
     speed_px: float | None
     how: str
     period_frames: float | None = None
+    shortened: int = 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -206,7 +206,7 @@ def untied(merged=None, reason="too dark"):
     message = (
         "level 2: 2 of 8 pairs could not be located\n  frames 300 to 399 onto frames 200 to 299: too dark\nTry larger groups."
     )
-    return UntiedError(message, 2, groups, edges, np.array([0, 0, 0, 1, 1, 2]), merged)
+    return UntiedError(message, 2, groups, edges, np.array([0, 0, 0, 1, 1, 2]), 0.1, merged)
 
 
 def test_page_of_failed_run_shows_exposures_that_did_not_match(failed, record, exposure_of):
