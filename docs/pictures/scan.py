@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import picture_parts as draw
 import tifffile
-from harness import EXAMPLES, Study
+from harness import EXAMPLES, Study, groups
 
 from photonpano import FrameSpan, load_panorama, load_spec, open_source, run
 from photonpano.geometry import apply
@@ -21,10 +21,13 @@ PLACE = (235, 85)  # centre of the compared place, in pixels of the reference fr
 
 def pictures(study: Study) -> Iterator[tuple[str, draw.Picture]]:
     """Yield each picture with its name."""
+    small = {"n_frames": 1500, "frame_shape": [128, 256], "path.length_px": 200}  # as in the tutorial
+    spec = study.spec("pipelines/capture", {f"source.with.{key}": value for key, value in small.items()})
+    first = study.run("first", {**spec, "resample": groups(100)}, study.capture("first", spec))
+    yield "first-panorama.png", draw.picture(load_panorama(first).flux, 0.67)
     capture = study.capture("capture", study.spec("pipelines/capture"))
     path = {"source.with.path": str(capture.absolute())}
     scan = study.run("scan", study.spec("pipelines/scan", path))
-    yield "first-panorama.png", draw.picture(load_panorama(scan).flux, 0.67)
     yield "uncertainty.png", uncertainty(scan)
     unrefined = path | {"refine": []}  # a refiner would mend most of what the methods have lost
     runs = {name: finished(study, name, study.spec(f"pipelines/{name}", unrefined), capture) for name in WAYS}

@@ -48,9 +48,8 @@ class ShortSpansRefiner:
         variances = residuals.variances * to_px**2
         steps = residuals.steps * to_px
         instants = np.array([span.centre for span in residuals.spans])
-        noise = variances[:, 0]
+        noise, wiggles = variances[:, 0], _wiggles(trajectory, instants, self._shape) * to_px
         if np.mean(noise > _DARK * np.median(noise)) > _DARK_SHARE:  # many steps are uncertain, as between two flickers
-            wiggles = _wiggles(trajectory, instants, self._shape) * to_px
             modes = [_through_the_dark(*columns) for columns in zip(steps.T, wiggles.T, variances.T, strict=True)]
         else:
             modes = [exceeding_noise(*columns) for columns in zip(steps.T, variances.T, strict=True)]
@@ -58,12 +57,12 @@ class ShortSpansRefiner:
         if shift_px < self._config.smallest_px:
             return None
         corrections = CubicSpline(instants, np.stack([mode.signal for mode in modes], axis=1) / to_px)
-        shifts = np.stack([mode.signal for mode in modes[:2]], axis=1)
+        tremor = np.stack([mode.signal for mode in modes[:2]], axis=1) + wiggles[:, :2]
         noise_px = np.interp(np.arange(len(std_px)), instants, np.sqrt(sum(mode.std**2 for mode in modes)))
         return Refined(
             self._corrected(trajectory, len(std_px), corrections, instants),
             np.hypot(std_px, noise_px),
-            f"motion of {shift_px:.2g} px within groups was corrected{self._frequencies(shifts, instants)}",
+            f"motion of {shift_px:.2g} px within groups was corrected{self._frequencies(tremor, instants)}",
         )
 
     def _corrected(self, trajectory: Trajectory, n_frames: int, corrections: CubicSpline, instants: FloatArray) -> FloatArray:
@@ -80,9 +79,12 @@ class ShortSpansRefiner:
             refined[block] = normalised(to_reference @ refined[block])
         return refined
 
-    def _frequencies(self, shifts: FloatArray, instants: FloatArray) -> str:
-        """Return the strongest frequencies of (S, 2) shifts, as the end of a sentence."""
-        spectrum = np.fft.rfft(shifts * np.hanning(len(shifts))[:, None], axis=0)
+    def _frequencies(self, tremor: FloatArray, instants: FloatArray) -> str:
+        """Return the strongest frequencies of a tremor, (S, 2) in px, as the end of a sentence.
+
+        Most of a slow tremor is known before, so that the correction alone would name what is left of it.
+        """
+        spectrum = np.fft.rfft(tremor * np.hanning(len(tremor))[:, None], axis=0)
         power = (np.abs(spectrum) ** 2).sum(axis=1)
         found: list[int] = []
         total = power.sum()
@@ -90,12 +92,12 @@ class ShortSpansRefiner:
             peak = int(power.argmax())
             found.append(peak)
             power[max(0, int(peak * 0.8) - 2) : int(peak * 1.25) + 3] = 0
-        cycles = np.array(sorted(peak for peak in found if peak > 1)) / (len(shifts) * float(np.median(np.diff(instants))))
+        cycles = np.array(sorted(peak for peak in found if peak > 1)) / (len(tremor) * float(np.median(np.diff(instants))))
         if not len(cycles):
             return ""
         if self._rate is None:
-            return f", mostly with periods of {' and '.join(f'{1 / each:.0f}' for each in cycles)} frames"
-        return f", mostly at {' and '.join(f'{self._rate * each:,.0f}' for each in cycles)} Hz"
+            return f"; the image trembles with periods of {' and '.join(f'{1 / each:.0f}' for each in cycles)} frames"
+        return f"; the image trembles at {' and '.join(f'{self._rate * each:,.0f}' for each in cycles)} Hz"
 
 
 def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> Filtered:

@@ -14,6 +14,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ BLOCK = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 
+NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?")
 ASSIGNMENT = re.compile(r"[A-Z0-9_]+=")
 
 
@@ -56,7 +58,9 @@ class Block:
     <!-- test: needs LIBRARY -->  a fragment that is checked where the library is installed
     <!-- test: parse -->        commands that are parsed and not run
     <!-- test: with ARGS -->    commands that are run with more arguments, so that they print something else
-    <!-- test: setup ... -->    Python that prepares the blocks after it, and that readers need not see
+    <!-- test: near -->         commands that print the same words and nearly the same numbers, as processors round differently
+    <!-- test: setup ... -->    Python that prepares the blocks after it, and that readers need not see; it compares figures of
+                                the text with measured ones by `figures("{} px at level 2", measured)`
     """
 
     page: Path
@@ -120,6 +124,23 @@ def forget_modules(folder: Path) -> None:
         if str(getattr(module, "__file__", "")).startswith(str(folder)):
             del sys.modules[name]
     importlib.invalidate_caches()
+
+
+def number(text: str) -> float:
+    return float(text.replace(",", ""))
+
+
+def near(shown: str) -> Any:
+    """Return what equals a number that a page shows to a quarter of it, or to two units of its last digit."""
+    return pytest.approx(number(shown), rel=0.25, abs=2 * 10.0 ** -len(shown.partition(".")[2]))
+
+
+def compare_figures(page: Path, sentence: str, *measured: float) -> None:
+    """Compare the figures of a sentence of a page with measured ones; `{}` stands for each."""
+    words = [re.escape(part).replace(r"\ ", r"\s+") for part in sentence.split("{}")]
+    found = re.search(f"({NUMBER.pattern})".join(words), page.read_text(encoding="utf-8"))
+    assert found, f"{page}: {sentence}"
+    assert all(value == near(shown) for value, shown in zip(measured, found.groups(), strict=True)), f"{found[0]}: {measured}"
 
 
 class Reader:
@@ -191,6 +212,8 @@ class Reader:
         assert (done.exit_code != 0) == fails, f"{block}: {words}\n{done.output}\n{done.exception!r}"
         if target is not None:
             (self.workplace / target).write_text(done.stdout, encoding="utf-8")
+        elif shown.strip() and block.marker == "test: near":
+            self.compare_nearly(block, done.output.replace(str(self.workplace.resolve()), "/home/you"), shown)
         elif shown.strip() and more is None:
             self.compare(block, words, done.output, shown)
         return None
@@ -210,6 +233,13 @@ class Reader:
         same = doctest.OutputChecker().check_output(f"{shown.strip()}\n", f"{printed.strip()}\n", flags)
         assert same, f"{block}: {words} printed\n{printed}\nand the page shows\n{shown}"
 
+    def compare_nearly(self, block: Block, printed: str, shown: str) -> None:
+        """Compare words, and numbers as `near` does."""
+        said = f"{block} printed\n{printed}\nand the page shows\n{shown}"
+        assert re.sub(NUMBER, "#", printed).split() == re.sub(NUMBER, "#", shown).split(), said
+        for got, text in zip(re.findall(NUMBER, printed), re.findall(NUMBER, shown), strict=True):
+            assert number(got) == near(text), f"{got} for {text}: {said}"
+
     def install(self) -> None:
         """Write the metadata that pip would install, beside the modules of the project."""
         project = tomllib.loads((self.workplace / "pyproject.toml").read_text())["project"]
@@ -226,7 +256,7 @@ class Reader:
 def test_code_and_commands_of_page_work(page, workplace, make_capture, monkeypatch):
     # Pages do not show the lines that long commands print as they go on, and on a busy machine any command is long.
     monkeypatch.setattr(cli_progress, "INTERVAL_S", 3600.0)
-    reader = Reader(workplace, {"make_capture": make_capture})
+    reader = Reader(workplace, {"make_capture": make_capture, "figures": partial(compare_figures, page)})
     for block in blocks_of(page):
         try:
             reader.follow(block)

@@ -14,6 +14,7 @@ SHAPE = (96, 128)
 N_FRAMES = 4096
 SPAN = 8
 NOISE_PX = 0.03
+STILL = np.tile(np.eye(3), (N_FRAMES, 1, 1))
 
 
 def spans() -> tuple[FrameSpan, ...]:
@@ -29,10 +30,9 @@ def residuals(seed: int, tremor_px: float = 0.0, period: float = 76.0) -> SpanRe
     return SpanResiduals(spans(), steps, np.broadcast_to(np.diag(1 / std**2), (len(steps), 4, 4)))
 
 
-def refine(found: SpanResiduals, frame_rate_hz: float | None = None):
+def refine(found: SpanResiduals, frame_rate_hz: float | None = None, known: np.ndarray = STILL):
     refiner = ShortSpansRefiner(ShortSpansConfig(), SHAPE, frame_rate_hz)
-    still = FrameTrajectory(np.tile(np.eye(3), (N_FRAMES, 1, 1)))
-    return refiner.refine(None, still, np.full(N_FRAMES, 0.02), found, None)
+    return refiner.refine(None, FrameTrajectory(known), np.full(N_FRAMES, 0.02), found, None)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -69,8 +69,15 @@ def test_refine_follows_tremor_through_gaps_without_light() -> None:
 
 
 def test_refine_names_frequencies() -> None:
-    assert refine(residuals(0, 0.5), 96_800).summary == "motion of 0.5 px within groups was corrected, mostly at 1,276 Hz"
-    assert refine(residuals(0, 0.5)).summary == "motion of 0.5 px within groups was corrected, mostly with periods of 76 frames"
+    corrected = "motion of 0.5 px within groups was corrected; the image trembles"
+    assert refine(residuals(0, 0.5), 96_800).summary == f"{corrected} at 1,276 Hz"
+    assert refine(residuals(0, 0.5)).summary == f"{corrected} with periods of 76 frames"
+
+
+def test_refine_names_the_tremor_and_not_what_is_left_of_it() -> None:
+    known = STILL.copy()
+    known[:, 0, 2] = 5 * np.sin(2 * np.pi * np.arange(N_FRAMES) / 128)
+    assert refine(residuals(0, 0.1), 96_800, known).summary.endswith("; the image trembles at 756 Hz")
 
 
 def test_refine_ignores_spans_without_information() -> None:
