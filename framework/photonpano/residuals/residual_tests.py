@@ -71,7 +71,8 @@ def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
 @RESIDUAL_TESTS.doubtful_above(
     0.03,
     "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
-    "mask what moves (corrections: mask); the motion may be that of the thing instead of the scene",
+    "mask what moves (corrections: mask), or divide by a flat field if the corners are dark (corrections: flat-field); the "
+    "motion may be that of the thing instead of the scene",
 )
 def _moving(run: TestedRun) -> Found | None:
     if run.explained.residuals.cell_count.max(initial=0) < _MIN_BLOCKS:
@@ -80,7 +81,11 @@ def _moving(run: TestedRun) -> Found | None:
     return Found(share, _box(changing, "px of the panorama"), harmless=share <= _HARMLESS_SHARE) if share else None
 
 
-@RESIDUAL_TESTS.doubtful_above(0.03, "the light changes over time", "keep the light steady, or shorten the capture")
+@RESIDUAL_TESTS.doubtful_above(
+    0.03,
+    "the light changes over time",
+    "write light: auto if the spec says that it is steady; otherwise keep it steady, or shorten the capture",
+)
 def _light(run: TestedRun) -> Found:
     residuals = run.explained.residuals
     # Relative to the mean light: in the dark between two flickers, an error of the gain matters little.

@@ -75,7 +75,9 @@ def _layers(run: TestedRun) -> Found | None:
         return None
     # Where little is left out, but much changes that is not, what is left out may be the scene.
     changing_share, _ = changing_places(run.explained.residuals)
-    return found._replace(doubtful=min(found.figure, changing_share) > MUCH)
+    if min(found.figure, changing_share) <= MUCH:
+        return found
+    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
 
 
 @SCENE_TESTS.doubtful_above(

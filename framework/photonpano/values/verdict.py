@@ -34,7 +34,8 @@ class Reason:
         return f"{self.what}{where}: {self.figure:.3g}"
 
     def __str__(self) -> str:
-        return f"{self.finding}, trusted up to {self.threshold:g}; {self.what_to_do}"
+        trusted = f", trusted up to {self.threshold:g}" if self.figure > self.threshold else ""
+        return f"{self.finding}{trusted}; {self.what_to_do}"
 
 
 @dataclass(frozen=True, slots=True)
