@@ -32,7 +32,7 @@ settings.load_profile("suite")
 
 def sibling(name: str) -> Any:
     """Import a module of this folder."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).parent / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -46,6 +46,12 @@ def browser_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         pytest.skip("Chromium is not installed (Debian: apt-get install chromium)")
     with browser.browser(tmp_path_factory.mktemp("browser")) as page:
         yield page
+
+
+@pytest.fixture(scope="session")
+def bounds() -> Any:
+    """The bounds on errors of registration, which benchmarks use as well."""
+    return sibling("benchmarks/bounds")
 
 
 @pytest.fixture(scope="session")

@@ -96,7 +96,7 @@ from .plugins.contributions import SourceContribution as SourceContribution
 from .plugins.contributions import SpecLocation as SpecLocation
 from .plugins.contributions import SpecPath as SpecPath
 from .plugins.contributions import StageContext as StageContext
-from .plugins.hookspecs import hookimpl as hookimpl
+from .plugins.contributions import hookimpl as hookimpl
 from .plugins.registry import Catalog as Catalog
 from .plugins.registry import discover as discover
 from .record.batch_row import BatchRow as BatchRow

@@ -15,11 +15,12 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from bounds import exposure_bound_px
 from harness import IMAGES, Study, command, packed, passing, scores_of, seen, simulator, table, write_tables
 
 from photonpano import PhotonpanoError
 from photonpano.capture.writing import truth_path
-from photonpano.evaluation import exposure_bound_px, load_truth
+from photonpano.evaluation import load_truth
 from photonpano.photometry import BinaryResponse
 
 FLUXES = (0.5, 0.1, 0.02)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 sys.path.append(str(Path(__file__).parent))
+from bounds import pair_bound_px
 from joint_bound import MODELS, Model, corner_errors_px, information, joint_bound
 
-from photonpano.evaluation import pair_bound_px
 from photonpano.geometry import Camera, rotation_matrices, step_motions, translation
 from photonpano.photometry import BinaryResponse
 

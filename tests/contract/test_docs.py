@@ -30,7 +30,7 @@ from photonpano.api.cli.app import app, commands
 from photonpano.capture.writing import truth_path
 from photonpano.corrections import CORRECTIONS
 from photonpano.plugins import hookspecs
-from photonpano.residuals import pose_verdict, verdict
+from photonpano.residuals import pose_verdict, residual_tests, verdict
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -342,7 +342,7 @@ def test_trust_page_shows_thresholds_of_verdict():
     # One row for a motion that is not known and for one that is uncertain.
     limits = [test.threshold for test in verdict.TESTS if test.what != "no motion is known"]
     assert shown == [f"{limit:g}" for limit in limits]
-    assert f"more than {100 * verdict.MAX_CONTRAST:g} % of the light" in page
+    assert f"more than {100 * residual_tests.MAX_CONTRAST:g} % of the light" in page
 
 
 def test_poses_page_shows_thresholds_of_verdict():

@@ -14,8 +14,9 @@ from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.motion.timeline import REPEATED
 from photonpano.pipeline.obstacles import timeline_of
 from photonpano.plugins.registry import Catalog
+from photonpano.residuals.motion_tests import NO_TURN, REPEATS, contradictions
 from photonpano.residuals.refinement import MotionFit
-from photonpano.residuals.verdict import NO_TURN, REPEATS, contradictions, judge
+from photonpano.residuals.verdict import judge
 from photonpano.values import Decision, Reason, Verdict
 
 

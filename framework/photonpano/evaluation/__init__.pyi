@@ -1,5 +1,3 @@
-from .bounds import exposure_bound_px as exposure_bound_px
-from .bounds import pair_bound_px as pair_bound_px
 from .images import ImageScore as ImageScore
 from .images import covered as covered
 from .images import image_score as image_score

@@ -1,23 +1,15 @@
 """Sums of frames along a motion: frames are summed in chunks, and each chunk is warped once."""
 
-from photonpano.merging.accumulate import PhotonSum, accumulate, divided
-from photonpano.merging.binning import binned_mean, binning_of
-from photonpano.merging.chunks import Chunk, CountsCache, chunks_of, clipped
-from photonpano.merging.light import LightTerms, LitFrames, gain_image
-from photonpano.merging.panorama import MergeRenderer
-
-__all__ = [
-    "Chunk",
-    "CountsCache",
-    "LightTerms",
-    "LitFrames",
-    "MergeRenderer",
-    "PhotonSum",
-    "accumulate",
-    "binned_mean",
-    "binning_of",
-    "chunks_of",
-    "clipped",
-    "divided",
-    "gain_image",
-]
+from .accumulate import PhotonSum as PhotonSum
+from .accumulate import accumulate as accumulate
+from .accumulate import divided as divided
+from .binning import binned_mean as binned_mean
+from .binning import binning_of as binning_of
+from .chunks import Chunk as Chunk
+from .chunks import CountsCache as CountsCache
+from .chunks import chunks_of as chunks_of
+from .chunks import clipped as clipped
+from .light import LightTerms as LightTerms
+from .light import LitFrames as LitFrames
+from .light import gain_image as gain_image
+from .panorama import MergeRenderer as MergeRenderer

@@ -1,61 +1,34 @@
 """Camera responses and flux estimation, similarity of images, tone curves, and sums of packed bits."""
 
-from photonpano.photometry.noise import FluxRange, debiased, flux_std, frame_variance, measurable_range, saturated
-from photonpano.photometry.packed import MAX_FRAMES, BitOrder, packed_along_width, packed_counts, reversed_bits
-from photonpano.photometry.pictures import (
-    Tone,
-    WhiteBalance,
-    balanced,
-    grey_world,
-    linear_to_srgb,
-    picture_of,
-    srgb_to_linear,
-    tone_mapped,
-)
-from photonpano.photometry.responses import BinaryResponse, BinarySumResponse, Factor, IntensityResponse
-from photonpano.photometry.similarity import (
-    LOCAL_PX,
-    Similarity,
-    autocorrelation,
-    hann_window,
-    noise_free_correlation,
-    signal_to_noise,
-    similarity_of,
-    tapered,
-    without_local_mean,
-)
-
-__all__ = [
-    "LOCAL_PX",
-    "MAX_FRAMES",
-    "BinaryResponse",
-    "BinarySumResponse",
-    "BitOrder",
-    "Factor",
-    "FluxRange",
-    "IntensityResponse",
-    "Similarity",
-    "Tone",
-    "WhiteBalance",
-    "autocorrelation",
-    "balanced",
-    "debiased",
-    "flux_std",
-    "frame_variance",
-    "grey_world",
-    "hann_window",
-    "linear_to_srgb",
-    "measurable_range",
-    "noise_free_correlation",
-    "packed_along_width",
-    "packed_counts",
-    "picture_of",
-    "reversed_bits",
-    "saturated",
-    "signal_to_noise",
-    "similarity_of",
-    "srgb_to_linear",
-    "tapered",
-    "tone_mapped",
-    "without_local_mean",
-]
+from .noise import FluxRange as FluxRange
+from .noise import debiased as debiased
+from .noise import flux_std as flux_std
+from .noise import frame_variance as frame_variance
+from .noise import measurable_range as measurable_range
+from .noise import saturated as saturated
+from .packed import MAX_FRAMES as MAX_FRAMES
+from .packed import BitOrder as BitOrder
+from .packed import packed_along_width as packed_along_width
+from .packed import packed_counts as packed_counts
+from .packed import reversed_bits as reversed_bits
+from .pictures import Tone as Tone
+from .pictures import WhiteBalance as WhiteBalance
+from .pictures import balanced as balanced
+from .pictures import grey_world as grey_world
+from .pictures import linear_to_srgb as linear_to_srgb
+from .pictures import picture_of as picture_of
+from .pictures import srgb_to_linear as srgb_to_linear
+from .pictures import tone_mapped as tone_mapped
+from .responses import BinaryResponse as BinaryResponse
+from .responses import BinarySumResponse as BinarySumResponse
+from .responses import Factor as Factor
+from .responses import IntensityResponse as IntensityResponse
+from .similarity import LOCAL_PX as LOCAL_PX
+from .similarity import Similarity as Similarity
+from .similarity import autocorrelation as autocorrelation
+from .similarity import hann_window as hann_window
+from .similarity import noise_free_correlation as noise_free_correlation
+from .similarity import signal_to_noise as signal_to_noise
+from .similarity import similarity_of as similarity_of
+from .similarity import tapered as tapered
+from .similarity import without_local_mean as without_local_mean

@@ -12,23 +12,13 @@ import numpy as np
 
 from photonpano.motion.loop import LevelResult
 from photonpano.residuals.capture_tests import CAPTURE_TESTS
-from photonpano.residuals.motion_tests import MOTION_TESTS, NO_TURN, REPEATS, contradictions
+from photonpano.residuals.motion_tests import MOTION_TESTS
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.residual_tests import MAX_CONTRAST, RESIDUAL_TESTS, changing_places
+from photonpano.residuals.residual_tests import RESIDUAL_TESTS
 from photonpano.residuals.scene_tests import SCENE_TESTS
 from photonpano.residuals.tested_run import TestedRun
 from photonpano.values import Decision, Verdict
 from photonpano.values.verdict import Test, judged
-
-__all__ = [
-    "MAX_CONTRAST",
-    "NO_TURN",
-    "REPEATS",
-    "TESTS",
-    "changing_places",
-    "contradictions",
-    "judge",
-]
 
 TESTS: tuple[Test[TestedRun], ...] = (*CAPTURE_TESTS, *SCENE_TESTS, *RESIDUAL_TESTS, *MOTION_TESTS)  # the most telling first
 

@@ -14,8 +14,7 @@ from pydantic import ConfigDict, Field
 from photonpano.errors import described
 from photonpano.execution.interrupts import is_interrupt
 from photonpano.files.paths import Location, Url
-from photonpano.plugins.contributions import Config, Recognised, SourceContribution, SpecLocation
-from photonpano.plugins.hookspecs import hookimpl
+from photonpano.plugins.contributions import Config, Recognised, SourceContribution, SpecLocation, hookimpl
 from photonpano.plugins.registry import Catalog, Entry
 from photonpano.reading import objections, require_there
 from photonpano.specs.checks import complaints

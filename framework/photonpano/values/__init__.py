@@ -1,49 +1,37 @@
 """Frozen values that stages exchange; this package imports numpy only."""
 
-from photonpano.values.arrays import BoolArray, Counts, FloatArray, FluxImage, Frames, Homography
-from photonpano.values.background import CELL_PX, Background
-from photonpano.values.capture import Bayer, CaptureSummary, Decision, DecisionValue, StreamInfo
-from photonpano.values.exposure import Panorama, PanoramaRows, Response, VirtualExposure
-from photonpano.values.frames import FrameSpan, Group, true_spans
-from photonpano.values.light import Light
-from photonpano.values.motion import Ambiguity, Edge, Located, NotLocated, Patches, Refined, SpanResiduals
-from photonpano.values.poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
-from photonpano.values.verdict import Reason, Verdict
-
-__all__ = [
-    "CELL_PX",
-    "Ambiguity",
-    "Background",
-    "Bayer",
-    "BoolArray",
-    "CameraGuess",
-    "CaptureSummary",
-    "Counts",
-    "Decision",
-    "DecisionValue",
-    "Edge",
-    "FloatArray",
-    "FluxImage",
-    "FrameSpan",
-    "Frames",
-    "Group",
-    "Homography",
-    "Light",
-    "Located",
-    "LostFrames",
-    "NotLocated",
-    "Panorama",
-    "PanoramaRows",
-    "Patches",
-    "PoseEstimate",
-    "PosedView",
-    "Reason",
-    "Refined",
-    "Response",
-    "ScenePoints",
-    "SpanResiduals",
-    "StreamInfo",
-    "Verdict",
-    "VirtualExposure",
-    "true_spans",
-]
+from .arrays import BoolArray as BoolArray
+from .arrays import Counts as Counts
+from .arrays import FloatArray as FloatArray
+from .arrays import FluxImage as FluxImage
+from .arrays import Frames as Frames
+from .arrays import Homography as Homography
+from .background import CELL_PX as CELL_PX
+from .background import Background as Background
+from .capture import Bayer as Bayer
+from .capture import CaptureSummary as CaptureSummary
+from .capture import Decision as Decision
+from .capture import DecisionValue as DecisionValue
+from .capture import StreamInfo as StreamInfo
+from .exposure import Panorama as Panorama
+from .exposure import PanoramaRows as PanoramaRows
+from .exposure import Response as Response
+from .exposure import VirtualExposure as VirtualExposure
+from .frames import FrameSpan as FrameSpan
+from .frames import Group as Group
+from .frames import true_spans as true_spans
+from .light import Light as Light
+from .motion import Ambiguity as Ambiguity
+from .motion import Edge as Edge
+from .motion import Located as Located
+from .motion import NotLocated as NotLocated
+from .motion import Patches as Patches
+from .motion import Refined as Refined
+from .motion import SpanResiduals as SpanResiduals
+from .poses import CameraGuess as CameraGuess
+from .poses import LostFrames as LostFrames
+from .poses import PosedView as PosedView
+from .poses import PoseEstimate as PoseEstimate
+from .poses import ScenePoints as ScenePoints
+from .verdict import Reason as Reason
+from .verdict import Verdict as Verdict

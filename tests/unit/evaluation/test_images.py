@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -13,9 +14,7 @@ from photonpano.evaluation import (
     corner_errors,
     covered,
     evaluate,
-    exposure_bound_px,
     image_score,
-    pair_bound_px,
     true_panorama,
     white_flux,
 )
@@ -158,21 +157,21 @@ def waves(points: np.ndarray) -> np.ndarray:
 FLUX = waves(np.stack(np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0])), axis=-1)).astype(np.float32)
 
 
-def test_exposure_bound_falls_with_number_of_frames_and_pair_bound_adds_noise_of_second_exposure() -> None:
-    alone = exposure_bound_px(FLUX, RESPONSE, 100)
-    assert exposure_bound_px(FLUX, RESPONSE, 400) == pytest.approx(alone / 2, rel=1e-6)
-    assert pair_bound_px(FLUX, RESPONSE, 100, 100) == pytest.approx(np.sqrt(2) * alone, rel=1e-6)
-    assert pair_bound_px(FLUX, RESPONSE, 100, 1e9) == pytest.approx(alone, rel=1e-4)
+def test_exposure_bound_falls_with_number_of_frames_and_pair_bound_adds_noise_of_second_exposure(bounds: ModuleType) -> None:
+    alone = bounds.exposure_bound_px(FLUX, RESPONSE, 100)
+    assert bounds.exposure_bound_px(FLUX, RESPONSE, 400) == pytest.approx(alone / 2, rel=1e-6)
+    assert bounds.pair_bound_px(FLUX, RESPONSE, 100, 100) == pytest.approx(np.sqrt(2) * alone, rel=1e-6)
+    assert bounds.pair_bound_px(FLUX, RESPONSE, 100, 1e9) == pytest.approx(alone, rel=1e-4)
 
 
-def test_pair_bound_ignores_pixels_that_one_exposure_did_not_see() -> None:
+def test_pair_bound_ignores_pixels_that_one_exposure_did_not_see(bounds: ModuleType) -> None:
     left = np.where(np.arange(SHAPE[1]) < 30, 100.0, 0.0)
-    half = exposure_bound_px(FLUX, RESPONSE, np.broadcast_to(left, SHAPE))
-    assert pair_bound_px(FLUX, RESPONSE, np.broadcast_to(left, SHAPE), 1e9) == pytest.approx(half, rel=1e-4)
-    assert half > 2 * exposure_bound_px(FLUX, RESPONSE, 100)
+    half = bounds.exposure_bound_px(FLUX, RESPONSE, np.broadcast_to(left, SHAPE))
+    assert bounds.pair_bound_px(FLUX, RESPONSE, np.broadcast_to(left, SHAPE), 1e9) == pytest.approx(half, rel=1e-4)
+    assert half > 2 * bounds.exposure_bound_px(FLUX, RESPONSE, 100)
 
 
-def test_maximum_likelihood_reaches_exposure_bound() -> None:
+def test_maximum_likelihood_reaches_exposure_bound(bounds: ModuleType) -> None:
     """Linearised at the truth; the standard deviation of 400 draws has an error of a few per cent."""
     frames, rng, steps = 2000, np.random.default_rng(0), 1e-4
     p = -np.expm1(-FLUX.astype(float))
@@ -188,7 +187,7 @@ def test_maximum_likelihood_reaches_exposure_bound() -> None:
     found = np.linalg.solve((derivatives.T * weights) @ derivatives, scores.T).T * units
     errors = apply(from_parameters(found), corners(SHAPE)) - corners(SHAPE)
     scatter = np.sqrt((errors**2).sum(axis=-1).mean())
-    assert exposure_bound_px(FLUX, RESPONSE, frames) == pytest.approx(scatter, rel=0.1)
+    assert bounds.exposure_bound_px(FLUX, RESPONSE, frames) == pytest.approx(scatter, rel=0.1)
 
 
 def test_evaluate_scores_perfect_run_in_any_gauge_and_scale(capture):

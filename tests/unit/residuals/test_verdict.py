@@ -17,10 +17,11 @@ from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED, UNCUT_JU
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
 from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals
+from photonpano.residuals.motion_tests import NO_TURN, contradictions
 from photonpano.residuals.refinement import Explained, residual_ratio
 from photonpano.residuals.shaking import Shaking
 from photonpano.residuals.tested_run import RIVAL
-from photonpano.residuals.verdict import NO_TURN, TESTS, contradictions, judge
+from photonpano.residuals.verdict import TESTS, judge
 from photonpano.values import Ambiguity, Decision, Edge, Located, Reason
 
 SHAPE, N_SPANS, SPAN = (128, 192), 200, 10

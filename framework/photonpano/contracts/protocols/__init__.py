@@ -1,65 +1,31 @@
 """The interfaces of the components that plugins build."""
 
-from photonpano.contracts.protocols.motion import (
-    InterpolatesTurns,
-    Interpolator,
-    KeepsHypotheses,
-    LocatesTurns,
-    Locator,
-    Merger,
-    PanoramaView,
-    PoseEstimator,
-    Refiner,
-    Resampler,
-    Trajectory,
-    camera_of_motion,
-)
-from photonpano.contracts.protocols.panorama import Exporter, FinishedPanorama, Renderer
-from photonpano.contracts.protocols.sources import (
-    Arrived,
-    Closing,
-    ColouredSource,
-    KnowsSharpViews,
-    KnowsTruth,
-    LensedSource,
-    LinearlyCorrectedSource,
-    LitSource,
-    PackedSource,
-    Piped,
-    Source,
-    WeightedSource,
-    camera_of,
-    light_of,
-)
-
-__all__ = [
-    "Arrived",
-    "Closing",
-    "ColouredSource",
-    "Exporter",
-    "FinishedPanorama",
-    "InterpolatesTurns",
-    "Interpolator",
-    "KeepsHypotheses",
-    "KnowsSharpViews",
-    "KnowsTruth",
-    "LensedSource",
-    "LinearlyCorrectedSource",
-    "LitSource",
-    "LocatesTurns",
-    "Locator",
-    "Merger",
-    "PackedSource",
-    "PanoramaView",
-    "Piped",
-    "PoseEstimator",
-    "Refiner",
-    "Renderer",
-    "Resampler",
-    "Source",
-    "Trajectory",
-    "WeightedSource",
-    "camera_of",
-    "camera_of_motion",
-    "light_of",
-]
+from .motion import InterpolatesTurns as InterpolatesTurns
+from .motion import Interpolator as Interpolator
+from .motion import KeepsHypotheses as KeepsHypotheses
+from .motion import LocatesTurns as LocatesTurns
+from .motion import Locator as Locator
+from .motion import Merger as Merger
+from .motion import PanoramaView as PanoramaView
+from .motion import PoseEstimator as PoseEstimator
+from .motion import Refiner as Refiner
+from .motion import Resampler as Resampler
+from .motion import Trajectory as Trajectory
+from .motion import camera_of_motion as camera_of_motion
+from .panorama import Exporter as Exporter
+from .panorama import FinishedPanorama as FinishedPanorama
+from .panorama import Renderer as Renderer
+from .sources import Arrived as Arrived
+from .sources import Closing as Closing
+from .sources import ColouredSource as ColouredSource
+from .sources import KnowsSharpViews as KnowsSharpViews
+from .sources import KnowsTruth as KnowsTruth
+from .sources import LensedSource as LensedSource
+from .sources import LinearlyCorrectedSource as LinearlyCorrectedSource
+from .sources import LitSource as LitSource
+from .sources import PackedSource as PackedSource
+from .sources import Piped as Piped
+from .sources import Source as Source
+from .sources import WeightedSource as WeightedSource
+from .sources import camera_of as camera_of
+from .sources import light_of as light_of

@@ -1,57 +1,31 @@
 """What plugins are made of: the records that offer components, their configs, and what components are told."""
 
-from photonpano.plugins.contributions.configs import Config, SpecLocation, SpecPath
-from photonpano.plugins.contributions.contexts import ExecutorContext, SourceContext, StageContext
-from photonpano.plugins.contributions.kinds import KINDS, PROJECT, Kind, hookimpl, hookspec
-from photonpano.plugins.contributions.records import (
-    API_VERSION,
-    Contribution,
-    ExecutorContribution,
-    ExporterContribution,
-    InterpolatorContribution,
-    LocatorContribution,
-    MergerContribution,
-    PartOfCapture,
-    PoseEstimatorContribution,
-    Recognised,
-    RefinerContribution,
-    RendererContribution,
-    Requirement,
-    ResamplerContribution,
-    SourceContribution,
-    StageContribution,
-    WriteFrames,
-    install_command,
-)
-
-__all__ = [
-    "API_VERSION",
-    "KINDS",
-    "PROJECT",
-    "Config",
-    "Contribution",
-    "ExecutorContext",
-    "ExecutorContribution",
-    "ExporterContribution",
-    "InterpolatorContribution",
-    "Kind",
-    "LocatorContribution",
-    "MergerContribution",
-    "PartOfCapture",
-    "PoseEstimatorContribution",
-    "Recognised",
-    "RefinerContribution",
-    "RendererContribution",
-    "Requirement",
-    "ResamplerContribution",
-    "SourceContext",
-    "SourceContribution",
-    "SpecLocation",
-    "SpecPath",
-    "StageContext",
-    "StageContribution",
-    "WriteFrames",
-    "hookimpl",
-    "hookspec",
-    "install_command",
-]
+from .configs import Config as Config
+from .configs import SpecLocation as SpecLocation
+from .configs import SpecPath as SpecPath
+from .contexts import ExecutorContext as ExecutorContext
+from .contexts import SourceContext as SourceContext
+from .contexts import StageContext as StageContext
+from .kinds import KINDS as KINDS
+from .kinds import PROJECT as PROJECT
+from .kinds import Kind as Kind
+from .kinds import hookimpl as hookimpl
+from .kinds import hookspec as hookspec
+from .records import API_VERSION as API_VERSION
+from .records import Contribution as Contribution
+from .records import ExecutorContribution as ExecutorContribution
+from .records import ExporterContribution as ExporterContribution
+from .records import InterpolatorContribution as InterpolatorContribution
+from .records import LocatorContribution as LocatorContribution
+from .records import MergerContribution as MergerContribution
+from .records import PartOfCapture as PartOfCapture
+from .records import PoseEstimatorContribution as PoseEstimatorContribution
+from .records import Recognised as Recognised
+from .records import RefinerContribution as RefinerContribution
+from .records import RendererContribution as RendererContribution
+from .records import Requirement as Requirement
+from .records import ResamplerContribution as ResamplerContribution
+from .records import SourceContribution as SourceContribution
+from .records import StageContribution as StageContribution
+from .records import WriteFrames as WriteFrames
+from .records import install_command as install_command

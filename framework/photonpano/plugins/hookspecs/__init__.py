@@ -9,38 +9,16 @@ The hook module imports no heavy library; the component does so when it is built
 distribution, and `docs/tutorial/first-plugin.md` writes it step by step.
 """
 
-from photonpano.plugins.contributions import PROJECT, hookimpl, hookspec
-from photonpano.plugins.hookspecs.levels import (
-    photonpano_interpolators,
-    photonpano_locators,
-    photonpano_mergers,
-    photonpano_resamplers,
-)
-from photonpano.plugins.hookspecs.observation import photonpano_run_finished, photonpano_run_started, photonpano_stage_finished
-from photonpano.plugins.hookspecs.runs import (
-    photonpano_executors,
-    photonpano_exporters,
-    photonpano_pose_estimators,
-    photonpano_refiners,
-    photonpano_renderers,
-    photonpano_sources,
-)
-
-__all__ = [
-    "PROJECT",
-    "hookimpl",
-    "hookspec",
-    "photonpano_executors",
-    "photonpano_exporters",
-    "photonpano_interpolators",
-    "photonpano_locators",
-    "photonpano_mergers",
-    "photonpano_pose_estimators",
-    "photonpano_refiners",
-    "photonpano_renderers",
-    "photonpano_resamplers",
-    "photonpano_run_finished",
-    "photonpano_run_started",
-    "photonpano_sources",
-    "photonpano_stage_finished",
-]
+from .levels import photonpano_interpolators as photonpano_interpolators
+from .levels import photonpano_locators as photonpano_locators
+from .levels import photonpano_mergers as photonpano_mergers
+from .levels import photonpano_resamplers as photonpano_resamplers
+from .observation import photonpano_run_finished as photonpano_run_finished
+from .observation import photonpano_run_started as photonpano_run_started
+from .observation import photonpano_stage_finished as photonpano_stage_finished
+from .runs import photonpano_executors as photonpano_executors
+from .runs import photonpano_exporters as photonpano_exporters
+from .runs import photonpano_pose_estimators as photonpano_pose_estimators
+from .runs import photonpano_refiners as photonpano_refiners
+from .runs import photonpano_renderers as photonpano_renderers
+from .runs import photonpano_sources as photonpano_sources

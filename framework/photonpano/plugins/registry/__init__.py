@@ -1,17 +1,12 @@
 """Discovery of plugins and the catalog of what they contribute."""
 
-from photonpano.plugins.contributions import KINDS, Kind
-from photonpano.plugins.registry.catalog import BrokenPlugin, Catalog, DisabledPlugin, Entry, Observer, Origin
-from photonpano.plugins.registry.discovery import discover
+from photonpano.plugins.contributions import KINDS as KINDS
+from photonpano.plugins.contributions import Kind as Kind
 
-__all__ = [
-    "KINDS",
-    "BrokenPlugin",
-    "Catalog",
-    "DisabledPlugin",
-    "Entry",
-    "Kind",
-    "Observer",
-    "Origin",
-    "discover",
-]
+from .catalog import BrokenPlugin as BrokenPlugin
+from .catalog import Catalog as Catalog
+from .catalog import DisabledPlugin as DisabledPlugin
+from .catalog import Entry as Entry
+from .catalog import Observer as Observer
+from .catalog import Origin as Origin
+from .discovery import discover as discover

@@ -10,7 +10,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from photonpano.errors import PluginError, described
 from photonpano.execution.interrupts import is_interrupt
-from photonpano.plugins.hookspecs import PROJECT
+from photonpano.plugins.contributions import PROJECT
 from photonpano.plugins.registry.catalog import (
     BrokenPlugin,
     Catalog,

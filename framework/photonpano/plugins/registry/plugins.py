@@ -10,11 +10,11 @@ import pluggy
 from photonpano.errors import PluginError, described
 from photonpano.execution.interrupts import is_interrupt
 from photonpano.plugins import hookspecs
-from photonpano.plugins.contributions import API_VERSION, KINDS, Contribution, Kind
+from photonpano.plugins.contributions import API_VERSION, KINDS, PROJECT, Contribution, Kind
 from photonpano.plugins.hookspecs import observation
 from photonpano.text import listed
 
-PREFIX = f"{hookspecs.PROJECT}_"
+PREFIX = f"{PROJECT}_"
 # The hooks that offer nothing: a run calls them, so that a plugin can watch it.
 OBSERVATION_HOOKS = tuple(name for name in vars(observation) if name.startswith(PREFIX))
 # All hooks: those that offer components, in the order in which a run needs these, and those that watch.
@@ -53,7 +53,7 @@ def require_same_contract(contribution: Contribution) -> None:
 
 def _registered(plugin: object) -> pluggy.PluginManager:
     """Register a plugin with a manager of its own, so that its mistakes affect no other plugin."""
-    manager = pluggy.PluginManager(hookspecs.PROJECT)
+    manager = pluggy.PluginManager(PROJECT)
     manager.add_hookspecs(hookspecs)
     for name in dir(plugin):
         if not name.startswith(PREFIX) or not callable(getattr(plugin, name)):
