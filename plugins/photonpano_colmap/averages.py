@@ -27,12 +27,12 @@ from photonpano import (
     StageContext,
     VirtualExposure,
 )
-from photonpano.geometry import Camera, camera_matrix
+from photonpano.geometry import Camera, camera_matrix, positions_of
 from photonpano.locating import blur_against_noise, stabilised_8_bit
 from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, counted, too_few_averages
 from photonpano_colmap.pose_noise import PoseNoise, pose_noise
 from photonpano_colmap.posing.merging import lit_counts
-from photonpano_colmap.posing.path import PoseSpline, left_out, positions_of
+from photonpano_colmap.posing.path import PoseSpline, left_out
 from photonpano_colmap.reconstruction import Piece, Reconstruction, reconstruct
 
 _PHOTONS = 60.0  # photons per pixel of an average; with fewer, keypoints are noise

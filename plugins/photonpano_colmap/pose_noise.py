@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FloatArray
+from photonpano.geometry import positions_of
 
 _POSE = 6  # unknowns of a pose: rotation vector and position
 _SMALLEST = 1e-12  # eigenvalues of the information below this fraction of the largest are undetermined directions
@@ -100,7 +101,7 @@ def without_gauge(information: FloatArray, poses: FloatArray) -> FloatArray:
     inverted = np.where(values > _SMALLEST * values[-1], 1 / np.where(values > 0, values, 1), 0)
     covariance = (vectors * inverted) @ vectors.T
     rotations = poses[:, :, :3]
-    places = -np.einsum("nji,nj->ni", rotations, poses[:, :, 3])
+    places = positions_of(poses)
     gauge = np.zeros((len(information), 7))
     for place, (rotation, position) in enumerate(zip(rotations, places - places.mean(axis=0), strict=True)):
         rows = slice(_POSE * place, _POSE * place + 3), slice(_POSE * place + 3, _POSE * place + _POSE)

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from photonpano import CameraGuess, FloatArray
 from photonpano_colmap.configs import FIRST_CENTRE, SEEDS, ColmapAveragesConfig
-from photonpano_colmap.halves import Halves, compared_halves
-from photonpano_colmap.reversal import Readings, likelier_reading
+from photonpano_colmap.reversal import Halves, Readings, compared_halves, likelier_reading
 
 _USUAL_FOCAL = 1.2  # initial focal length where none is given, in longer sides of a frame
 _START_ANGLE_DEG = 4.0  # parallax of COLMAP's initial pair; its own 16 degrees are too much for short captures

@@ -1,4 +1,4 @@
-"""Resolve the depth reversal of a reconstruction (the ambiguity of Necker's cube).
+"""Adjust a reconstruction: resolve its depth reversal (the ambiguity of Necker's cube), and compare halves of its points.
 
 From afar, a scene and its mirror image in depth look alike if the camera rotates the other way. A reconstruction may end in
 either; perspective leaves larger residuals in the wrong one.
@@ -14,12 +14,14 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from photonpano import FloatArray, Reason
-from photonpano_colmap.posing.path import positions_of
+from photonpano.geometry import positions_of
 
 _NEAREST = 0.1  # minimum distance of reversed points, in median depths
 _FARTHEST_OFF_PX = 4.0  # points with a larger residual are removed, as COLMAP removes them
 _SAME = 0.2  # two readings agree if their rotations differ by less than this fraction
 _ALIKE = 0.9  # neither reading is likelier if the ratio of their residuals is above this
+_CELLS = 0.06, 0.12  # sides of the squares of two chessboards, in focal lengths
+_FEWEST = 3  # positions that determine a similarity
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,3 +125,51 @@ def _agree(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction) -> b
     ]
     rotations = [Rotation.from_matrix(each[1:, :, :3] @ each[0, :, :3].T) for each in poses]
     return bool(np.median((rotations[0] * rotations[1].inv()).magnitude()) < _SAME * np.median(rotations[0].magnitude()))
+
+
+@dataclass(frozen=True, slots=True)
+class Halves:
+    """Expected errors of poses from half of the points, root mean square.
+
+    Keypoints of a track err alike, from blur and at the edges of things, which residuals do not show: so the poses from all
+    points are hardly better than these.
+    """
+
+    std_position: float  # in units of the world
+    std_rotation: float  # in radians, after the best common rotation
+
+
+def compared_halves(found: pycolmap.Reconstruction, finds_focal: bool) -> Halves:
+    """Adjust the images of a reconstruction to each half of its points; compare both, aligned.
+
+    The halves are the black and the white squares of a chessboard that the image in the middle sees: neighbours err alike, so
+    that they belong to one half. How far two halves are apart is chance, too, and less so as the mean of two boards.
+    """
+    squares = np.array([_compared(found, finds_focal, cell) for cell in _CELLS]) ** 2
+    return Halves(*np.sqrt(squares.mean(axis=0)).tolist())
+
+
+def _compared(found: pycolmap.Reconstruction, finds_focal: bool, cell: float) -> tuple[float, float]:
+    """Return the expected errors of positions and rotations from the halves of a board; infinite where half has no poses."""
+    places = sorted(found.reg_image_ids())
+    middle = found.images[places[len(places) // 2]].cam_from_world()
+    halves = [copy.deepcopy(found) for _ in range(2)]
+    for number, half in enumerate(halves):
+        for identifier, point in found.points3D.items():
+            x, y, z = middle * point.xyz
+            if (x / z // cell + y / z // cell) % 2 == number:
+                half.delete_point3D(identifier)
+        adjust_model(half, finds_focal)
+        if not half.num_points3D():  # as of a camera that only turns, whose points lie anywhere
+            return np.inf, np.inf
+    images = sorted(set(halves[0].reg_image_ids()) & set(halves[1].reg_image_ids()))
+    first, second = (np.array([half.images[each].cam_from_world().matrix() for each in images]) for half in halves)
+    aligned = pycolmap.estimate_sim3d(positions_of(first), positions_of(second)) if len(images) >= _FEWEST else None
+    if aligned is None:
+        return np.inf, np.inf
+    apart = positions_of(first) @ aligned.rotation.matrix().T * aligned.scale + aligned.translation - positions_of(second)
+    worlds = Rotation.from_matrix(np.swapaxes(first[:, :, :3], 1, 2) @ second[:, :, :3])
+    turned = (worlds * worlds.mean().inv()).magnitude()
+    # Both halves err, by chance.
+    squares = np.sum(apart**2, axis=1), turned**2
+    return float(np.sqrt(np.mean(squares[0]) / 2)), float(np.sqrt(np.mean(squares[1]) / 2))

@@ -21,11 +21,11 @@ from photonpano import (
     Source,
     StageContext,
 )
-from photonpano.geometry import Camera, camera_matrix, corners
+from photonpano.geometry import Camera, camera_matrix, corners, positions_of
 from photonpano_colmap.averages import FOCAL_BIAS, AveragesEstimator, flux_of_points, relative_std, tilt, with_focal_judged
 from photonpano_colmap.configs import StratifiedPoseConfig
 from photonpano_colmap.posing.levels import PosedLevel, Scene, refine
-from photonpano_colmap.posing.path import Path, PoseSpline, positions_of
+from photonpano_colmap.posing.path import Path, PoseSpline
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
 _CONTRADICTION, _CONTRADICTION_PX = 10.0, 0.5

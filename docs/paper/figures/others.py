@@ -31,9 +31,8 @@ from paper.figures.study import (
 from photonpano import FrameSpan, Panorama, PhotonpanoError, evaluate_poses, load_panorama, open_source, parse_spec
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import align_positions
-from photonpano.geometry import FrameTrajectory
-from photonpano.merging.panorama import plan_canvas
-from photonpano.record.poses import centres
+from photonpano.geometry import FrameTrajectory, positions_of
+from photonpano.merging.canvas_plan import plan_canvas
 
 APERTURES = {"f/8": 1 / 8, "f/5.6": 1 / 4, "f/4": 1 / 2, "f/2.8": 1.0}  # and their light, relative to the spec
 SHOWN = ("f/5.6", "f/2.8")  # the paper's apertures
@@ -152,12 +151,12 @@ def high_speed_claims(numbers: Numbers) -> list[Claim]:
 def true_centres(capture: Path) -> NDArray[np.float64]:
     """Return the true positions of a camera that travels: (T, 3) in m."""
     with np.load(truth_path(capture)) as file:
-        return centres(file["camera_from_world"])
+        return positions_of(file["camera_from_world"])
 
 
 def draw_found(folder: Path, true: NDArray[np.float64], views: dict[Axes, tuple[int, int]], **line: Any) -> None:
     """Draw the positions that a run has found, after the best similarity, on plots of two coordinates each."""
-    found = centres(np.load(folder / "poses.npz")["camera_from_world"])
+    found = positions_of(np.load(folder / "poses.npz")["camera_from_world"])
     scale, rotation, shift = align_positions(found, true)
     aligned = scale * found @ rotation.T + shift
     for panel, (x, y) in views.items():

@@ -18,10 +18,11 @@ from photonpano.evaluation import RunPoses, RunTrajectory, has_poses, load_run_p
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside
 from photonpano.files.folders import atomic_folder, require_new
+from photonpano.geometry import positions_of
 from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import require_one_run
 from photonpano.record.picture_files import Picture, counted, write_pngs
-from photonpano.record.poses import POSE_FORMATS, PoseFormat, Poses, centres, ply
+from photonpano.record.poses import POSE_FORMATS, PoseFormat, Poses, ply
 from photonpano.record.run_json import read_record
 
 
@@ -146,7 +147,7 @@ def _poses(folder: Path, every: int, frame_rate_hz: float | None, needs_seconds:
     run: RunPoses | RunTrajectory
     if has_poses(folder):
         run = load_run_poses(folder)
-        camera, positions = run.camera, centres(run.camera_from_world)
+        camera, positions = run.camera, positions_of(run.camera_from_world)
         rotations = np.swapaxes(run.camera_from_world[:, :, :3], -1, -2)
     else:
         run = load_run_trajectory(folder, needs_std_px=False)

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from photonpano.errors import InputError
 from photonpano.evaluation.trajectory import of_focal_length
-from photonpano.geometry import Camera, nearest_rotations, rotation_vectors
+from photonpano.geometry import Camera, nearest_rotations, positions_of, rotation_vectors
 from photonpano.notebooks import facts
 from photonpano.reading import read_arrays
 from photonpano.record.contents import require_one_run
-from photonpano.record.poses import centres
 from photonpano.values import BoolArray, FloatArray
 
 POSES = "poses.npz"
@@ -209,11 +208,11 @@ def pose_errors(
     The relative error is that of every pair of located frames that are `rpe_frames` apart. `std_position` is (T,), in units of
     the found world; None or not finite if not known. Raises `ValueError` for positions that cannot be aligned.
     """
-    scale, rotation, shift = align_positions(centres(found[located]), centres(true[located]))
+    scale, rotation, shift = align_positions(positions_of(found[located]), positions_of(true[located]))
     aligned = np.full((len(found), 3, 4), np.nan)
     aligned[:, :, :3] = found[:, :, :3] @ rotation.T
     aligned[:, :, 3] = scale * found[:, :, 3] - aligned[:, :, :3] @ shift
-    places, true_places = centres(aligned), centres(true)
+    places, true_places = positions_of(aligned), positions_of(true)
     errors_m = np.where(located, np.linalg.norm(places - true_places, axis=1), np.nan)
     errors_deg = np.full(len(found), np.nan)
     errors_deg[located] = _angles(aligned[located, :, :3] @ np.swapaxes(true[located, :, :3], 1, 2))

@@ -6,6 +6,7 @@ from .camera import camera_matrix as camera_matrix
 from .camera import lenses_apart_px as lenses_apart_px
 from .camera import likely_rotations as likely_rotations
 from .camera import nearest_rotations as nearest_rotations
+from .camera import positions_of as positions_of
 from .camera import right_handed_axes as right_handed_axes
 from .camera import rotation_matrices as rotation_matrices
 from .camera import rotation_vectors as rotation_vectors

@@ -215,6 +215,11 @@ def rotations_between(camera: Camera, here: FloatArray, there: FloatArray) -> Fl
     return nearest_rotations(np.swapaxes(seen[1], -1, -2) @ seen[0])
 
 
+def positions_of(camera_from_world: FloatArray) -> FloatArray:
+    """Return the positions of cameras in the world, -R^T t: (..., 3, 4) to (..., 3)."""
+    return np.asarray(-np.einsum("...ji,...j->...i", camera_from_world[..., :3], camera_from_world[..., 3]))
+
+
 def right_handed_axes() -> dict[str, FloatArray]:
     """Return the 24 ways to choose axes along others, such as "x, -y, -z": rotations (3, 3) whose rows are the axes."""
     from scipy.spatial.transform import Rotation

@@ -11,13 +11,13 @@ import numpy as np
 from photonpano.contracts.results import POSES
 from photonpano.contracts.rules import attributing
 from photonpano.errors import OutputError
-from photonpano.geometry import Camera
+from photonpano.geometry import Camera, positions_of
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.estimate import require_centre
 from photonpano.pipeline.obstacles import naming_obstacles
 from photonpano.pipeline.run_steps import BegunRun
-from photonpano.record.poses import Poses, centres, colmap, in_standard_world, nerfstudio, ply, tum
+from photonpano.record.poses import Poses, colmap, in_standard_world, nerfstudio, ply, tum
 from photonpano.record.run_json import poses_record, verdict_record
 from photonpano.record.run_warnings import poses_warnings
 from photonpano.record.schema import RunRecord
@@ -114,7 +114,7 @@ def _write(folder: Path, estimate: PoseEstimate, stream: StreamInfo) -> None:
         poses = estimate.camera_from_world[frames]
         names = tuple(map(str, frames.tolist()))
         to_world = np.swapaxes(poses[:, :, :3], -1, -2)
-        located = Poses(camera, stream.frame_shape, names, to_world, frames / rate, centres(poses))
+        located = Poses(camera, stream.frame_shape, names, to_world, frames / rate, positions_of(poses))
         (folder / "poses.tum").write_text(tum(located)["trajectory.txt"], encoding="utf-8")
 
 
@@ -127,7 +127,7 @@ def _of_views(camera: Camera, estimate: PoseEstimate, stream: StreamInfo, rate: 
         view_names(estimate, stream.n_frames),
         np.swapaxes(poses[:, :, :3], -1, -2),
         np.array([view.instant for view in estimate.views]) / rate,
-        centres(poses),
+        positions_of(poses),
         tuple((np.asarray(view.points), view.xy) for view in estimate.views),
         estimate.points,
     )

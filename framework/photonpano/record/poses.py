@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError, LocationError
-from photonpano.geometry import Camera
+from photonpano.geometry import Camera, positions_of
 from photonpano.photometry import srgb_to_linear, tone_mapped
 from photonpano.values import FloatArray, PoseEstimate, ScenePoints
 
@@ -186,7 +186,7 @@ def read_colmap(folder: Path, camera: Camera, frame_shape: tuple[int, int]) -> P
         numbers = np.array([head[1:8] for head in heads], float).reshape(-1, 7)
         rows = np.array([line.split()[:5] for line in cloud], float).reshape(-1, 5)
         from_world = Rotation.from_quat(np.roll(numbers[:, :4], -1, axis=1)).as_matrix()
-        places = centres(np.concatenate([from_world, numbers[:, 4:, None]], axis=-1))
+        places = positions_of(np.concatenate([from_world, numbers[:, 4:, None]], axis=-1))
         names = tuple(head[9] for head in heads)
     except (OSError, ValueError, IndexError) as error:
         raise InputError(f"{folder} is no COLMAP model of a run: {error}") from error
@@ -245,11 +245,6 @@ def _line(*numbers: float) -> str:
     return " ".join(repr(float(number)) for number in numbers)
 
 
-def centres(camera_from_world: FloatArray) -> FloatArray:
-    """Return the positions of cameras in the world, -R^T t: (..., 3, 4) to (..., 3)."""
-    return np.asarray(-np.einsum("...ji,...j->...i", camera_from_world[..., :3], camera_from_world[..., 3]))
-
-
 def in_standard_world(estimate: PoseEstimate) -> PoseEstimate:
     """Move the world so that the first located camera is its origin and looks along z, and the path has the length 1.
 
@@ -257,7 +252,7 @@ def in_standard_world(estimate: PoseEstimate) -> PoseEstimate:
         LocationError: the camera does not travel, so that there is no scale.
     """
     known = estimate.camera_from_world[np.isfinite(estimate.camera_from_world).all(axis=(1, 2))]
-    length = float(np.linalg.norm(np.diff(centres(known), axis=0), axis=1).sum())
+    length = float(np.linalg.norm(np.diff(positions_of(known), axis=0), axis=1).sum())
     if not length > 0:
         raise LocationError(
             "the camera does not travel: all located frames have one position; if it turns, leave out `pose` and set "

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from photonpano.geometry import nearest_rotations, positions_of
 from photonpano.photometry import linear_to_srgb
-from photonpano.record.poses import centres
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import INK, MUTED, SERIES, WIDTH_IN, Margins, add_axes, add_time_axis, plain_figure, svg_of
 from photonpano.report.environment import filled
@@ -116,7 +116,7 @@ def viewpoints(shown: FloatArray, poses: FloatArray) -> tuple[Viewpoint, Viewpoi
     middle = (low + high) / 2
     radius = float(np.linalg.norm(shown - middle, axis=1).max()) or 1.0
     principal = np.linalg.eigh(np.cov(shown.T))[1].T  # the least first
-    right, down, ahead = _mean_rotation(poses)
+    right, down, ahead = nearest_rotations(poses[:, :, :3].mean(axis=0))
     least, second = (_viewpoint(axis, right, -down, ahead, middle, _AWAY * radius) for axis in principal[:2])
     return least, second
 
@@ -124,7 +124,7 @@ def viewpoints(shown: FloatArray, poses: FloatArray) -> tuple[Viewpoint, Viewpoi
 def path_views(estimate: PoseEstimate, shape: tuple[int, int]) -> tuple[str, str]:
     """Draw the path of the camera, coloured by time, with its frustums; frames have the given height and width."""
     poses = estimate.camera_from_world[estimate.located]
-    first, second = viewpoints(centres(poses), poses)
+    first, second = viewpoints(positions_of(poses), poses)
     return _path_view(estimate, shape, first, "path-1"), _path_view(estimate, shape, second, "path-2")
 
 
@@ -133,7 +133,7 @@ def scene_views(estimate: PoseEstimate, shape: tuple[int, int]) -> tuple[str, st
     poses, points = estimate.camera_from_world[estimate.located], estimate.points.positions
     low, high = np.quantile(points, _NEAR_QUANTILES, axis=0)
     near = points[((points >= low) & (points <= high)).all(axis=1)]
-    shown = np.concatenate([near, centres(poses)])
+    shown = np.concatenate([near, positions_of(poses)])
     first, second = viewpoints(shown, poses)
     return _scene_view(estimate, shape, first, shown, "scene-1"), _scene_view(estimate, shape, second, shown, "scene-2")
 
@@ -154,14 +154,8 @@ def _viewpoint(
     return Viewpoint(np.array([np.cross(upwards, towards), upwards, towards]), middle, distance, f"from {name}")
 
 
-def _mean_rotation(poses: FloatArray) -> FloatArray:
-    """Return the rotation nearest to the mean of rotations: rows to the right, down, and ahead of the cameras."""
-    left, _, right = np.linalg.svd(poses[:, :, :3].mean(axis=0))
-    return np.asarray(left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right)
-
-
 def _path_view(estimate: PoseEstimate, shape: tuple[int, int], viewpoint: Viewpoint, name: str) -> str:
-    places = centres(estimate.camera_from_world[estimate.located])
+    places = positions_of(estimate.camera_from_world[estimate.located])
     frustums = _frustums(estimate, shape, _FRUSTUM * viewpoint.distance / _AWAY)
     with plain_figure(*_SIZE_IN) as figure:
         axes: Axes = figure.add_axes((0, 0, 1, 1))
@@ -225,7 +219,7 @@ def _draw_path(
     colours = LinearSegmentedColormap.from_list("time", _TIME)
     n_frames = len(estimate.located)
     frames = np.unique(np.append(np.arange(0, n_frames, -(-n_frames // MAX_FRAMES)), n_frames - 1))
-    xy, _ = viewpoint.project(centres(estimate.camera_from_world[frames]))
+    xy, _ = viewpoint.project(positions_of(estimate.camera_from_world[frames]))
     steps = np.stack([xy[:-1], xy[1:]], axis=1)
     known = np.isfinite(steps).all(axis=(1, 2))
     times = frames[:-1] / max(1, n_frames - 1)
@@ -235,7 +229,7 @@ def _draw_path(
         edges = [np.array([*image, image[0]]), *(np.array([apex, corner]) for corner in image)]
         axes.add_collection(LineCollection(edges, colors=[colours(time)], linewidths=0.9, alpha=0.85))
     first_and_last = np.flatnonzero(estimate.located)[[0, -1]]
-    ends, _ = viewpoint.project(centres(estimate.camera_from_world[first_and_last]))
+    ends, _ = viewpoint.project(positions_of(estimate.camera_from_world[first_and_last]))
     upper = int(np.argmax(ends[:, 1]))
     for number, (frame, end) in enumerate(zip(first_and_last.tolist(), ends, strict=True)):
         axes.plot(*end, "os"[number], color=colours(frame / max(1, n_frames - 1)), markersize=7)

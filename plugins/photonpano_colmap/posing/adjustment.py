@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from photonpano import FloatArray
-from photonpano.geometry import Camera, camera_matrix
+from photonpano.geometry import Camera, camera_matrix, positions_of
 from photonpano_colmap.pose_noise import without_gauge
-from photonpano_colmap.posing.path import posed, positions_of, projected
+from photonpano_colmap.posing.path import posed, projected
 
 _ROBUST = 2.0  # scale of the Cauchy loss, in standard deviations
 _FLOOR_PX = 0.02  # error of observations beside photon noise, from interpolation and errors of depth

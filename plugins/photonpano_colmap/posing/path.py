@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from photonpano import FloatArray
 from photonpano.filtering import exceeding_noise
-from photonpano.geometry import rotation_matrices, rotation_vectors
+from photonpano.geometry import positions_of, rotation_matrices, rotation_vectors
 
 _DEGREE = 5  # degree of the polynomial in time that is always kept: gauge and drift
 
@@ -95,11 +95,6 @@ class Path:
     def rotated(self, rotations: FloatArray) -> Path:
         """Return this path with the camera rotated on the spot at each frame, by (T, 3) rotation vectors in its own axes."""
         return Path(rotation_matrices(rotations) @ self.poses)
-
-
-def positions_of(poses: FloatArray) -> FloatArray:
-    """Return the positions of cameras in the world, -R^T t: (..., 3, 4) to (..., 3)."""
-    return np.asarray(-np.einsum("...ji,...j->...i", poses[..., :3], poses[..., 3]))
 
 
 def posed(rotations: FloatArray, centres: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from photonpano import CameraGuess, CaptureSummary, FrameSpan, LocationError, StageContext, StreamInfo, discover
 from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
-from photonpano.geometry import camera_matrix
+from photonpano.geometry import camera_matrix, positions_of
 from photonpano.testing import MemorySource
 from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses
 
@@ -21,11 +21,10 @@ pytest.importorskip("pycolmap")
 
 from photonpano_colmap.averages import AveragesEstimator, chosen_size, tilt
 from photonpano_colmap.configs import ColmapAveragesConfig
-from photonpano_colmap.halves import Halves
 from photonpano_colmap.pose_noise import pose_noise
-from photonpano_colmap.posing.path import PoseSpline, positions_of
+from photonpano_colmap.posing.path import PoseSpline
 from photonpano_colmap.reconstruction import Piece, Reconstruction, _apart
-from photonpano_colmap.reversal import Readings
+from photonpano_colmap.reversal import Halves, Readings
 
 SIZE = 20
 MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))

@@ -11,9 +11,8 @@ pytest.importorskip("pycolmap")
 
 import pycolmap
 
-from photonpano_colmap.halves import compared_halves
 from photonpano_colmap.pose_noise import pose_noise
-from photonpano_colmap.reversal import adjust_model, likelier_reading, reversed_in_depth
+from photonpano_colmap.reversal import adjust_model, compared_halves, likelier_reading, reversed_in_depth
 
 SEEN = 150
 

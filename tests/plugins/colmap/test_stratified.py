@@ -12,7 +12,7 @@ from photonpano import CameraGuess, FrameSpan, Group, LocationError, StageContex
 from photonpano.contracts.results import POSES
 from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
-from photonpano.geometry import Camera, rotation_matrices
+from photonpano.geometry import Camera, positions_of, rotation_matrices
 from photonpano.testing import MemorySource
 from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses
 
@@ -26,7 +26,7 @@ from photonpano_colmap.posing.lens import imaged, lens_of
 from photonpano_colmap.posing.levels import Merged, Scene, interpolate, locate, merge, resample
 from photonpano_colmap.posing.merging import inverse_depth_of, merge_through_depth
 from photonpano_colmap.posing.patches import Found, Patches, find_patches
-from photonpano_colmap.posing.path import Path, PoseSpline, between, moves, posed, positions_of, projected
+from photonpano_colmap.posing.path import Path, PoseSpline, between, moves, posed, projected
 from photonpano_colmap.posing.tremor import _beyond_noise, find_tremor
 from photonpano_colmap.stratified import StratifiedEstimator
 
