@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -30,7 +31,7 @@ _STD_OFFSET_S = 1e-4  # of an offset that is given
 class _AlongRates(Contrast):
     """The contrast along rates: the unknowns are their bias in rad/s and, where it is sought, the time of the first frame."""
 
-    def __init__(self, images: Images, size: int, rates: Rates, camera: Camera, spans_s: FloatArray) -> None:
+    def __init__(self, images: Images, camera: Camera, spans_s: FloatArray, rates: Rates, size: int) -> None:
         """Take the camera of binned pixels, and the (S,) times of the spans, without what is sought."""
         super().__init__(images, size)
         self._rates, self._camera, self._spans_s = rates, camera, spans_s[self.spans]
@@ -69,35 +70,20 @@ def fit_rates(
     varying, seen, n_frames = varying_spans(source, context)
     images = structure_of(varying, seen)
     spans_s = timeline.times((np.arange(len(images)) + 0.5) * n_frames - 0.5) / info.frame_rate_hz
-    period_s, last_s = float(np.median(np.diff(spans_s))), measured.times_s[-1] - frames_s[-1]
-    offsets = np.arange(measured.times_s[0], last_s, period_s) if offset_s == "find" else np.array([offset_s])
-    if not 0 < len(offsets) <= _MOST_OFFSETS:
-        raise InputError(
-            f"{file} covers {np.ptp(measured.times_s):g} s, and the capture takes {frames_s[-1]:g} s: to find the time offset, "
-            f"at least as many and at most {_MOST_OFFSETS * period_s:g} s more are needed; give motion.prior.time_offset_s"
-        )
-    if offset_s != "find":
+    if offset_s == "find":
+        starts = [np.array([0.0, 0.0, 0.0, start_s]) for start_s in _offsets_s(file, measured, frames_s, spans_s)]
+    else:
         measured.require_covered(frames_s + offset_s)
         spans_s = spans_s + offset_s
+        starts = [np.zeros(3)]
     every = right_handed_axes()
     about = {text: measured.about(every[text]) for text in (every if axes == "find" else [axes])}
-
-    def along(rates: Rates, size: int) -> _AlongRates:
-        return _AlongRates(images, size, rates, camera.scaled(1 / binning_of(source)), spans_s)
-
-    size = min(_SIZE, len(images))
-    motions = [np.array([0.0, 0.0, 0.0, *([start_s] if offset_s == "find" else [])]) for start_s in offsets]
-    tried = [(text, motion) for text in about for motion in motions]
-    heights = list(context.in_order(partial(_height, {text: along(rates, size) for text, rates in about.items()}), tried))
-    axes, motion = tried[int(np.argmax(heights))]
-    start = motion
-    while True:
-        fitted = along(about[axes], size)
-        motion = fitted.sharpest(motion)
-        if 2 * size > len(images) or fitted.moved_px(motion) > fitted.middle.min():
-            break
-        size *= 2
-    opposite = along(about[axes].about(-np.eye(3)), size).of_spans(np.array([*-motion[:3], *motion[3:]]))
+    along = partial(_AlongRates, images, camera.scaled(1 / binning_of(source)), spans_s)
+    tried = [(text, start) for text in about for start in starts]
+    shortest = {text: along(rates, min(_SIZE, len(images))) for text, rates in about.items()}
+    axes, start = tried[int(np.argmax(list(context.in_order(partial(_height, shortest), tried))))]
+    fitted, motion = _sharpened(partial(along, about[axes]), start, len(images))
+    opposite = along(about[axes].about(-np.eye(3)), fitted.size).of_spans(np.array([*-motion[:3], *motion[3:]]))
     better = fitted.of_spans(motion) - opposite
     significance = float(better.sum() / max(np.sqrt((better**2).sum()), 1e-12))
     if significance < _SIGNIFICANT or np.abs(motion[:3]).max() > _MOST_BIAS:
@@ -107,23 +93,51 @@ def fit_rates(
             f"{np.rad2deg(np.abs(motion[:3]).max()):.2g} deg/s; is the file of this capture, are its units and "
             "motion.prior.axes right, and does the camera turn?"
         )
-    # Slower motions have a larger overlap, and what photons leave open is as usual of gyroscopes.
-    shown = np.linalg.inv(fitted.covariance(motion) + np.diag((_PULL * fitted.steps[: len(motion)]) ** 2))
-    covariance = np.linalg.inv(shown + np.diag([*[_STD_BIAS**-2] * 3, (size * period_s) ** -2][: len(motion)]))
-    usual = np.array([0.0, 0.0, 0.0, *start[3:]])
-    motion = usual + covariance @ shown @ (motion - usual)
-    *std_bias, std_offset_s = [*np.sqrt(np.diag(covariance)), _STD_OFFSET_S][:4]
+    motion, stds = _likeliest(fitted, motion, start)
+    std_bias, std_offset_s = stds[:3], float(np.append(stds, _STD_OFFSET_S)[3])
     found_s = float(motion[3]) if offset_s == "find" else offset_s
     frames_s = frames_s + found_s
     about[axes].require_covered(frames_s)
     bias = ", ".join(f"{value:.3g} +- {std:.1g}" for value, std in np.rad2deg([motion[:3], std_bias]).T)
     text = f"time offset {found_s:.6g} +- {std_offset_s:.1g} s, axes ({axes}), bias ({bias}) deg/s"
     reason = f"photons along its rates stand out by {significance:.2g} standard deviations from those along opposite ones"
-    gyroscope = Gyroscope(about[axes], camera, info.frame_shape, frames_s, noise, motion[:3], np.array(std_bias), std_offset_s)
+    gyroscope = Gyroscope(about[axes], camera, info.frame_shape, frames_s, noise, motion[:3], std_bias, std_offset_s)
     return gyroscope, Decision(GYROSCOPE, text, reason)
+
+
+def _offsets_s(file: Path, measured: Rates, frames_s: FloatArray, spans_s: FloatArray) -> FloatArray:
+    """Return the times of the first frame to try, at which the file covers the capture."""
+    period_s = float(np.median(np.diff(spans_s)))
+    offsets_s = np.arange(measured.times_s[0], measured.times_s[-1] - frames_s[-1], period_s)
+    if not 0 < len(offsets_s) <= _MOST_OFFSETS:
+        raise InputError(
+            f"{file} covers {np.ptp(measured.times_s):g} s, and the capture takes {frames_s[-1]:g} s: to find the time offset, "
+            f"at least as many and at most {_MOST_OFFSETS * period_s:g} s more are needed; give motion.prior.time_offset_s"
+        )
+    return offsets_s
 
 
 def _height(along: dict[str, _AlongRates], tried: tuple[str, FloatArray]) -> float:
     """Return the contrast along rates about some axes."""
     axes, motion = tried
     return float(along[axes].of_spans(motion).sum())
+
+
+def _sharpened(along: Callable[[int], _AlongRates], motion: FloatArray, n_spans: int) -> tuple[_AlongRates, FloatArray]:
+    """Raise the contrast in longer and longer windows, until a window sees another place at its end; return the longest."""
+    size = min(_SIZE, n_spans)
+    while True:
+        fitted = along(size)
+        motion = fitted.sharpest(motion)
+        if 2 * size > n_spans or fitted.moved_px(motion) > fitted.middle.min():
+            return fitted, motion
+        size *= 2
+
+
+def _likeliest(fitted: _AlongRates, motion: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the motion if what photons leave open is as usual of gyroscopes, and its standard deviations."""
+    # Slower motions have a larger overlap.
+    shown = np.linalg.inv(fitted.covariance(motion) + np.diag((_PULL * fitted.steps[: len(motion)]) ** 2))
+    usual = np.array([*[_STD_BIAS] * 3, fitted.size * fitted.steps[-1]])[: len(motion)] ** -2.0
+    covariance = np.linalg.inv(shown + np.diag(usual))
+    return start + covariance @ shown @ (motion - start), np.sqrt(np.diag(covariance))
