@@ -38,7 +38,8 @@ from photonpano.evaluation import (
 )
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas, FrameTrajectory, apply, normalised
-from photonpano.merging.panorama import plan_canvas, render
+from photonpano.merging.canvas_plan import plan_canvas
+from photonpano.merging.panorama import render
 from photonpano.reading import Closing
 from photonpano.record.environment import peak_memory_bytes
 

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Renderer, Source, Trajectory
-from photonpano.errors import ExtentError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import InOrder
-from photonpano.geometry import Canvas, Extent, rescaling
+from photonpano.geometry import Canvas, rescaling
 from photonpano.merging.accumulate import accumulate
-from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
-from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, View, plan_canvas
+from photonpano.merging.canvas_noise import DynamicRange
+from photonpano.merging.canvas_plan import BYTES_PER_PIXEL
 from photonpano.merging.chunks import chunks_of
-from photonpano.merging.colour import channels_of, composed, in_colours, seen_in
-from photonpano.merging.light import bytes_of_light
-from photonpano.photometry import Tone, WhiteBalance, balanced, debiased, picture_of
-from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
+from photonpano.merging.colour import channels_of, in_colours, seen_in
+from photonpano.photometry import debiased
+from photonpano.values import FluxImage, FrameSpan, Panorama
 
 
 class MergeRenderer:
@@ -50,38 +46,6 @@ class MergeRenderer:
         photons = accumulate(source, chunks, canvas, canvas.shape, advance, self._in_order)
         flux, weight = photons.estimate(source.response)
         return Panorama(debiased(flux, weight, source.response), weight, canvas.transform)
-
-
-class RenderOptions(Protocol):
-    """Settings of `render_panorama`."""
-
-    @property
-    def scale(self) -> float:
-        """Pixels of the panorama per pixel of the reference frame."""
-
-    @property
-    def tolerance_px(self) -> float:
-        """Motion within which frames are summed before they are warped, in px of a frame."""
-
-    @property
-    def white_quantile(self) -> float:
-        """Quantile of the flux that is white in the picture."""
-
-    @property
-    def white_balance(self) -> WhiteBalance:
-        """What makes grey things grey in a picture in colour."""
-
-    @property
-    def extent(self) -> Extent:
-        """What the canvas holds."""
-
-    @property
-    def tone(self) -> Tone:
-        """How flux becomes the picture."""
-
-    @property
-    def exposure_stops(self) -> float:
-        """How much brighter the picture is, in powers of two."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,53 +179,3 @@ class RenderedPanorama:
     seconds: float  # time of rendering and writing
     std: FluxImage  # of the flux of a pixel, averaged down as the thumbnail
     dynamic_range: DynamicRange  # the range of flux, with what its noise depends on
-
-
-def render_panorama(
-    renderer: Renderer,
-    source: Source,
-    trajectory: Trajectory,
-    span: FrameSpan,
-    options: RenderOptions,
-    memory: int,
-    write_tile: Callable[[Tile, Panorama, FluxImage, Canvas], object],
-    context: Context,
-    bytes_per_pixel: int = BYTES_PER_PIXEL,
-    view: View | None = None,
-    std_px: FloatArray | None = None,
-) -> RenderedPanorama:
-    """Render the frames of a span, in tiles if the panorama exceeds the memory, in bytes.
-
-    `write_tile` is called with each tile, its flux and weight, the standard deviation of the flux, and the whole canvas.
-    `bytes_per_pixel` is what the renderer takes in one colour; `std_px` (T,) are the expected corner errors of all frames.
-
-    Raises:
-        ExtentError: no frame shows the extent.
-        CanvasTooLargeError, LocationError, ProjectionError: see `plan_canvas`.
-    """
-    start = time.perf_counter()
-    bytes_per_pixel = (bytes_per_pixel + bytes_of_light(source)) * channels_of(source)
-    shown = trajectory, span, source.info.frame_shape
-    canvas = plan_canvas(*shown, options.scale, memory, bytes_per_pixel, options.extent, view)
-    tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
-    gathered, noise = Thumbnail(canvas, reduction), CanvasNoise.of(source, trajectory, span, canvas, std_px)
-    dynamic_range = DynamicRange(noise)
-    rendered = render_tiles(renderer, source, trajectory, span, tiles, options.tolerance_px, context)
-    for tile, images in zip(tiles, rendered, strict=True):
-        part = composed(images, source)
-        std = np.empty_like(part.flux)
-        for rows, found in noise.of_tile(part.flux, part.weight, tile.top, tile.left):
-            dynamic_range.add(part.flux[rows], part.weight[rows], found.photons)
-            std[rows] = found.whole
-        write_tile(tile, part, std, canvas)
-        gathered.add(tile, part, std)
-    if options.extent != "panorama" and not gathered.coverage_share:
-        raise ExtentError("no frame that was located shows it; choose a part of the panorama")
-    thumbnail = gathered.panorama
-    lit_picture = balanced(thumbnail.flux, options.white_balance)
-    lit = lit_picture[np.isfinite(lit_picture)]
-    white_flux = (float(np.quantile(lit, options.white_quantile)) if lit.size else 0.0) or 1.0
-    picture = picture_of(lit_picture, white_flux, options.tone, options.exposure_stops)
-    seconds = time.perf_counter() - start
-    share, white_flux = gathered.coverage_share, white_flux / 2**options.exposure_stops
-    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, share, seconds, gathered.std, dynamic_range)

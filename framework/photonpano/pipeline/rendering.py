@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -24,11 +25,15 @@ from photonpano.errors import ExtentError, InputError, OutputError, ProjectionEr
 from photonpano.execution.context import Context
 from photonpano.execution.threads import InOrder
 from photonpano.geometry import Canvas
-from photonpano.merging.canvas_noise import CanvasNoise
+from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
+from photonpano.merging.canvas_plan import plan_canvas
+from photonpano.merging.colour import channels_of, composed
 from photonpano.merging.footprints import by_homographies
-from photonpano.merging.panorama import RenderedPanorama, render_panorama
+from photonpano.merging.light import bytes_of_light
+from photonpano.merging.panorama import RenderedPanorama, Thumbnail, render_tiles, tiles_of
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.motion.level import Recorder
+from photonpano.photometry import balanced, picture_of
 from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.run_folder import RunFolder
 from photonpano.plugins.contributions import ExporterContribution, RendererContribution
@@ -56,19 +61,7 @@ def render_into(
     renderer = build_renderer(plan, source, decisions, context.in_order)
     exporters = build_exporters(plan, source, decisions)
     with naming_key_of_canvas(plan):
-        panorama = render_panorama(
-            renderer,
-            source,
-            motion.trajectory,
-            motion.span,
-            plan.render,
-            int(plan.run.memory),
-            folder.write_tile,
-            context,
-            renderer.bytes_per_pixel,
-            view_of(motion, source, plan.render.projection, level=plan.render.horizon == "level"),
-            motion.std_px,
-        )
+        panorama = _rendered(folder, plan, source, motion, context, renderer)
     renderer.require_seen(panorama.coverage_share)
     folder.write_results(panorama, motion)
     for exporter in exporters:
@@ -81,6 +74,39 @@ def render_into(
         if background is not None:
             write_background(folder.staging, background)
     return panorama, decisions
+
+
+def _rendered(
+    folder: RunFolder, plan: Plan, source: Source, motion: FrameMotion, context: Context, renderer: AttributedRenderer
+) -> RenderedPanorama:
+    """Render the frames of a motion, in tiles if the panorama exceeds the memory, and write these."""
+    start, settings, memory = time.perf_counter(), plan.render, int(plan.run.memory)
+    bytes_per_pixel = (renderer.bytes_per_pixel + bytes_of_light(source)) * channels_of(source)
+    view = view_of(motion, source, settings.projection, level=settings.horizon == "level")
+    shown = motion.trajectory, motion.span, source.info.frame_shape
+    canvas = plan_canvas(*shown, settings.scale, memory, bytes_per_pixel, settings.extent, view)
+    tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
+    noise = CanvasNoise.of(source, motion.trajectory, motion.span, canvas, motion.std_px)
+    gathered, dynamic_range = Thumbnail(canvas, reduction), DynamicRange(noise)
+    rendered = render_tiles(renderer, source, motion.trajectory, motion.span, tiles, settings.tolerance_px, context)
+    for tile, images in zip(tiles, rendered, strict=True):
+        part = composed(images, source)
+        std = np.empty_like(part.flux)
+        for rows, found in noise.of_tile(part.flux, part.weight, tile.top, tile.left):
+            dynamic_range.add(part.flux[rows], part.weight[rows], found.photons)
+            std[rows] = found.whole
+        folder.write_tile(tile, part, std, canvas)
+        gathered.add(tile, part, std)
+    if settings.extent != "panorama" and not gathered.coverage_share:
+        raise ExtentError("no frame that was located shows it; choose a part of the panorama")
+    thumbnail = gathered.panorama
+    lit_picture = balanced(thumbnail.flux, settings.white_balance)
+    lit = lit_picture[np.isfinite(lit_picture)]
+    white_flux = (float(np.quantile(lit, settings.white_quantile)) if lit.size else 0.0) or 1.0
+    picture = picture_of(lit_picture, white_flux, settings.tone, settings.exposure_stops)
+    seconds = time.perf_counter() - start
+    share, white_flux = gathered.coverage_share, white_flux / 2**settings.exposure_stops
+    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, share, seconds, gathered.std, dynamic_range)
 
 
 @contextmanager
