@@ -17,8 +17,7 @@ from photonpano import (
 )
 from photonpano.reading import as_written, objections
 from photonpano_zarr.configs import OmeZarrConfig, ZarrConfig
-from photonpano_zarr.source import opened, require_layout
-from photonpano_zarr.writing import write
+from photonpano_zarr.source import opened, require_layout, write
 
 
 def _check(config: ZarrConfig) -> Sequence[str]:

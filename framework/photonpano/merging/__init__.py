@@ -2,9 +2,9 @@
 
 from .accumulate import PhotonSum as PhotonSum
 from .accumulate import accumulate as accumulate
+from .accumulate import binned_mean as binned_mean
+from .accumulate import binning_of as binning_of
 from .accumulate import divided as divided
-from .binning import binned_mean as binned_mean
-from .binning import binning_of as binning_of
 from .chunks import Chunk as Chunk
 from .chunks import CountsCache as CountsCache
 from .chunks import chunks_of as chunks_of

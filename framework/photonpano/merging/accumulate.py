@@ -1,4 +1,4 @@
-"""Warp sums of frames onto a grid and add them up, for virtual exposures and panoramas."""
+"""Warp sums of frames onto a grid and add them up, for virtual exposures and panoramas; and sum frames in large pixels."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +24,8 @@ from photonpano.values import Counts, FluxImage, FrameSpan, Homography, Response
 
 _RUN = 64  # chunks that are summed on a part of the grid of their own. It does not depend on the threads, for sums are rounded
 _BLOCK = 4096  # chunks whose footprints are known at a time
+# Pixels are binned until the shorter side has about 64 of them, which lowers the noise and keeps shifts measurable.
+_SIDE_PX = 64
 MIN_WEIGHT = 1.0  # pixels with less weight than this, in frames, are unknown
 
 _Visible = Sequence[tuple[Chunk, Footprint]]
@@ -219,3 +222,25 @@ def divided(length: int, parts: int) -> list[range]:
     """Divide `range(length)` into parts of about equal length, each of 1 or more."""
     bounds = [length * part // parts for part in range(parts + 1)]
     return [range(start, stop) for start, stop in pairwise(bounds) if start < stop]
+
+
+def binning_of(source: Source) -> int:
+    """Return the side of a binned pixel, in px."""
+    return max(1, min(source.info.frame_shape) // _SIDE_PX)
+
+
+def binned_mean(source: Source, span: FrameSpan) -> FluxImage:
+    """Return the mean count per frame of a span in binned pixels; NaN where no pixel is valid."""
+    binning = binning_of(source)
+    height, width = (side // binning * binning for side in source.info.frame_shape)
+    size = (width // binning, height // binning)
+    capture = capture_of(source)
+    counts = np.asarray(capture.corrected(capture.chunk(span), len(span)), np.float32)[:height, :width]
+    weights = weights_of(capture)
+    if weights is None:
+        return np.asarray(cv2.resize(counts, size, interpolation=cv2.INTER_AREA) / np.float32(len(span)), np.float32)
+    valid = weights[:height, :width]
+    share, summed = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (valid, counts * valid))
+    mean = np.full(share.shape, np.nan, dtype=np.float32)
+    np.divide(summed, share * len(span), out=mean, where=share > 0)
+    return mean

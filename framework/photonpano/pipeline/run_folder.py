@@ -1,4 +1,4 @@
-"""The run folder: it is locked, and its files change in one step."""
+"""The run folder: it is locked, and its files change in one step; and the exposures of levels that are kept in it."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from photonpano.errors import OutputError
+from photonpano.execution.context import Context
+from photonpano.execution.threads import in_order
 from photonpano.files.folders import (
     finish_replacement,
     link_or_copy,
@@ -31,6 +33,8 @@ from photonpano.files.locks import locked
 from photonpano.geometry import Canvas
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.loop import LevelResult
+from photonpano.photometry import tone_mapped
 from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
 from photonpano.record.contents import MAPS, RECORD, contents_of, names_of_results, recorded_contents, recorded_json
 from photonpano.record.schema import FileContent, RunRecord
@@ -229,3 +233,41 @@ def _write_box(path: Path, image: FluxImage, tile: Tile, canvas: Canvas) -> None
         for row, pixels in enumerate(image, start=tile.top):
             stream.seek(start + 4 * pixel * (row * canvas.width + tile.left))
             pixels.tofile(stream)
+
+
+def write_exposures(folder: Path, levels: Sequence[LevelResult], white_flux: float, context: Context) -> None:
+    """Merge the exposures of each level again, as they were located, and write them.
+
+    For each level, `exposures/level-1.npy` is (N, H, W) float32, `exposures/level-1.npz` describes its exposures, and
+    `exposures/level-1-0012.png` is a picture of the one of number 12, from 0. Raises `OSError` if the disk is full.
+    """
+    exposures = folder / "exposures"
+    exposures.mkdir()
+    for result in levels:
+        _write_level(exposures, result, white_flux, context)
+
+
+def _write_level(folder: Path, result: LevelResult, white_flux: float, context: Context) -> None:
+    name, groups = f"level-{result.level.number}", result.groups
+    digits = len(str(len(groups) - 1))
+    exposures = in_order(result.exposures.merged, range(len(groups)), context.threads)
+    title = f"exposures of level {result.level.number}"
+    with (folder / f"{name}.npy").open("wb") as file, context.progress.stage(title, len(groups), "exposures") as advance:
+        for number, exposure in enumerate(exposures):
+            if not file.tell():
+                head = {"descr": "<f4", "fortran_order": False, "shape": (len(groups), *exposure.flux.shape)}
+                np.lib.format.write_array_header_1_0(file, head)
+            file.write(np.ascontiguousarray(exposure.flux, "<f4").tobytes())
+            _, picture = cv2.imencode(".png", tone_mapped(exposure.flux, white_flux))
+            (folder / f"{name}-{number:0{digits}}.png").write_bytes(picture.tobytes())
+            advance(1)
+    instants = np.array([group.reference for group in groups])
+    np.savez(
+        folder / f"{name}.npz",
+        allow_pickle=False,
+        frames=np.array([[group.span.start, group.span.stop] for group in groups]),
+        instants=instants,
+        located=result.located.solution.located,
+        homographies=result.trajectory.at(instants),
+        scale=np.array(result.level.scale),
+    )

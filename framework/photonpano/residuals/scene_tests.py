@@ -1,4 +1,4 @@
-"""Tests of whether the motion is that of the scene, and not of the sensor, or of what stands or moves before it."""
+"""Tests of what was captured, and of whether the motion is that of the scene, not of the sensor or of what stands before it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from photonpano.geometry import corners, transform_points
+from photonpano.motion.timeline import INTERLACED, SHOTS, SHUFFLED
 from photonpano.residuals.block_sums import M, V
 from photonpano.residuals.residual_tests import changing_places
 from photonpano.residuals.tested_run import RIVAL, TestedRun, Tests
@@ -17,6 +18,48 @@ _FINE, _COARSE = (0.35, 0.5), (0.1, 0.17)  # cycles per pixel
 MUCH = 0.25  # share of the frames that is left out, or of the panorama that changes, which may be the scene
 
 SCENE_TESTS = Tests()
+
+
+@SCENE_TESTS.doubtful_above(
+    1,
+    "the capture holds shots that no pair of exposures ties together, and the panorama is of the longest alone",
+    "look at the panoramas of the others beside the run folder: DIR.panorama-2 and so on",
+)
+def _shots(run: TestedRun) -> Found | None:
+    shots = next((str(each.value) for each in run.decisions if each.what == SHOTS), "")
+    return Found(shots.count("frame"), shots) if shots else None
+
+
+@SCENE_TESTS.doubtful_above(
+    0.5,
+    "odd and even frames show two different images, as where two captures are interlaced",
+    "write each capture to a file of its own",
+)
+def _interlaced(run: TestedRun) -> Found | None:
+    return run.decided(INTERLACED, "share of the image in which they differ")
+
+
+@SCENE_TESTS.doubtful_above(
+    0.05,
+    "the image jumps back and forth from one frame to the next, as where frames are out of order",
+    "sort the frames by the time at which they were taken",
+)
+def _shuffled(run: TestedRun) -> Found | None:
+    return run.decided(SHUFFLED, "share of the width of a frame, the median of the jumps")
+
+
+@SCENE_TESTS.doubtful_above(
+    10,
+    "the photons contradict the focal length or the lens that the spec gives",
+    "write camera: {focal_px: find}, and distortion: {k1: find} if the lens distorts, or calibrate the camera anew",
+)
+def _given_camera(run: TestedRun) -> Found | None:
+    freed = run.levels[-1].located.solution.freed() if run.levels else None
+    if freed is None:
+        return None
+    what, unit = [("a focal length", " px"), ("k1", "")][freed.number]
+    where = f"{what} of {freed.found:.4g} ± {freed.std:.2g}{unit} fits, {freed.given:.4g}{unit} is given; in expected errors"
+    return Found(abs(freed.found - freed.given) / freed.std, where)
 
 
 @SCENE_TESTS.doubtful_above(

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 
 from photonpano.motion.loop import LevelResult
-from photonpano.residuals.capture_tests import CAPTURE_TESTS
 from photonpano.residuals.motion_tests import MOTION_TESTS
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.residual_tests import RESIDUAL_TESTS
@@ -20,7 +19,7 @@ from photonpano.residuals.tested_run import TestedRun
 from photonpano.values import Decision, Verdict
 from photonpano.values.verdict import Test, judged
 
-TESTS: tuple[Test[TestedRun], ...] = (*CAPTURE_TESTS, *SCENE_TESTS, *RESIDUAL_TESTS, *MOTION_TESTS)  # the most telling first
+TESTS: tuple[Test[TestedRun], ...] = (*SCENE_TESTS, *RESIDUAL_TESTS, *MOTION_TESTS)  # the most telling first
 
 
 def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:

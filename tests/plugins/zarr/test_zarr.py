@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError, SourceContext, StreamInfo, Url, discover
-from photonpano_zarr import writing
+from photonpano_zarr import source as zarr_source
 from photonpano_zarr.configs import ZarrConfig
 
 ZARR = discover().find("source", "zarr").contribution
@@ -24,7 +24,7 @@ def opened(path: Path, **keys: Any) -> Any:
 @pytest.fixture
 def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Write an array in chunks of ten frames."""
-    monkeypatch.setattr(writing, "_CHUNK_BYTES", 10 * 6 * 3)
+    monkeypatch.setattr(zarr_source, "_CHUNK_BYTES", 10 * 6 * 3)
 
     def written(compressed: bool = False, blocks: tuple[int, ...] = (7, 30)) -> Path:
         if compressed:

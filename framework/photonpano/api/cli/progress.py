@@ -1,4 +1,4 @@
-"""Show the progress of a command: bars on a terminal, and a line every ten seconds elsewhere."""
+"""Show the progress of a command, bars on a terminal and a line every ten seconds elsewhere, and what its stages take."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ import os
 import sys
 import threading
 import time
+from collections import Counter
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from photonpano.api.cli.costs import StageCosts
-from photonpano.api.cli.verbosity import is_logged, is_quiet, is_verbose, log_shown, logger
+import numpy as np
+
+from photonpano.api.cli.verbosity import STARTED_S, is_logged, is_quiet, is_verbose, log_shown, logger
 from photonpano.execution.context import Progress, Quiet
-from photonpano.text import count, duration
+from photonpano.text import columns, count, duration, share
+from photonpano.values import FloatArray
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -25,6 +29,8 @@ INTERVAL_S = 10.0  # time between two lines of progress
 _LEAST_S = 1.0  # minimum age of a stage that is printed
 _TOLD_FROM = 0.05  # share of a stage that is done before the time left is told
 _IN_NOTEBOOK = "JPY_PARENT_PID"  # set in notebooks, whose terminal prints control characters
+_READ = "rchar: "  # of the process so far, from files and caches, by the count of Linux
+START, OTHER, WHOLE = "start", "other", "whole"
 
 
 def progress_for_stderr(*, notes: bool = False) -> Progress:
@@ -173,3 +179,50 @@ def _bar(console: Console, unit: str) -> RichProgress:
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         console=console,
     )
+
+
+class StageCosts:
+    """Adds up the costs of stages by their titles; the start is what comes before the first of them."""
+
+    def __init__(self) -> None:
+        self._spent: dict[str, FloatArray] = {}
+        self._times: Counter[str] = Counter()
+
+    @contextmanager
+    def __call__(self, title: str) -> Iterator[None]:
+        """Add the cost of the block to a stage."""
+        before = _spent()
+        self._spent.setdefault(START, before)
+        try:
+            yield
+        finally:
+            self._spent[title] = self._spent.get(title, 0.0) + _spent() - before
+            self._times[title] += 1
+
+    def table(self) -> str:
+        """Return a table of the stages; empty for a single one, whose line says all."""
+        if len(self._times) < 2:
+            return ""
+        whole = _spent()
+        other = whole - np.sum(list(self._spent.values()), axis=0)
+        rows = [["stage", "seconds", "CPU seconds", "GB read", "share"]]
+        for title, (seconds, cpu_s, read) in {**self._spent, OTHER: other, WHOLE: whole}.items():
+            times = f" ({count(self._times[title])} times)" if self._times[title] > 1 else ""
+            gigabytes = "\N{EN DASH}" if np.isnan(read) else f"{read / 1e9:.2f}"
+            rows.append(
+                [f"{title}{times}", f"{seconds:7.2f}", f"{cpu_s:11.2f}", f"{gigabytes:>7}", f"{share(seconds / whole[0]):>5}"]
+            )
+        return columns(rows)
+
+
+def _spent() -> FloatArray:
+    """Return what the process has spent so far: seconds, CPU seconds, and bytes read, NaN where the system does not count."""
+    return np.array([time.perf_counter() - STARTED_S, time.process_time(), _bytes_read()])
+
+
+def _bytes_read() -> float:
+    try:
+        lines = Path("/proc/self/io").read_text(encoding="ascii").splitlines()
+    except OSError:  # not Linux, or not allowed
+        return np.nan
+    return next((float(line.removeprefix(_READ)) for line in lines if line.startswith(_READ)), np.nan)
