@@ -8,16 +8,7 @@ from pathlib import Path
 
 import typer
 
-from photonpano.api.command import (
-    CHANGES,
-    SPEC,
-    WrongArgumentError,
-    command,
-    logger,
-    require_trust,
-    verdict_lines,
-    warn,
-)
+from photonpano.api.command import CHANGES, SPEC, WrongArgumentError, command, logger, require_trust, verdict_lines, warn
 from photonpano.execution.context import Progress
 from photonpano.motion.gyroscope import GYROSCOPE
 from photonpano.motion.timeline import CUT, DARK_FRAMES, DARK_JUMP, REPEATED, SHOTS

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from photonpano.geometry import Canvas
+from photonpano.geometry import PROJECTIONS, Canvas
 from photonpano.photometry import linear_to_srgb
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
 
@@ -149,9 +149,8 @@ def _scene_points(canvas: Canvas, alignment: Homography, around: FloatArray | No
         depth = on_plane[..., 2:]
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(on_plane[..., :2] / (depth if canvas.planar else np.where(depth > 0, depth, np.nan)))
-    x, y, z = np.moveaxis(on_plane @ np.linalg.inv(around).T, -1, 0)
     height, width = scene_shape[:2]
-    angles = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
+    angles = PROJECTIONS["spherical"].points(on_plane @ np.linalg.inv(around).T)
     return np.asarray(angles * (width / (2 * np.pi)) + [(width - 1) / 2, (height - 1) / 2])
 
 

@@ -197,11 +197,6 @@ def read_tiff(path: Path) -> FluxImage:
 def _read_archive(path: Path, content: str, required: tuple[str, ...], optional: tuple[str, ...]) -> Mapping[str, NDArray[Any]]:
     """Read named arrays; a pickle is never loaded."""
     arrays = read_arrays(path, content)
-    if "camera_from_world" in arrays and "homographies" not in arrays:
-        raise InputError(
-            f"{path} is the truth of a camera that travelled through a scene with depth, where no homography maps a frame to "
-            "the scene: evaluate compares homographies and rotations; photonpano_simulator.travel.truth tells what frames saw"
-        )
     missing = [name for name in required if name not in arrays]
     if missing:
         held = ", ".join(name or "an array without a name" for name in arrays) or "nothing"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -25,13 +26,8 @@ from photonpano.notebooks import facts
 from photonpano.record.contents import require_one_run
 from photonpano.values import Panorama
 
-
-class Renderer(Protocol):
-    """Renders the capture of a run along another motion, with the settings of the run."""
-
-    def __call__(self, trajectory: Trajectory, canvas: Canvas) -> Panorama:
-        """Return flux and weight on the canvas."""
-        ...
+# Renders the capture of a run along another motion on a canvas, with the settings of the run.
+Render: TypeAlias = "Callable[[Trajectory, Canvas], Panorama]"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +85,7 @@ class Evaluation:
         return facts(self.rows())
 
 
-def evaluate(run_folder: Path | str, truth_path: Path | str, render: Renderer | None = None) -> Evaluation:
+def evaluate(run_folder: Path | str, truth_path: Path | str, render: Render | None = None) -> Evaluation:
     """Score a run against the truth of its capture.
 
     Args:

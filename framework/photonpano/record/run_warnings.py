@@ -19,7 +19,6 @@ from photonpano.values import FrameSpan, PoseEstimate, true_spans
 UNCERTAIN_PX = 0.5
 SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst first
 
-DOUBTFUL = "doubtful: "  # begins the warnings that are doubts
 TIME_LIMIT = "time_limit"  # name of the decision on what was left out
 _MANY_COPIES = 0.25  # share of the frames from which a warning names them
 _SHOWN_LOST = 3  # spans of lost frames that a warning names
