@@ -26,6 +26,7 @@ from photonpano import (
     Source,
     StageContext,
     VirtualExposure,
+    capture_of,
 )
 from photonpano.geometry import Camera, camera_matrix, positions_of
 from photonpano.locating import blur_against_noise, stabilised_8_bit
@@ -324,10 +325,10 @@ def parallax(piece: Piece) -> FloatArray:
 
 def _exposure(source: Source, span: FrameSpan) -> VirtualExposure:
     """Average the frames of a span."""
-    frames = len(span)
+    frames, valid = len(span), capture_of(source).masked_in(span).valid
     flux = source.response.flux(lit_counts(source, span) / np.float32(frames), float(frames))
-    weight = np.where(source.valid, frames, 0).astype(np.float32)
-    flux = np.where(source.valid, flux, np.nan).astype(np.float32)
+    weight = np.where(valid, frames, 0).astype(np.float32)
+    flux = np.where(valid, flux, np.nan).astype(np.float32)
     return VirtualExposure(flux, weight, Group(span, span.centre), 1.0, source.response)
 
 

@@ -14,6 +14,7 @@ import typer
 from rich.filesize import decimal
 
 from photonpano.api.command import command, warn
+from photonpano.capture import capture_of
 from photonpano.capture.writing import truth_path, write_folder, write_packed
 from photonpano.contracts.protocols import KnowsTruth, Source
 from photonpano.errors import OutputError
@@ -40,7 +41,7 @@ class WrittenCapture:
         path: the file or folder.
         truth: the file beside it with the true motion and scene, if the source knows them.
         info: the size and rate of the capture.
-        n_masked: how many pixels the source masks; the file holds no mask.
+        n_masked: how many pixels are masked, in all frames or in some; the file holds no mask.
         source: the section of a spec that reads the file.
         sharp: the folder with pictures of frames without noise, if they were asked for.
     """
@@ -170,7 +171,8 @@ def write_capture(
     compressed: bool = False,
 ) -> WrittenCapture:
     """Write the frames of a source to a packed file, or with the source that writes such folders."""
-    info, n_masked, threads = source.info, int((~source.valid).sum()), thread_count(plan.run.threads)
+    info, threads = source.info, thread_count(plan.run.threads)
+    n_masked = int((~capture_of(source).masked_in(info.span).valid).sum())
     with usual(progress).stage(f"writing {output.name}", info.n_frames, "frames") as advance:
         if writer is not None and (write := writer.write) is not None:
             folder, *truth = write_folder(source, output, partial(write, compressed=compressed), advance, threads)

@@ -1,7 +1,7 @@
 """One record of a capture as a run sees it: what its source gives, and what was found about it."""
 
 from photonpano.capture.capture import Capture, Colours, before, capture_of, in_light, leaving_out, part_of, seen_through
-from photonpano.capture.pixels import MISSING, Gather, Index, LinearCorrection, numbered
+from photonpano.capture.pixels import MISSING, Gather, Index, LinearCorrection, MaskedSpan, numbered
 from photonpano.capture.plugin_source import PluginSource
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "Gather",
     "Index",
     "LinearCorrection",
+    "MaskedSpan",
     "PluginSource",
     "before",
     "capture_of",

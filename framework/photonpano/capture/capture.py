@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.capture.pixels import Gather
+from photonpano.capture.pixels import Gather, MaskedSpan
 from photonpano.capture.plugin_source import PluginSource
 from photonpano.contracts.protocols import Closing
 from photonpano.photometry import MAX_FRAMES, packed_counts
@@ -46,7 +47,8 @@ class Capture(Closing):
     Attributes:
         source: the source as its plugin gives it.
         info: frames, size, rate; of the frames as they are seen here.
-        valid: (H, W) mask, False for pixels that must not be used.
+        valid: (H, W) mask, False for pixels that must not be used in any frame.
+        masks: more of them, each for some frames.
         first: the frame of the source that is frame 0 here.
         gather: rearranges the pixels of frames; None for frames as they are read.
         steps: take everything but the flux out of sums of frames, one after the other.
@@ -64,6 +66,7 @@ class Capture(Closing):
     source: PluginSource
     info: StreamInfo
     valid: BoolArray
+    masks: tuple[MaskedSpan, ...] = ()
     first: int = 0
     gather: Gather | None = None
     steps: tuple[Callable[[Any, int], FluxImage], ...] = ()
@@ -154,10 +157,28 @@ class Capture(Closing):
         first = np.flatnonzero(~self.copies[span.start + 1 : span.stop]) + 1
         return float((np.diff([0, *first, len(span)]) ** 2).sum() / len(span))
 
-    def masking_movers(self, span: FrameSpan) -> Capture:
-        """Return the capture with a mask of the pixels in which something hides the background at any time of a span."""
+    def shown_pixels(self, span: FrameSpan) -> NDArray[np.uint8] | None:
+        """Return which pixels count in a span, beside `valid`: (H, W), 1, others 0; None if all do.
+
+        Others are those in which something hides the background, or that a mask leaves out, at any time of the span.
+        """
         shown = None if self.background is None else self.background.pixels(span)
-        return self if shown is None else replace(self, valid=self.valid & (shown > 0), background=None)
+        start, stop = self.first + span.start, self.first + span.stop
+        for mask in self.masks:
+            if mask.span.start < stop and start < mask.span.stop:
+                shown = mask.valid.view(np.uint8) if shown is None else shown & mask.valid
+        return shown
+
+    def masked_in(self, span: FrameSpan) -> Capture:
+        """Return the capture with one mask for a span: of all pixels that do not count at any time of it."""
+        shown = self.shown_pixels(span)
+        return self if shown is None else replace(self, valid=self.valid & (shown > 0), masks=(), background=None)
+
+    def pieces(self, span: FrameSpan) -> list[FrameSpan]:
+        """Divide a span where a mask of some frames begins or ends."""
+        ends = {end - self.first for mask in self.masks for end in (mask.span.start, mask.span.stop)}
+        inside = sorted(end for end in ends if span.start < end < span.stop)
+        return [FrameSpan(*ends) for ends in pairwise([span.start, *inside, span.stop])]
 
     def weights(self) -> FluxImage:
         """Return the statistical weight of a frame of each pixel: (H, W) float32, 1 for an ordinary pixel."""
@@ -167,7 +188,7 @@ class Capture(Closing):
         """Return a capture for each colour, see `Colours`; none for a grey capture."""
         parts = {} if self.colour is None else self.colour.parts
         seen = {"info": self.info, "first": self.first, "light": self.light, "camera": self.camera}
-        seen |= {"background": self.background, "copies": self.copies}
+        seen |= {"masks": self.masks, "background": self.background, "copies": self.copies}
         return {name: replace(part, **seen) for name, part in parts.items()}  # type: ignore[arg-type]  # mixed values
 
     def clear_mix(self) -> FloatArray:

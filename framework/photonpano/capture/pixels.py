@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.values import Counts, FluxImage
+from photonpano.values import BoolArray, Counts, FluxImage, FrameSpan
 
 Index: TypeAlias = NDArray[np.intp]
 MISSING = -1  # the index of a pixel that the sensor does not have
@@ -17,6 +17,14 @@ MISSING = -1  # the index of a pixel that the sensor does not have
 def numbered(shape: tuple[int, ...]) -> Index:
     """Number the pixels of a frame along its rows, from 0: (H, W) intp."""
     return np.arange(np.prod(shape), dtype=np.intp).reshape(shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaskedSpan:
+    """Pixels that must not be used in some frames, such as those that a hand hides for a second."""
+
+    span: FrameSpan  # frames of the source
+    valid: BoolArray  # (H, W) mask, False for these pixels
 
 
 class Gather:

@@ -31,6 +31,7 @@ __all__ = [
     "DarkFrames",
     "FlatField",
     "HotPixels",
+    "Mask",
     "Vignette",
     "corrected_source",
     "divided_by",

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from photonpano.capture import MISSING, Capture, Gather, Index, LinearCorrection, capture_of, numbered
+from photonpano.capture import MISSING, Capture, Gather, Index, LinearCorrection, MaskedSpan, capture_of, numbered
 from photonpano.contracts.protocols import Source
 from photonpano.corrections.colour_filter import ColourFilter, with_colours
 from photonpano.corrections.dark import DarkCounts
@@ -46,7 +46,7 @@ def corrected_source(
         step = _linear(pixels, valid, capture.info.kind == "binary")
         corrected = replace(corrected, steps=(step,))
     valid.flags.writeable = False
-    corrected = replace(corrected, valid=valid, decisions=tuple(decisions))
+    corrected = replace(corrected, valid=valid, masks=_masks(pixels), decisions=tuple(decisions))
     if capture.colour is not None:
         parts = {
             name: replace(_rearranged(part, pixels.index), valid=valid, steps=corrected.steps)
@@ -65,7 +65,7 @@ def _applied(
     blame: Callable[[int, str], Exception] | None,
 ) -> Pixels:
     """Apply corrections to the pixels of a capture, one after the other; for `decide`, see `Correction.applied`."""
-    pixels = Pixels.as_read(capture.valid)
+    pixels = Pixels.as_read(capture)
     for place, correction in enumerate(corrections):
         try:
             if capture.corrects_sums:
@@ -73,8 +73,7 @@ def _applied(
             if capture.colour is not None and isinstance(correction, ColourFilter | DarkCounts):
                 raise InputError(f"{correction.name} is for one channel, and this capture has three; leave it out")
             pixels = correction.applied(pixels, capture, decide)
-            if not pixels.valid.any():
-                raise InputError(f"{correction.name} leaves no pixel that may be used")
+            pixels.require_some(correction.name)
         except InputError as error:
             if blame is None:
                 raise
@@ -93,6 +92,16 @@ def _rearranged(capture: Capture, index: Index) -> Capture:
         before = capture.gather.index.ravel()[index]
         gather = Gather(np.where(index == MISSING, MISSING, before), capture.source.info.frame_shape)
     return replace(capture, info=info, gather=gather, weight=weight, camera=None, colour=None)
+
+
+def _masks(pixels: Pixels) -> tuple[MaskedSpan, ...]:
+    """Return the masks of some frames; a pixel that is interpolated from a masked one is masked, too."""
+    if not pixels.masks or not pixels.interpolated.any():
+        return pixels.masks
+    from scipy.ndimage import minimum_filter
+
+    usable = (np.where(pixels.interpolated, minimum_filter(each.valid, 3), each.valid) for each in pixels.masks)
+    return tuple(replace(each, valid=valid) for each, valid in zip(pixels.masks, usable, strict=True))
 
 
 def _linear(pixels: Pixels, valid: BoolArray, binary: bool) -> LinearCorrection:

@@ -178,7 +178,7 @@ class _Seen:
 
     @classmethod
     def of(cls, capture: Capture, span: FrameSpan, trajectory: Trajectory) -> _Seen:
-        valid = capture.masking_movers(span).valid
+        valid = capture.masked_in(span).valid
         counts = capture.corrected_counts(span) * valid
         photons, area = (sums_of_blocks(np.asarray(each, float), _CELL_PX) for each in (counts, valid))
         seen = (area == _CELL_PX**2) & (photons > 0)

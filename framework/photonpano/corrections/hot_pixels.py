@@ -11,9 +11,10 @@ from pydantic import Field
 from photonpano.corrections.dark import DARK_FILE, read_dark
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
-from photonpano.plugins.contributions import SpecPath
+from photonpano.plugins.contributions import FrameRange, SpecPath
 from photonpano.reading import look_first, read_array, read_picture
 from photonpano.robust import robust_std
+from photonpano.values import FrameSpan
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -160,12 +161,17 @@ def _picked(around: FluxImage, known: NDArray[np.intp], place: NDArray[Any]) -> 
 
 
 class Mask(Correction):
-    """Masks the pixels that a file marks as bad; the motion fills them."""
+    """Masks the pixels that a file marks as bad, in all frames or in some; the motion fills them."""
 
     name: ClassVar[str] = "mask"
     file: SpecPath = Field(
         description="a bool .npy file, true for bad pixels, or a .png picture in which bad pixels are not black; of "
         "the size of the frames at this place of the list"
+    )
+    frames: FrameRange | None = Field(
+        None,
+        description="the frames in which they are bad, [start, stop]: frames start to stop - 1 of the recording, whatever part "
+        "of it is read; all by default",
     )
 
     def applied(self, pixels: Pixels, capture: Capture, decide: Decide | None) -> Pixels:
@@ -173,7 +179,7 @@ class Mask(Correction):
         del capture, decide
         bad = _read_mask(self.file)
         pixels.require(bad.shape, self.file)
-        return pixels.without(bad)
+        return pixels.without(bad, self.frames and FrameSpan(*self.frames))
 
 
 def _read_mask(path: Path) -> BoolArray:

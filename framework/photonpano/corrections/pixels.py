@@ -10,10 +10,10 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.capture import MISSING, Capture, Index, numbered
+from photonpano.capture import MISSING, Capture, Index, MaskedSpan, numbered
 from photonpano.errors import InputError
 from photonpano.plugins.contributions import Config
-from photonpano.values import BoolArray, FluxImage
+from photonpano.values import BoolArray, FluxImage, FrameSpan
 
 Decide: TypeAlias = Callable[[str, float, str], None]  # records a decision: what was chosen, its value, and the reason
 
@@ -28,12 +28,14 @@ class Pixels:
     dark_rates: FluxImage  # float32, dark counts per frame to subtract: photons of binary frames, grey values of others
     # int8, the place in `COLOURS` of the colour that each pixel sees; -1 where all pixels are treated alike
     colour: NDArray[np.int8]
+    masks: tuple[MaskedSpan, ...] = ()  # more pixels that must not be used, each in some frames
 
     @classmethod
-    def as_read(cls, valid: BoolArray) -> Pixels:
+    def as_read(cls, capture: Capture) -> Pixels:
         """Return the pixels of a source without corrections."""
-        nothing = np.zeros(valid.shape, np.bool_)
-        return cls(numbered(valid.shape), valid, nothing, np.zeros(valid.shape, np.float32), np.full(valid.shape, -1, np.int8))
+        shape, valid = capture.valid.shape, capture.valid
+        nothing, dark, colour = np.zeros(shape, np.bool_), np.zeros(shape, np.float32), np.full(shape, -1, np.int8)
+        return cls(numbered(shape), valid, nothing, dark, colour, capture.masks)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -50,15 +52,28 @@ class Pixels:
             self.interpolated.ravel()[order] & ~missing,
             np.where(missing, np.float32(0), self.dark_rates.ravel()[order]),
             np.where(missing, np.int8(-1), self.colour.ravel()[order]),
+            tuple(MaskedSpan(each.span, each.valid.ravel()[order]) for each in self.masks),
         )
 
     def alike(self) -> list[BoolArray]:
         """Return masks of the pixels that may be compared with each other, since they see one colour: (H, W) each."""
         return [self.colour == each for each in np.unique(self.colour)]
 
-    def without(self, bad: BoolArray) -> Pixels:
-        """Return the pixels with more of them masked."""
+    def without(self, bad: BoolArray, span: FrameSpan | None = None) -> Pixels:
+        """Return the pixels with more of them masked, in all frames or in those of a span of the source."""
+        if span is not None:
+            return replace(self, masks=(*self.masks, MaskedSpan(span, ~bad)))
         return replace(self, valid=self.valid & ~bad)
+
+    def require_some(self, name: str) -> None:
+        """Raise an `InputError` if no pixel is left in all frames, or in some, after the correction of this name."""
+        if not self.valid.any():
+            raise InputError(f"{name} leaves no pixel that may be used")
+        for start in (mask.span.start for mask in self.masks):
+            masks = [each for each in self.masks if each.span.start <= start < each.span.stop]
+            if not np.logical_and.reduce([self.valid, *(each.valid for each in masks)]).any():
+                span = FrameSpan(start, min(each.span.stop for each in masks))
+                raise InputError(f"{name} leaves no pixel that may be used in {span}; mask less of them, or read other frames")
 
     def require(self, shape: tuple[int, ...], what: object) -> None:
         """Raise an `InputError` for a file whose size differs from that of frames after the corrections so far."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.capture import Capture, capture_of
+from photonpano.capture import Capture, before, capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.execution.threads import InOrder
 from photonpano.geometry import Canvas
@@ -172,7 +172,7 @@ def _sum_on(
         masked = masked.astype(np.uint8)  # sums in bytes stay in bytes
     grid, seen_by = Grid.zeros(canvas, 1 if terms is None else terms.number), _Seen(source.info.frame_shape, masked)
     for chunk, footprint in visible:
-        shown = None if source.background is None else source.background.pixels(chunk.span)
+        shown = source.shown_pixels(chunk.span)
         weight = masked if shown is None else shown if masked is None else masked * shown
         amounts = np.array([float(len(chunk.span))]) if terms is None else terms.amounts(chunk.span)
         raw = counts_of(chunk.span)
@@ -231,12 +231,18 @@ def binning_of(source: Source) -> int:
 
 def binned_mean(source: Source, span: FrameSpan) -> FluxImage:
     """Return the mean count per frame of a span in binned pixels; NaN where no pixel is valid."""
+    capture = before(source, None)
+    if len(pieces := capture.pieces(span)) > 1:
+        means = np.array([binned_mean(source, each) for each in pieces])
+        frames = np.isfinite(means) * np.array([len(each) for each in pieces], np.float32)[:, None, None]
+        n_frames = frames.sum(axis=0)
+        mean = (np.nan_to_num(means) * frames).sum(axis=0) / np.maximum(n_frames, 1)
+        return np.where(n_frames > 0, mean, np.float32(np.nan))
     binning = binning_of(source)
     height, width = (side // binning * binning for side in source.info.frame_shape)
     size = (width // binning, height // binning)
-    capture = capture_of(source)
     counts = np.asarray(capture.corrected(capture.chunk(span), len(span)), np.float32)[:height, :width]
-    weights = weights_of(capture)
+    weights = weights_of(capture.masked_in(span))
     if weights is None:
         return np.asarray(cv2.resize(counts, size, interpolation=cv2.INTER_AREA) / np.float32(len(span)), np.float32)
     valid = weights[:height, :width]

@@ -40,8 +40,10 @@ class MergeRenderer:
         advance: Callable[[int], None],
     ) -> Panorama:
         """Merge the frames of a span on a canvas: see `Renderer`."""
-        background = capture_of(source).background
-        cuts = () if background is None else background.instants
+        capture = capture_of(source)
+        cuts = [each.start for each in capture.pieces(span)]
+        if capture.background is not None:
+            cuts += capture.background.instants.tolist()
         chunks = chunks_of(span, trajectory, source.info.frame_shape, tolerance_px, cuts)
         photons = accumulate(source, chunks, canvas, canvas.shape, advance, self._in_order)
         flux, weight = photons.estimate(source.response)

@@ -147,7 +147,7 @@ class VirtualExposures:
             PluginError: the merger failed, or returned anything but an exposure of the group at the level's scale.
         """
         level, group = self.level, self.groups[index]
-        source = self.source if level.handles_movers else capture_of(self.source).masking_movers(group.span)
+        source = self.source if level.handles_movers else capture_of(self.source).masked_in(group.span)
         with (clock or self.clock)("merge"), level.attributing("merger"):
             exposure = level.merger.merge(source, group, self.previous or self.start, level.scale)
             return EXPOSURE.require(exposure, Asked(group, level.scale, self.frame_shape))

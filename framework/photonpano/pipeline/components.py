@@ -14,7 +14,7 @@ from photonpano.capture import Capture, capture_of, part_of
 from photonpano.contracts.loop import require_groups
 from photonpano.contracts.protocols import PoseEstimator, Resampler, Source, light_of
 from photonpano.contracts.rules import attributing, shown
-from photonpano.corrections import corrected_source, without_still_pixels
+from photonpano.corrections import Mask, corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.execution.interrupts import is_interrupt
 from photonpano.execution.threads import in_order, thread_count
@@ -73,7 +73,11 @@ def build_source(plan: Plan, look: bool = True) -> Capture:
     """
     try:
         opened = built(plan.source, SourceContext(plan.run.seed, thread_count(plan.run.threads)))
-        capture = _part(plan, capture_of(opened, plan.source.label))
+        whole = capture_of(opened, plan.source.label)
+        for index, each in enumerate(plan.corrections):
+            if isinstance(each, Mask):
+                _require_frames(plan, whole, f"corrections.{index}.mask.frames", each.frames)
+        capture = _part(plan, whole)
     except InputError as error:
         found = next((decision for decision in plan.decisions if decision.what == "source"), None)
         if found is None:
@@ -104,12 +108,17 @@ def _part(plan: Plan, capture: Capture) -> Capture:
     config = plan.source.config
     if not isinstance(config, PartOfCapture) or config.frames is None:
         return capture
-    (start, stop), n_frames = config.frames, capture.info.n_frames
-    if stop > n_frames:
+    _require_frames(plan, capture, "source.with.frames", config.frames)
+    return part_of(capture, FrameSpan(*config.frames))
+
+
+def _require_frames(plan: Plan, capture: Capture, where: str, frames: tuple[int, int] | None) -> None:
+    """Raise `SpecError` if a key names frames that a capture does not have; the capture is closed then."""
+    n_frames = capture.info.n_frames
+    if frames is not None and frames[1] > n_frames:
         capture.close()
-        message = f"the capture has {n_frames} frames: expected [start, stop] with stop up to {n_frames}, got [{start}, {stop}]"
-        raise SpecError([plan.place("source.with.frames").problem(message)])
-    return part_of(capture, FrameSpan(start, stop))
+        message = f"the capture has {n_frames} frames: expected [start, stop] with stop up to {n_frames}, got {list(frames)}"
+        raise SpecError([plan.place(where).problem(message)])
 
 
 def build_levels(plan: Plan, source: Source, decisions: list[Decision], shortened: int = 1) -> tuple[Level, ...]:

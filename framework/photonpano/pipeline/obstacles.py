@@ -116,9 +116,10 @@ def _repetition_within(source: Source, span: FrameSpan) -> float | None:
 
 def _sum(source: Source, span: FrameSpan) -> NDArray[Any]:
     """Sum the frames of a span; colours are made alike, and blurred, so that their filter array is not seen."""
-    capture, weights = capture_of(source), weights_of(source)
+    capture = capture_of(source).masked_in(span)
+    weights = weights_of(capture)
     if capture.colour is None or weights is None:
-        return np.where(source.valid, source.counts(span), 0)
+        return np.where(capture.valid, capture.counts(span), 0)
     lit, near = (
         ndimage.gaussian_filter(image, _FILTER_BLUR_PX) for image in (capture.corrected_counts(span) * weights, weights)
     )
@@ -202,8 +203,9 @@ def _compared(capture: Capture, span: FrameSpan) -> tuple[BoolArray, NDArray[np.
         same[index] = np.array_equal(frames[index], frames[index + 1])
     if not capture.is_packed:
         return np.asarray(same), np.zeros(len(span), np.int64)
-    usable = np.packbits(capture.valid[::_ROW_STRIDE], axis=-1)
-    return np.asarray(same), np.bitwise_count(some & usable).sum(axis=(1, 2), dtype=np.int64)
+    usable, always = (each.valid[::_ROW_STRIDE] for each in (capture.masked_in(span), capture))
+    lit = np.bitwise_count(some & np.packbits(usable, axis=-1)).sum(axis=(1, 2), dtype=np.int64)
+    return np.asarray(same), lit if usable is always else lit * always.sum() // max(int(usable.sum()), 1)
 
 
 def _frames(capture: Capture, span: FrameSpan) -> NDArray[np.integer]:

@@ -51,6 +51,8 @@ def fingerprint(plan: Plan, source: Source) -> CaptureRecord:
     """Return the fingerprint of the open capture of a plan, which names its files."""
     suffixes = tuple(plan.source.contribution.suffixes)  # type: ignore[attr-defined]  # those of a source
     capture, pixels = capture_of(source), hashlib.sha256(np.packbits(source.valid).data)
+    for mask in capture.masks:
+        pixels.update(f"{mask.span} {np.packbits(mask.valid).tobytes()!r}".encode())
     if capture.corrects_sums:
         (first, *_) = source.info.spread(_PLACES, _FRAMES)
         pixels.update(np.ascontiguousarray(capture.corrected_counts(first)).data)

@@ -276,9 +276,9 @@ class _Colour:
         return cls(capture, prediction, masked, corrected, dark, np.maximum(dark, 0), slope)
 
     def counted(self, raw: Counts, span: FrameSpan) -> NDArray[np.float32] | NDArray[np.uint8]:
-        """Return the counts of a span, corrected, NaN where masked, or where something hides the background: (H, W)."""
+        """Return the counts of a span, corrected, NaN where masked or where something hides the background: (H, W)."""
         counts: Any = raw if self.corrected is None else self.corrected(raw, len(span))
-        if self.capture.background is not None and (shown := self.capture.background.pixels(span)) is not None:
+        if (shown := self.capture.shown_pixels(span)) is not None:
             counts = np.where(shown, counts, np.float32(np.nan))
         if counts.dtype != np.uint8:
             counts = np.ascontiguousarray(counts, np.float32)

@@ -44,10 +44,11 @@ def merge_through_depth(source: Source, group: Group, path: Path, inverse_depth:
     """
     pose = path.at([group.reference])[0]
     counts, weight = np.zeros((2, *source.info.frame_shape), np.float32)
-    valid, lens = source.valid.astype(np.float32), lens_of(camera, source.info.frame_shape)
+    lens = lens_of(camera, source.info.frame_shape)
     plane = _Plane(path, pose, float(np.median(inverse_depth)), camera)
     for chunk in chunks_of(group.span, plane, source.info.frame_shape, _CHUNK_PX):
         turn, shift = between(pose, path.at([chunk.span.centre])[0], camera.matrix)
+        valid = capture_of(source).masked_in(chunk.span).valid.astype(np.float32)
         frames = lit_counts(source, chunk.span) * valid
         _add(frames, valid * np.float32(len(chunk.span)), inverse_depth, lens, turn, shift, counts, weight)
     flux, seen = PhotonSum(counts, weight).estimate(source.response)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from photonpano import FloatArray, FrameSpan, Source
+from photonpano import FloatArray, FrameSpan, Source, capture_of
 from photonpano.compiling import compiled
 from photonpano.filtering import exceeding_noise
 from photonpano.geometry import Camera
@@ -163,7 +163,7 @@ def _measured(
     source: Source, span: FrameSpan, turn: FloatArray, shift: FloatArray, posed: PosedExposure, predicted: _Prediction
 ) -> _Equations:
     """Return the motion of the camera in a span, beyond that along which its group was merged."""
-    valid = source.valid.astype(np.float32)
+    valid = capture_of(source).masked_in(span).valid.astype(np.float32)
     sums = np.zeros(_GAIN + 2)
     frames, weight = lit_counts(source, span) * valid, valid * np.float32(len(span))
     _add_residuals(frames, weight, predicted, turn, shift, sums)

@@ -56,7 +56,7 @@ class BurstMerger:
 class _Burst:
     def __init__(self, source: Source, group: Group, config: BurstConfig) -> None:
         self._source, self._group, self._config = source, group, config
-        self._counts = WeightedFrames(source)
+        self._counts = WeightedFrames(source, group)
         weights = self._counts.weights
         self._weights = weights if weights.size else np.ones(source.info.frame_shape, np.float32)
         self._spans, self._reference = parts_of(group, round(len(group.span) / config.block_frames))

@@ -87,7 +87,7 @@ class LocalFlowMerger:
         inside = enlarged(where, total.counts.shape, scale)
         counts, weight = (np.where(inside, np.float32(0), each) for each in (total.counts, total.weight))
         sums = Sums(counts, weight, np.zeros_like(weight))
-        frames, cells = WeightedFrames(source), (SCALE / scale, box[0].start, box[1].start)
+        frames, cells = WeightedFrames(source, group), (SCALE / scale, box[0].start, box[1].start)
         for span, trust in zip(parts.spans, best.trusts, strict=True):
             for chunk, motion in parts.moving(clipped(chunks, span, trajectory), best.field, fastest_px, tolerance_px):
                 to_image = inverse(onto @ chunk.homography)

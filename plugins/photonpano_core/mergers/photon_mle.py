@@ -51,7 +51,8 @@ class PhotonMleMerger:
             shared = self._shared
             if shared is None or shared.source is not source or shared.trajectory is not trajectory:
                 tolerance_px = self._config.tolerance_px
-                chunks = chunks_of(source.info.span, trajectory, source.info.frame_shape, tolerance_px)
+                cuts = [each.start for each in capture_of(source).pieces(source.info.span)]
+                chunks = chunks_of(source.info.span, trajectory, source.info.frame_shape, tolerance_px, cuts)
                 if self._decide is not None:
                     self._decide(
                         "chunk_frames",
@@ -106,8 +107,8 @@ def to_exposure(group: Group, trajectory: Trajectory, scale: float) -> Homograph
 
 def unwarped_sum(source: Source, group: Group, scale: float) -> PhotonSum:
     """Sum the frames of a group as they are, while no motion is known."""
-    chunk = Chunk(group.span, np.eye(3))
-    return accumulate(source, [chunk], rescaling(scale), exposure_shape(source, scale))
+    chunks = [Chunk(each, np.eye(3)) for each in capture_of(source).pieces(group.span)]
+    return accumulate(source, chunks, rescaling(scale), exposure_shape(source, scale))
 
 
 def exposure_of(photons: PhotonSum, source: Source, group: Group, scale: float) -> VirtualExposure:

@@ -80,9 +80,10 @@ class SuperResolutionRenderer:
         """Render the frames of a span on a canvas: see `Renderer`."""
         # Frames are sorted by where their pixels lie on the canvas.
         tolerance_px = min(tolerance_px, 0.25 / _scale_of(canvas))
-        background = capture_of(source).background
+        capture = capture_of(source)
         every = max(1, len(span) // _MANY_PIECES)
-        cuts = np.arange(span.start, span.stop, every) if background is None else background.instants
+        cuts = np.arange(span.start, span.stop, every) if capture.background is None else capture.background.instants
+        cuts = np.union1d(cuts, [each.start for each in capture.pieces(span)])
         scan = _Scan(source, trajectory, span, chunks_of(span, trajectory, source.info.frame_shape, tolerance_px, cuts))
         if not scan.near(canvas):
             advance(len(span))

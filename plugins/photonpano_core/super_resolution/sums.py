@@ -79,9 +79,8 @@ def sums_on(
 def _summed(capture: Capture, terms: LightTerms | None, chunk: Chunk) -> _Summed:
     """Return the counts of a chunk, (h, w), what a pixel adds to each image of frames and gains, (P,), and which pixels do."""
     amounts = np.array([len(chunk.span)], np.float32) if terms is None else terms.amounts(chunk.span).astype(np.float32)
-    shown = None if capture.background is None else capture.background.pixels(chunk.span)
-    usable = capture.valid if shown is None else capture.valid & (shown > 0)
-    return np.ascontiguousarray(capture.corrected_counts(chunk.span), np.float32), amounts, np.ascontiguousarray(usable)
+    usable = np.ascontiguousarray(capture.masked_in(chunk.span).valid)
+    return np.ascontiguousarray(capture.corrected_counts(chunk.span), np.float32), amounts, usable
 
 
 def _add(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, InputError, Light, Merger, StageContext, Trajectory, discover
+from photonpano import FrameSpan, Group, InputError, Light, Merger, StageContext, Trajectory, capture_of, discover
+from photonpano.capture import MaskedSpan
 from photonpano.corrections.lighting import in_light
 from photonpano.geometry import Camera, translation
 from photonpano.merging import accumulate, chunks_of
@@ -65,6 +67,20 @@ def test_group_of_one_frame_is_that_frame(name: str, motion: Trajectory) -> None
     exposure = built(name).merge(source, Group(FrameSpan(3, 4), 3.0), motion, 1.0)
     np.testing.assert_allclose(exposure.weight, 1, rtol=1e-4)
     np.testing.assert_array_equal(exposure.flux > 0.3, source.frames(FrameSpan(3, 4))[0] > 0)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("name", ["photon-mle", "local-flow"])
+def test_what_a_mask_of_some_frames_leaves_out_is_not_merged(name: str, moves: bool, motion: Trajectory) -> None:
+    clean, bad, hidden = capture(), np.ones((HEIGHT, WIDTH), bool), FrameSpan(10, 60)
+    bad[:, 30:60] = False
+    lit = clean.frames(clean.info.span)
+    lit[hidden.start : hidden.stop, :, 30:60] = 1
+    masked = replace(capture_of(MemorySource(lit)), masks=(MaskedSpan(hidden, bad),))
+    found, expected = (built(name).merge(each, GROUP, motion if moves else None, 1.0) for each in (masked, clean))
+    assert np.nanmean(found.flux[:, 20:70]) == pytest.approx(np.nanmean(expected.flux[:, 20:70]), rel=0.05)
+    assert found.weight[:, 40:50].mean() == pytest.approx(N - len(hidden), abs=3)
+    assert found.weight[:, :20].mean() == pytest.approx(expected.weight[:, :20].mean())
 
 
 @pytest.mark.parametrize("name", ["burst", "local-flow"])

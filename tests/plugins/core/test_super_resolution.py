@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 
-from photonpano import Light, Panorama
+from photonpano import FrameSpan, Light, Panorama, capture_of
+from photonpano.capture import MaskedSpan
 from photonpano.corrections.lighting import in_light
 from photonpano.geometry import Canvas, translation
-from photonpano.merging import MergeRenderer, PhotonSum
+from photonpano.merging import Chunk, MergeRenderer, PhotonSum
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import SuperResolutionConfig
@@ -19,7 +22,7 @@ from photonpano_core.mergers.dense_motion.frames import count_variance, sharpene
 from photonpano_core.super_resolution.collaborative import Patches, filter_groups, find_similar
 from photonpano_core.super_resolution.estimate import Observations, counts_in_light, expected, pixel_area, rounds_of
 from photonpano_core.super_resolution.renderer import SuperResolutionRenderer
-from photonpano_core.super_resolution.sums import add_observations
+from photonpano_core.super_resolution.sums import add_observations, sums_on
 
 SIDE, CHUNKS, FRAMES, FINE = 40, 96, 40, 8
 """Pixels of a side of a frame, its stops, the frames of each, and the samples of the scene along the side of a pixel."""
@@ -184,6 +187,17 @@ def test_add_observations_sorts_pixels_into_the_nearest_cells_and_leaves_masked_
     np.testing.assert_array_equal(lit, wanted)
     assert (seen > 0).sum(axis=(1, 2)).tolist() == [5, 5]
     assert seen.sum(axis=(1, 2)).tolist() == [25, 10]
+
+
+def test_what_a_mask_of_some_frames_leaves_out_is_not_summed() -> None:
+    frames, left = np.ones((40, SIDE, SIDE), np.uint8), np.zeros((SIDE, SIDE), bool)
+    left[:, :10] = True
+    source = replace(capture_of(MemorySource(frames)), masks=(MaskedSpan(FrameSpan(10, 30), ~left),))
+    chunks = [Chunk(each, np.eye(3)) for each in source.pieces(FrameSpan(0, 40))]
+    with ThreadPoolExecutor(1) as pool:
+        sums = sums_on(source, chunks, Canvas(SIDE, SIDE, np.eye(3)), lambda _: None, pool)
+    for image in (sums.lit, sums.seen):
+        np.testing.assert_array_equal(image, np.where(left, 20, 40))
 
 
 def test_likelihood_rises_from_round_to_round_until_the_prior_is_weak() -> None:

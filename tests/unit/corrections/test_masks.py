@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError
+from photonpano.capture import part_of
 from photonpano.corrections import corrected_source
+from photonpano.merging import Chunk, accumulate, binned_mean
 from photonpano.testing import MemorySource
 
 SHAPE = (6, 10)
@@ -71,6 +73,60 @@ def test_wrong_mask_files_are_refused(refused: Callable, tmp_path: Path) -> None
     }
     for name, message in expected.items():
         assert refused({"mask": {"file": name}}) == f"{tmp_path / name} {message}"
+
+
+def test_mask_of_some_frames_follows_rearrangements_and_counts_frames_of_the_recording(
+    source: MemorySource, corrections: Callable, tmp_path: Path
+) -> None:
+    bad = np.zeros(SHAPE, bool)
+    bad[:, :4] = True
+    np.save(tmp_path / "bad.npy", bad)
+    mask = {"mask": {"file": "bad.npy", "frames": [20, 30]}}
+    capture = part_of(
+        corrected_source(part_of(source, FrameSpan(10, 50)), corrections(mask, "rot90", "missing-row")), FrameSpan(5, 40)
+    )
+    with_gap = np.insert(np.rot90(~bad, -1), 5, False, axis=0)
+    assert capture.valid[[4, 6]].all()
+    assert capture.pieces(FrameSpan(0, 35)) == [FrameSpan(0, 5), FrameSpan(5, 15), FrameSpan(15, 35)]
+    for span, shown in [((0, 5), True), ((4, 6), with_gap), ((14, 15), with_gap), ((15, 35), True)]:
+        np.testing.assert_array_equal(capture.masked_in(FrameSpan(*span)).valid, capture.valid & shown)
+
+
+def test_masked_frames_count_in_no_sum(source: MemorySource, corrections: Callable, tmp_path: Path) -> None:
+    bad = np.zeros(SHAPE, bool)
+    bad[2:4] = True
+    np.save(tmp_path / "bad.npy", bad)
+    capture = corrected_source(source, corrections({"mask": {"file": "bad.npy", "frames": [20, 30]}}))
+    summed = accumulate(capture, [Chunk(each, np.eye(3)) for each in capture.pieces(SPAN)], np.eye(3), SHAPE)
+    others = source.counts(FrameSpan(0, 20)) + source.counts(FrameSpan(30, 50))
+    expected = np.where(bad, others, source.counts(SPAN))
+    np.testing.assert_array_equal(summed.weight, np.where(bad, 40, 50))
+    np.testing.assert_array_equal(summed.counts, expected)
+    np.testing.assert_allclose(binned_mean(capture, SPAN), expected / np.where(bad, 40, 50), rtol=1e-6)
+    assert np.isnan(binned_mean(capture, FrameSpan(20, 30))[bad]).all()
+
+
+def test_pixels_interpolated_from_masked_ones_are_masked_in_these_frames(
+    source: MemorySource, corrections: Callable, tmp_path: Path
+) -> None:
+    red, bad = np.zeros((2, *SHAPE), bool)
+    red[2, [3, 7]] = bad[1, 2] = True
+    np.save(tmp_path / "pattern.npy", pattern_of(red))
+    np.save(tmp_path / "bad.npy", bad)
+    filled = {"colour-filter": {"pattern": "pattern.npy", "others": "interpolate"}}
+    capture = corrected_source(source, corrections({"mask": {"file": "bad.npy", "frames": [20, 30]}}, filled))
+    assert np.argwhere(~capture.masked_in(FrameSpan(20, 21)).valid).tolist() == [[1, 2], [2, 3]]
+
+
+def test_masks_that_leave_no_pixel_in_some_frames_are_refused(refused: Callable, tmp_path: Path) -> None:
+    half = np.arange(10) < 5
+    for name, bad in (("left", half), ("right", ~half), ("all", half | True)):
+        np.save(tmp_path / f"{name}.npy", np.broadcast_to(bad, SHAPE))
+    masks = [{"mask": {"file": f"{name}.npy", "frames": span}} for name, span in (("left", [10, 30]), ("right", [20, 40]))]
+    left_over = "mask leaves no pixel that may be used in frames 20 to 29; mask less of them, or read other frames"
+    assert refused(*masks) == refused(*masks[::-1]) == left_over
+    assert refused(masks[0], {"mask": {"file": "right.npy"}}) == left_over.replace("20", "10")
+    assert refused({"mask": {"file": "all.npy"}}) == "mask leaves no pixel that may be used"
 
 
 def pattern_of(red: np.ndarray) -> np.ndarray:

@@ -213,7 +213,7 @@ def spec(*corrections: Any) -> dict[str, Any]:
 def test_correction_paths_are_relative_to_spec(catalog: Catalog, tmp_path: Path) -> None:
     np.save(tmp_path / "bad.npy", np.zeros((2, 2), bool))
     plan = parse_spec(spec({"mask": {"file": "bad.npy"}}), directory=tmp_path, catalog=catalog)
-    assert plan.document["corrections"] == [{"mask": {"file": str(tmp_path / "bad.npy")}}]
+    assert plan.document["corrections"] == [{"mask": {"file": str(tmp_path / "bad.npy"), "frames": None}}]
     assert parse_spec(plan.document, catalog=catalog).corrections == plan.corrections
 
 

@@ -186,8 +186,11 @@ def varying_spans(source: Source, context: Context) -> tuple[Images, Images, int
         raise InputError(
             f"motion.start: frames of {source.info.height}x{source.info.width} px are too small to show a velocity"
         )
-    seen = np.isfinite(means[0]).astype(np.float32)
-    images = np.nan_to_num(means)
+    known, images = np.isfinite(means), np.nan_to_num(means)
+    n_known = known.sum(axis=0)
+    seen = (n_known > 0).astype(np.float32)
+    # What is masked for a time shows neither motion nor edges.
+    images = np.where(known, images, images.sum(axis=0) / np.maximum(n_known, 1).astype(np.float32))
     brightness = images.sum(axis=(1, 2))
     still = np.tensordot(brightness, images, 1) / max(float(brightness @ brightness), 1e-12)
     images -= brightness[:, None, None] * still

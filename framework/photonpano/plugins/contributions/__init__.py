@@ -1,6 +1,7 @@
 """What plugins are made of: the records that offer components, their configs, and what components are told."""
 
 from .configs import Config as Config
+from .configs import FrameRange as FrameRange
 from .configs import SpecLocation as SpecLocation
 from .configs import SpecPath as SpecPath
 from .contexts import ExecutorContext as ExecutorContext

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, GetCoreSchemaHandler, GetPydanticSchema, ValidationInfo
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetPydanticSchema, ValidationInfo
 from pydantic_core import core_schema
 
 from photonpano.files.paths import Location, Url, given_path, location, refusal
@@ -40,6 +40,19 @@ SpecPath = Annotated[Path, AfterValidator(_relative_to_spec)]
 
 Named pipes, devices and sockets are refused: they are not files that can be read twice. So are URLs: see `SpecLocation`.
 """
+
+
+def _in_order(frames: tuple[int, int]) -> tuple[int, int]:
+    if frames[0] >= frames[1]:
+        raise ValueError(f"expected [start, stop] with start < stop, got {list(frames)}")
+    return frames
+
+
+FrameRange = Annotated[
+    tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]],
+    AfterValidator(_in_order),
+]
+"""Frames in a config, [start, stop]: frames start to stop - 1."""
 
 
 def _url_or(value: Any, path: core_schema.ValidatorFunctionWrapHandler) -> Any:

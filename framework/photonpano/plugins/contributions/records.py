@@ -6,11 +6,11 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field
 
 from photonpano.contracts.protocols import (
     Arrived,
@@ -26,7 +26,7 @@ from photonpano.contracts.protocols import (
     Source,
 )
 from photonpano.execution import Executor
-from photonpano.plugins.contributions.configs import Config
+from photonpano.plugins.contributions.configs import Config, FrameRange
 from photonpano.plugins.contributions.contexts import ExecutorContext, SourceContext, StageContext
 from photonpano.plugins.contributions.kinds import KINDS, Kind
 from photonpano.text import install_line
@@ -128,16 +128,9 @@ class Recognised:
 class PartOfCapture(Config):
     """The key of every source that the framework applies: which part of the capture to read."""
 
-    frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = Field(
+    frames: FrameRange | None = Field(
         None, description="the part of the capture to read, [start, stop]: frames start to stop - 1; all by default"
     )
-
-    @field_validator("frames", mode="after")
-    @classmethod
-    def _in_order(cls, frames: tuple[int, int] | None) -> tuple[int, int] | None:
-        if frames is not None and frames[0] >= frames[1]:
-            raise ValueError(f"expected [start, stop] with start < stop, got {list(frames)}")
-        return frames
 
 
 def _not_ours(_: Path) -> None:
@@ -222,8 +215,9 @@ class MergerContribution(StageContribution, kind="merger", section="merge", defa
     Attributes:
         accepts_corrected_sums: whether it merges corrected sums. The framework then divides the sums of frames by
             a vignette that it finds.
-        handles_movers: whether it leaves out by itself what hides `Capture.background`, or merges it sharply. Any other
-            merger gets a capture in which the pixels are masked that something hides at any time of the group.
+        handles_movers: whether it leaves out by itself what `Capture.masks` name, and what hides `Capture.background`, or
+            merges that sharply. Any other merger gets a capture in which the pixels are masked that are to be left out at any
+            time of the group.
     """
 
     build: Callable[[Any, StageContext], Merger]

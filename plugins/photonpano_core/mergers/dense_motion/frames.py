@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
-from photonpano import BoolArray, FrameSpan, Response, Source, capture_of
+from photonpano import BoolArray, FrameSpan, Group, Response, Source, capture_of
 from photonpano.merging import PhotonSum
 from photonpano_core.mergers.dense_motion.field import Image
 
@@ -15,16 +17,19 @@ _WINDOW_PX = 1.5  # standard deviation of the window over which the Laplacian is
 
 
 class WeightedFrames:
-    """Returns the sum of the frames of a span: (H, W) float32, corrected, and multiplied by the weight of each pixel."""
+    """Returns sums of frames of a group: (H, W) float32, corrected, and multiplied by the weight of each pixel.
 
-    def __init__(self, source: Source) -> None:
-        self._capture = capture = capture_of(source)
+    Pixels that are masked in some frames of the group are masked in all. What moves by itself is not.
+    """
+
+    def __init__(self, source: Source, group: Group) -> None:
+        self._capture = capture = replace(capture_of(source), background=None).masked_in(group.span)
         # (H, W) weight of a frame of each pixel, from 0, for a masked one, to 1; (0, 0) if it is 1 for all.
         self.weights: Image
         if capture.weight is not None:
-            self.weights = np.where(source.valid, capture.weight, np.float32(0))
+            self.weights = np.where(capture.valid, capture.weight, np.float32(0))
         else:
-            self.weights = np.zeros((0, 0), np.float32) if source.valid.all() else source.valid.astype(np.float32)
+            self.weights = np.zeros((0, 0), np.float32) if capture.valid.all() else capture.valid.astype(np.float32)
 
     def __call__(self, span: FrameSpan) -> Image:
         """Sum the frames of a span."""

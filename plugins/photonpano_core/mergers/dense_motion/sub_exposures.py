@@ -69,7 +69,7 @@ class SubExposures:
     def __init__(self, source: Source, group: Group, trajectory: Trajectory, n: int) -> None:
         """Merge `n` sub-exposures along the global motion; fewer if the group has fewer frames."""
         self._group, self._trajectory = group, trajectory
-        self._frames = WeightedFrames(source)
+        self._frames = WeightedFrames(source, group)
         self._weights = halved(self._frames.weights) if self._frames.weights.size else self._frames.weights
         self._onto = to_exposure(group, trajectory, SCALE)
         height, width = source.info.frame_shape
