@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -16,9 +18,10 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from photonpano import capture_plan, convert, open_source, parse_spec
+from photonpano import capture_plan, convert, load_trajectory, open_source, parse_spec
 from photonpano.api.cli.app import app
 from photonpano.capture.writing import truth_path
+from photonpano.geometry import inverse
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "pipelines"
 SMALL = {"source.with.n_frames": 240, "source.with.frame_shape": "[128, 160]", "source.with.path.length_px": 40}
@@ -98,7 +101,7 @@ RUNS: dict[str, dict[str, Any]] = {
     | {"source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
 }
 """Specs to run, with overrides that make them small."""
-OTHERS = {"mandrill", "poses", "stratified-poses", "many-captures", "as-it-arrives"}
+OTHERS = {"mandrill", "poses", "stratified-poses", "many-captures", "as-it-arrives", "windows"}
 """Specs that have tests of their own."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Specs with the same number of groups at every level."""
@@ -213,6 +216,23 @@ def test_example_specs_run(name, examples, tmp_path, write_video, request):
     assert record["spec"]["merge"]["with"].get("compensate", True) == (name != "naive-average")
     assert any(level["revisits"]["located"] for level in record["levels"]) == (name == "revisits")
     assert ("levels" in {decision["what"] for decision in record["decisions"]}) == (name == "revisits")
+
+
+def test_excluded_pairs_mend_a_scene_that_repeats(examples, tmp_path, without_report):
+    windows = runpy.run_path(str(examples / "windows.py"))
+    windows["main"](examples)
+    truth = np.array([windows["to_scene"](frame) for frame in range(windows["N_FRAMES"])])
+    errors_px = {}
+    for name, changes in (("bent", {"graph.exclude": "[]"}), ("mended", {})):
+        photonpano("run", examples / "windows.yaml", "--output", tmp_path / name, **changes)
+        found = load_trajectory(tmp_path / name).homographies
+        moved = (inverse(found[150]) @ found[500])[:2, 2] - (inverse(truth[150]) @ truth[500])[:2, 2]
+        errors_px[name] = float(np.hypot(*moved))
+    assert errors_px["bent"] == pytest.approx(windows["WINDOW_PX"], abs=1)
+    assert errors_px["mended"] < 1
+    failures = json.loads((tmp_path / "bent" / "run.json").read_text())["levels"][0]["failures"]
+    (reason,) = [each["reason"] for each in failures if (each["moving"], each["fixed"]) == ([450, 500], [250, 300])]
+    assert re.fullmatch(r"opencv-sift: the motion is \d+ px from that along the pairs of direct in between", reason)
 
 
 def test_example_follows_a_program_that_writes_frames(examples, tmp_path):
