@@ -20,7 +20,7 @@ LONG_GROUPS = {"resample": {"with": {"group_size": 100}}, "refine": []}
 # What the simulator is told; the spec; what is doubtful; the advice; and the spec that follows it.
 ADVICE: dict[str, tuple[dict[str, Any], dict[str, Any], str, str, dict[str, Any]]] = {
     "refiner": (
-        {"path": PAN | {"shake": {"rms_px": 2, "frequencies_hz": [700, 1100]}}},
+        {"path": PAN | {"shake": {"rms_px": 2, "frequencies_hz": [700, 1100]}}, "n_frames": 600},
         LONG_GROUPS,
         "the image moves within groups by more than the motion that was found",
         "use the refiner short-spans",
@@ -60,7 +60,7 @@ ADVICE: dict[str, tuple[dict[str, Any], dict[str, Any], str, str, dict[str, Any]
 @pytest.mark.parametrize("case", ADVICE)
 def test_advice_that_is_followed_helps(case: str, simulated: Callable[..., Path], tmp_path: Path) -> None:
     settings, spec, what, advice, followed = ADVICE[case]
-    capture = simulated(frame_shape=[96, 144], n_frames=400, **settings)
+    capture = simulated(**{"frame_shape": [96, 144], "n_frames": 400} | settings)
     base = {"version": 1, "source": {"use": "packed-npy", "with": {"path": str(capture), "frame_rate_hz": 96800}}, "levels": 1}
     doubtful, better = (
         run(parse_spec(base | each, output=tmp_path / name)) for name, each in (("before", spec), ("after", followed))
