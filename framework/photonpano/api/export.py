@@ -21,9 +21,10 @@ from photonpano.files.folders import atomic_folder, require_new
 from photonpano.geometry import positions_of
 from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import require_one_run
-from photonpano.record.picture_files import Picture, counted, write_pngs
+from photonpano.record.picture_files import Picture, advancing, write_pngs
 from photonpano.record.poses import POSE_FORMATS, PoseFormat, Poses, ply
 from photonpano.record.run_json import read_record
+from photonpano.text import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ class ExportedPoses:
 def _lines(found: ExportedPoses) -> Iterator[str]:
     yield f"{found.n_frames:,} poses in {', '.join(map(str, found.files))}"
     if found.pictures is not None:
-        yield f"{found.n_frames:,} pictures in {found.pictures}"
+        yield f"{counted(found.n_frames, 'picture')} in {found.pictures}"
 
 
 @command(
@@ -136,7 +137,7 @@ def export(
         if images:
             (written / "images").mkdir()
             advance = stack.enter_context(usual(progress).stage("writing pictures", len(poses.names), "pictures"))
-            write_pngs(written / "images", counted(pictures, advance), [Path(name).stem for name in poses.names])
+            write_pngs(written / "images", advancing(pictures, advance), [Path(name).stem for name in poses.names])
     paths = tuple(output / name for name in files)
     return ExportedPoses(paths, len(poses.names), output / "images" if images else None)
 

@@ -14,9 +14,10 @@ from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.files.folders import require_new
 from photonpano.pipeline.components import build_source
 from photonpano.record.fingerprint import capture_files
-from photonpano.record.picture_files import counted, require_writable, write_pictures
+from photonpano.record.picture_files import advancing, require_writable, write_pictures
 from photonpano.report.preview import Style, pictures, preview_spans, white_flux
 from photonpano.specs import Plan
+from photonpano.text import counted
 from photonpano.values import StreamInfo
 
 
@@ -40,7 +41,7 @@ class Preview:
 
 
 def _lines(made: Preview) -> Iterator[str]:
-    yield f"{made.path}: {made.n_pictures:,} pictures of {made.info}, {made.group_size} frames each"
+    yield f"{made.path}: {counted(made.n_pictures, 'picture')} of {made.info}, {made.group_size} frames each"
     yield f"white is {made.white_flux:.4g} photons per pixel per frame"
 
 
@@ -101,5 +102,5 @@ def preview(
         digits = len(str(source.info.n_frames))
         names = [f"frame_{span.start:0{digits}}" for span in spans]
         with usual(progress).stage(f"writing {output.name}", len(spans), "pictures") as advance:
-            write_pictures(output, counted(pictures(source, spans, style, threads), advance), names, fps)
+            write_pictures(output, advancing(pictures(source, spans, style, threads), advance), names, fps)
         return Preview(output, len(spans), len(spans[0]), style.white_flux, source.info)

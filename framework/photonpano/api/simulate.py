@@ -14,7 +14,7 @@ from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.files.folders import atomic_folder, require_new
 from photonpano.pipeline.components import build_source
 from photonpano.plugins.registry import discover
-from photonpano.record.picture_files import counted, write_pngs
+from photonpano.record.picture_files import advancing, write_pngs
 from photonpano.report.preview import require_sharp_views, sharp_pictures
 from photonpano.specs import Plan
 
@@ -63,5 +63,5 @@ def simulate(
         with atomic_folder(sharp) as folder:
             with one_thread_inside(), usual(progress).stage(f"writing {sharp.name}", len(frames), "pictures") as advance:
                 pictures = sharp_pictures(views, frames, thread_count(plan.run.threads))
-                write_pngs(folder, counted(pictures, advance), [f"frame_{frame:06}" for frame in frames])
+                write_pngs(folder, advancing(pictures, advance), [f"frame_{frame:06}" for frame in frames])
             return replace(write_capture(source, plan, output, progress, None, writer), sharp=sharp)

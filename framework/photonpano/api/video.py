@@ -29,8 +29,8 @@ from photonpano.pipeline.film import Film, merged
 from photonpano.pipeline.rendering import naming_key_of_canvas
 from photonpano.plugins.registry import Catalog
 from photonpano.record.fingerprint import capture_files
-from photonpano.record.picture_files import counted, require_writable, write_pictures
-from photonpano.text import byte_size
+from photonpano.record.picture_files import advancing, require_writable, write_pictures
+from photonpano.text import byte_size, counted
 from photonpano.values import FrameSpan
 
 View = Literal["panorama", "smooth"]
@@ -61,7 +61,7 @@ class Video:
 
 def _lines(made: Video) -> Iterator[str]:
     height, width = made.shape
-    yield f"{made.path}: {made.n_pictures:,} pictures of {height}x{width}, {made.exposure:,} frames each"
+    yield f"{made.path}: {counted(made.n_pictures, 'picture')} of {height}x{width}, {made.exposure:,} frames each"
     if made.speed is not None:
         yield f"a second of the video shows {made.speed:.4g} s of the capture"
 
@@ -140,7 +140,7 @@ def video(
         threads = thread_count(opened.plan.run.threads)
         names = [f"frame_{number:0{len(str(len(spans)))}}" for number in range(len(spans))]
         with progress.stage(f"writing {output.name}", len(spans), "pictures") as advance:
-            write_pictures(output, counted(film.pictures(spans, threads, 8 if output.suffix else 16), advance), names, fps)
+            write_pictures(output, advancing(film.pictures(spans, threads, 8 if output.suffix else 16), advance), names, fps)
         rate = opened.source.info.frame_rate_hz
         return Video(output, len(spans), film.canvas.shape, n_frames, step, None if rate is None else step * fps / rate)
 

@@ -24,6 +24,7 @@ from photonpano.pipeline.obstacles import timeline_of
 from photonpano.pipeline.shots import ApartError, shots_of
 from photonpano.pipeline.state import State, model_of, within
 from photonpano.specs.plan import Plan
+from photonpano.text import listed
 from photonpano.values import Decision, FrameSpan
 
 _MOST_LENSES = 4  # times that the last level is run again, through the lens that it has found
@@ -63,15 +64,22 @@ def _in_shots(
 ) -> State:
     """Estimate the motion of a capture as one, or in shots if its exposures fall into such."""
     before = len(journal)
-    try:
-        return _along(timeline, plan, source, journal, context, started, shortened)
-    except ApartError as apart:
-        shots = apart.shots
-    except UntiedError as unlocated:
-        if not (shots := shots_of(source, unlocated)):
-            raise
-    del journal[before:]
-    return _along(timeline.in_shots(shots), plan, source, journal, context, started, shortened)
+    while True:
+        try:
+            return _along(timeline, plan, source, journal, context, started, shortened)
+        except ApartError as apart:
+            shots = apart.shots
+        except UntiedError as unlocated:
+            if timeline.shots or not (shots := shots_of(source, unlocated)):
+                raise
+        del journal[before:]
+        starts = sorted({shot.start for shot in (*timeline.shots, *shots)})
+        if len(starts) == len(timeline.shots):
+            raise LocationError(
+                f"{listed(map(str, shots))} are not tied together, and the longest of them falls apart as well; run parts of "
+                "the capture by themselves (source.with.frames)"
+            )
+        timeline = timeline.in_shots(list(map(FrameSpan, starts, [*starts[1:], source.info.n_frames])))
 
 
 def _along(

@@ -68,7 +68,7 @@ def write_pngs(folder: Path, pictures: Iterable[Picture], names: Sequence[str]) 
         (folder / f"{name}.png").write_bytes(png.tobytes())
 
 
-def counted(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
+def advancing(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
     """Yield pictures, and call `advance` with 1 when each is written."""
     for picture in made:
         yield picture
