@@ -57,7 +57,8 @@ def rows(seeds: int, fluxes: Sequence[float]) -> Iterator[Sequence[str]]:
                 for name, prior in (("without", {}), ("with", {"prior": {"imu": str(imu)}})):
                     motion = {"motion": {"model": "rotation", **prior}, "camera": {"focal_px": FOCAL_PX}}
                     found[name].append(outcome(packed(capture, RATE_HZ, **motion), study.folder / name, capture))
-        yield f"{flux:g}", *(shown(each) for each in found.values()), f"{np.mean([each[1] for each in found['with']]):.2f}"
+        expected = np.mean([each[1] for each in found["with"]])
+        yield f"{flux:g}", *map(shown, found.values()), f"{expected:.2f}" if np.isfinite(expected) else "not known"
 
 
 def shown(found: Sequence[tuple[float, float, str]]) -> str:

@@ -42,6 +42,7 @@ from photonpano.values import Background, Decision, Light
 logger = logging.getLogger(__name__)
 
 _FAILED = 0.05  # share of the pairs that are not located beyond which the motion is not trusted to tell what moves by itself
+_SHOWING = 0.5  # share of the exposures that must show something when what hides the background is left out
 _CHANGING = 0.003  # share of the panorama that changes over time beyond which what moves is looked for again
 _EXPLAINED = 0.9  # changing light is accepted if it lowers the reduced chi-square of the photons to this fraction
 
@@ -240,6 +241,9 @@ def without_movers(state: State) -> Proposal | None:
     if (layers := located.solution.layers) is not None:
         there = located.solution.located
         found = without_layers(found, located.instants, layers[there], state.source.info.frame_shape)
+    # Where most exposures would show nothing, the scene itself was taken for what hides it.
+    if found is not None and np.mean([found.cells(each.span).any() for each in last.exposures.groups]) < _SHOWING:
+        found = None
     watched = replace(state if found is None else _with_background(state, found), watched=True)
     # Residuals of what is left out, and not, cannot be compared.
     return Proposal(lambda: watched, worse=None)

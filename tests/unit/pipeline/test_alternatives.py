@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from photonpano.capture.writing import truth_path
 from photonpano.evaluation import corner_errors, load_truth
 from photonpano.residuals.tested_run import RIVAL
 
-SHAPE, N_FRAMES = (128, 192), 1000
+SMALL, LARGE = ((96, 144), 600, 100), ((128, 192), 1000, 150)  # frame shape, frames, length of the pan in px
 MOVES_PX = (0.02, 0.006)
 
 
@@ -19,12 +20,13 @@ MOVES_PX = (0.02, 0.006)
 def run_with(tmp_path: Path) -> Callable:
     """Return what runs a pan past a street behind objects, and the errors of its frames."""
 
-    def of(objects: list[dict]) -> tuple:
+    def of(objects: list[dict], size: tuple = SMALL, **sections: Any) -> tuple:
+        shape, n_frames, length_px = size
         keys = {
             "scene": {"kind": "street", "seed": 1},
-            "path": {"kind": "pan", "length_px": 150},
-            "frame_shape": SHAPE,
-            "n_frames": N_FRAMES,
+            "path": {"kind": "pan", "length_px": length_px},
+            "frame_shape": shape,
+            "n_frames": n_frames,
             "flux": 0.5,
             "objects": objects,
             "seed": 1,
@@ -32,18 +34,18 @@ def run_with(tmp_path: Path) -> Callable:
         cube = tmp_path / "capture.npy"
         simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": keys}}), cube)
         spec = {"version": 1, "source": {"use": "packed-npy", "with": {"path": str(cube)}}}
-        result = run(parse_spec(spec, output=tmp_path / "run"))
+        result = run(parse_spec(spec | sections, output=tmp_path / "run"))
         with np.load(tmp_path / "run" / "trajectory.npz") as found:
             arrays = dict(found)
         truth = load_truth(truth_path(cube))
-        errors = corner_errors(arrays["homographies"], truth.homographies, SHAPE, arrays["located"])
+        errors = corner_errors(arrays["homographies"], truth.homographies, shape, arrays["located"])
         return result, errors.errors_px, arrays["std_px"]
 
     return of
 
 
 def test_motion_of_a_thing_that_fills_half_of_the_frame_has_a_rival(run_with: Callable) -> None:
-    result, errors_px, std_px = run_with([{"size": (0.7, 0.7), "at": (0.4, 0.45), "moves_px": MOVES_PX, "seed": 1}])
+    result, errors_px, std_px = run_with([{"size": (0.7, 0.7), "at": (0.4, 0.45), "moves_px": MOVES_PX, "seed": 1}], LARGE)
     assert result.verdict is not None
     assert result.verdict.reasons[0].what == "parts of the frame follow another motion than the one that was found"
     assert [each["what"] for each in result.record["decisions"]].count(RIVAL) == 1
@@ -61,3 +63,10 @@ def test_error_is_not_known_where_most_of_the_frame_stands_still(run_with: Calla
     assert result.verdict.reasons[0].what == "more than half of the frame stands still while the rest moves"
     assert np.isinf(std_px).all()
     assert result.record["motion"] is None
+
+
+def test_what_hides_nearly_all_of_each_exposure_is_not_left_out(run_with: Callable) -> None:
+    """Nothing masks what stands still: its motion, which is none, is taken for that of the scene."""
+    result, errors_px, _ = run_with([{"size": (0.8, 0.8), "seed": 1}], corrections=[], levels=2)
+    assert result.verdict.status == "doubtful"
+    assert errors_px.mean() > 10

@@ -48,6 +48,8 @@ def local_flicker(gains: Gains) -> LocalFlicker | None:
     """
     seen = gains.seen
     instants = seen.instants
+    if not len(seen.cells):
+        return None
     first, last = np.full(seen.n_cells, np.inf), np.full(seen.n_cells, -np.inf)
     np.minimum.at(first, seen.cells, instants[seen.times])
     np.maximum.at(last, seen.cells, instants[seen.times])
