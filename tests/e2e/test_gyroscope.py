@@ -50,9 +50,10 @@ def spec_of(capture: Path, name: str, **prior: Any) -> dict[str, Any]:
     }
 
 
-def test_a_capture_too_dark_to_be_located_is_located_with_a_gyroscope(capture: Path) -> None:
+@pytest.mark.parametrize("prior", [{}, {"time_offset_s": 0.03}], ids=["offset is found", "offset is given"])
+def test_a_capture_too_dark_to_be_located_is_located_with_a_gyroscope(capture: Path, prior: dict[str, Any]) -> None:
     """Without one, no level of the graph is tied together."""
-    result = run(parse_spec(spec_of(capture, "with")))
+    result = run(parse_spec(spec_of(capture, "with", **prior)))
     scores = evaluate(result.directory, capture.with_suffix(".truth.npz"), oracle=False)
     assert scores.trajectory.mean_px < 0.5
     assert scores.honest_share > 0.95
@@ -72,7 +73,7 @@ def test_rates_in_other_units_or_of_another_capture_are_refused(capture: Path, t
     lines = capture.with_name("imu.csv").read_text().splitlines()
     numbers = np.loadtxt(lines[1:], delimiter=",") * [1, scale, scale, scale]
     (file := tmp_path / "imu.csv").write_text("\n".join([lines[0], *(",".join(map(str, row)) for row in numbers)]))
-    with pytest.raises((InputError, LocationError), match=r"motion\.prior: photons do not fit|more than any usual gyroscope"):
+    with pytest.raises((SpecError, LocationError), match=r"motion\.prior: photons do not fit|more than any usual gyroscope"):
         run(parse_spec(spec_of(capture, "other", imu=str(file))))
 
 

@@ -111,7 +111,7 @@ def _capture(
             problems = "; ".join(f"{problem.where}: {problem.message}" for problem in error.problems)
             raise InputError(
                 f"{folder}: the capture of this run cannot be opened by its recorded spec ({problems}); if it was moved, "
-                "name it with --capture, or with --set source.with.path=PATH"
+                "name it with --capture PATH, or, where a command has --set, with --set source.with.path=PATH"
             ) from error
         yield plan, source
 

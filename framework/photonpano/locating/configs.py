@@ -36,9 +36,7 @@ class ImageLimits(Config):
         description="a pair is rejected if the correlation of its aligned images, corrected for photon noise, is below this",
     )
     max_std_px: float = Field(
-        15.0,
-        gt=0,
-        description="a pair is rejected if its images leave the corners of a frame more uncertain than this",
+        15.0, gt=0, description="a pair is rejected if its images leave the corners of a frame more uncertain than this"
     )
 
 
@@ -55,9 +53,7 @@ class PointLimits(Config):
         "suffice",
     )
     max_std_px: float = Field(
-        10.0,
-        gt=0,
-        description="a pair is rejected if its matches leave the corners of a frame more uncertain than this",
+        10.0, gt=0, description="a pair is rejected if its matches leave the corners of a frame more uncertain than this"
     )
 
 

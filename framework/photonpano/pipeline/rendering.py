@@ -45,12 +45,7 @@ logger = logging.getLogger(__name__)
 
 
 def render_into(
-    folder: RunFolder,
-    plan: Plan,
-    source: Source,
-    vignette: Vignette | None,
-    motion: FrameMotion,
-    context: Context,
+    folder: RunFolder, plan: Plan, source: Source, vignette: Vignette | None, motion: FrameMotion, context: Context
 ) -> tuple[RenderedPanorama, list[Decision]]:
     """Render the panorama, and write it, its motion, and what its capture was divided by. For errors, see `run`.
 

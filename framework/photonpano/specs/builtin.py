@@ -156,7 +156,7 @@ def _near_misses(spec: Spec, keys: Written, path: Location) -> list[tuple[str, s
             continue
         needed = [name for name, field in contribution.config.model_fields.items() if field.is_required()]
         if contribution.suffixes and (missing := [name for name in needed if keys.at(name).data is None]):
-            needing.append((entry.name, f"reads such files if it is given {listed(missing)} beside the path"))
+            needing.append((entry.name, f"reads such files if the source is named, with {listed(missing)} beside the path"))
             continue
         try:
             config = validate(contribution.config, keys, replace(spec, problems=[]))

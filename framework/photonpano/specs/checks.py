@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from itertools import islice
 from typing import Any
 
 from photonpano.corrections import Correction, FlatField
 from photonpano.errors import InputError, Problem, described
 from photonpano.execution.interrupts import is_interrupt
+from photonpano.motion.rates import read_rates
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.settings import CameraSettings, MotionSettings
@@ -40,13 +42,18 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
     if outside:
         message = f"expected frames of the capture, 0 to {info.n_frames - 1}, got {outside[0]}"
         problems.append(plan.place("graph.exclude").problem(message))
+    files: dict[str, Callable[[], object]] = {}
     if plan.graph.tie is not None:
         from photonpano.motion.ties import read_ties  # with OpenCV, which other specs need not import
 
+        files["graph.tie"] = partial(read_ties, plan.graph.tie, info)
+    if plan.motion.prior is not None:
+        files["motion.prior.imu"] = partial(read_rates, plan.motion.prior.imu)
+    for key, read in files.items():
         try:
-            read_ties(plan.graph.tie, info)
+            read()
         except InputError as error:
-            problems.append(plan.place("graph.tie").problem(str(error)))
+            problems.append(plan.place(key).problem(str(error)))
     return problems
 
 

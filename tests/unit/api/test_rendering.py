@@ -85,8 +85,8 @@ def test_capture_that_was_moved_is_named_and_changed_one_refused(
     output = tmp_path / "again"
     assert error_of(folder, output) == (
         f"{folder}: the capture of this run cannot be opened by its recorded spec (source: there is no file "
-        f"{tmp_path / 'gone.npy'}; check the path); if it was moved, name it with --capture, or with --set "
-        "source.with.path=PATH"
+        f"{tmp_path / 'gone.npy'}; check the path); if it was moved, name it with --capture PATH, or, where a "
+        "command has --set, with --set source.with.path=PATH"
     )
     again = render(folder, output, [f"source.with.path={moved}"])
     assert again.record["files"]["panorama.tiff"] == small_run.record["files"]["panorama.tiff"]

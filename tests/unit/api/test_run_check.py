@@ -67,7 +67,9 @@ def test_check_run_doubts_other_photons_of_the_same_size(finished: Path) -> None
 def test_check_run_opens_a_capture_that_was_moved(finished: Path) -> None:
     verdict, cube = check_run(finished).verdict, finished.parent / "cube.npy"
     moved = cube.rename(cube.with_name("moved.npy"))
-    assert error_of(finished).endswith("if it was moved, name it with --capture, or with --set source.with.path=PATH")
+    assert error_of(finished).endswith(
+        "if it was moved, name it with --capture PATH, or, where a command has --set, with --set source.with.path=PATH"
+    )
     assert check_run(finished, capture=moved).verdict == verdict
     np.save(moved, np.load(moved)[:, ::-1])
     with pytest.raises(InputError, match="it is another capture"):

@@ -32,11 +32,7 @@ class Track:
     """
 
     def __init__(
-        self,
-        start: StartingMotion | None,
-        groups: Sequence[Group],
-        frame_shape: tuple[int, int],
-        places: Mapping[int, Place],
+        self, start: StartingMotion | None, groups: Sequence[Group], frame_shape: tuple[int, int], places: Mapping[int, Place]
     ) -> None:
         """Take the motion that short spans show, all groups of the level, and the places of some of them."""
         self._start, self._groups = start, groups

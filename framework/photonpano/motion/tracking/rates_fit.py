@@ -90,8 +90,8 @@ def fit_rates(
         raise LocationError(
             f"motion.prior: photons do not fit together along the rates of {file}: they stand out by {significance:.2g} "
             f"standard deviations from those along opposite rates (needed are {_SIGNIFICANT:g}), at a bias of "
-            f"{np.rad2deg(np.abs(motion[:3]).max()):.2g} deg/s; is the file of this capture, are its units and "
-            "motion.prior.axes right, and does the camera turn?"
+            f"{np.rad2deg(np.abs(motion[:3]).max()):.2g} deg/s (up to {np.rad2deg(_MOST_BIAS):.2g}); try axes: find; is the "
+            "file of this capture, in the units that it names, and does the camera turn?"
         )
     motion, stds = _likeliest(fitted, motion, start)
     std_bias, std_offset_s = stds[:3], float(np.append(stds, _STD_OFFSET_S)[3])

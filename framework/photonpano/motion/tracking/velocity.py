@@ -306,19 +306,20 @@ class Contrast(ABC):
 
     def sharpest(self, motion: FloatArray) -> FloatArray:
         """Return the motion of highest contrast near another one (Nelder and Mead 1965)."""
-        simplex = motion + np.concatenate([np.zeros((1, len(motion))), np.diag(self.steps)])
+        steps = self.steps[: len(motion)]  # without that of the time, where this is known
+        simplex = motion + np.concatenate([np.zeros((1, len(motion))), np.diag(steps)])
         scale = abs(float(self.of_spans(motion).sum())) or 1.0
 
         def lost(units: FloatArray) -> float:
-            return -float(self.of_spans(units * self.steps).sum()) / scale
+            return -float(self.of_spans(units * steps).sum()) / scale
 
         found = optimize.minimize(
             lost,
-            motion / self.steps,
+            motion / steps,
             method="Nelder-Mead",
-            options={"initial_simplex": simplex / self.steps, "xatol": 0.01, "fatol": 1e-5, "maxiter": 200},
+            options={"initial_simplex": simplex / steps, "xatol": 0.01, "fatol": 1e-5, "maxiter": 200},
         )
-        return np.asarray(found.x * self.steps)
+        return np.asarray(found.x * steps)
 
     def covariance(self, motion: FloatArray) -> FloatArray:
         """Return the covariance of the sharpest motion: (k, k), by the infinitesimal jackknife over spans (Efron 1982).
@@ -326,7 +327,7 @@ class Contrast(ABC):
         It is inv(H) J inv(H): H are the second derivatives of the contrast, and J is the sum over spans of the squares of what
         each adds to the first ones.
         """
-        steps = self.steps / 2
+        steps = self.steps[: len(motion)] / 2
         centre = self.of_spans(motion)
         ahead, back = ([self.of_spans(motion + sign * step) for step in np.diag(steps)] for sign in (1, -1))
         # The contrast loses twice the products of a span with all others if that is left out.
