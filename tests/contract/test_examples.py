@@ -311,5 +311,10 @@ def test_tutorial_specs_equal_example_specs():
     page = (EXAMPLES.parents[1] / "docs" / "tutorial" / "first-panorama.md").read_text(encoding="utf-8")
     yaml = YAML(typ="safe")
     for name in ("capture.yaml", "scan.yaml"):
-        shown = page.partition(f"<!-- file: {name} -->\n```yaml\n")[2].partition("```")[0]
-        assert yaml.load(shown) == yaml.load((EXAMPLES / name).read_text(encoding="utf-8"))
+        shown = yaml.load(page.partition(f"<!-- file: {name} -->\n```yaml\n")[2].partition("```")[0])
+        example = yaml.load((EXAMPLES / name).read_text(encoding="utf-8"))
+        if name == "capture.yaml":  # the tutorial's is smaller, as the tests follow it in full
+            camera = shown["source"]["with"]
+            camera["path"]["length_px"], camera["n_frames"] = 300, 3000
+            assert camera.pop("frame_shape") == [128, 256]
+        assert shown == example

@@ -98,5 +98,5 @@ def test_a_mask_beyond_the_recording_is_an_error_and_other_frames_are_another_ca
 def test_a_mask_holds_while_the_capture_is_followed(spec: dict[str, Any]) -> None:
     plan = parse_spec(spec)
     with build_source(plan) as whole:
-        arrived = ArrivedFrames(plan).of(part_of(whole.source, FrameSpan(0, 500)), None)
+        arrived = ArrivedFrames(plan).of(part_of(whole.source.given, FrameSpan(0, 500)), None)
         assert [arrived.masked_in(FrameSpan(*each)).valid.all() for each in ((0, 400), (399, 401))] == [True, False]

@@ -153,6 +153,7 @@ def path_data(motion: FrameMotion, panorama: RenderedPanorama) -> dict[str, Any]
         "frames": instants.tolist(),
         "centres": _rounded(centres * factor),
         "outlines": _rounded(outlines * factor),
+        "wide": not panorama.canvas.planar,
         "std": std,
         "start": int(np.abs(instants - motion.reference).argmin()),
     }

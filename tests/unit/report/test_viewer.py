@@ -71,6 +71,7 @@ def test_path_has_outlines_on_the_panorama(motion, panorama):
     assert path["std"][0] is None
     outlines = np.array(path["outlines"])
     assert outlines.shape == (len(path["frames"]), 5, 2)
+    assert not path["wide"]
     np.testing.assert_array_equal(outlines[:, 0], outlines[:, -1])
     height, width = panorama.canvas.shape
     assert outlines.min() > -1.5

@@ -74,7 +74,7 @@
     function line(points) {
       context.beginPath();
       points.forEach(([x, y], k) => {
-        const jumps = k > 0 && Math.abs(x - points[k - 1][0]) > width / 2; // over the seam of a full turn
+        const jumps = data.path.wide && k > 0 && Math.abs(x - points[k - 1][0]) > width / 2; // over the seam of a full turn
         if (k === 0 || jumps) context.moveTo(x + 0.5, y + 0.5);
         else context.lineTo(x + 0.5, y + 0.5);
       });
