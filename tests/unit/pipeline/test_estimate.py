@@ -5,13 +5,16 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import pytest
 
 from photonpano import FrameSpan, LocationError, parse_spec
 from photonpano.execution.context import Context
+from photonpano.motion.diagnosis import UntiedError
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.shots import ApartError
+from photonpano.values import Decision
 
 SPEC = {
     "version": 1,
@@ -48,3 +51,26 @@ def test_a_shot_that_falls_apart_is_divided_too(monkeypatch: pytest.MonkeyPatch)
 def test_shots_that_are_found_twice_end_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(LocationError, match=r"^frames 0 to 29 and frames 30 to 99 are not tied together"):
         timelines_of([spans(0, 30, 100)] * 2, monkeypatch)
+
+
+@pytest.mark.parametrize(("signal_to_noise", "shortened"), [(0.5, [1, 1, 2, 4]), (0.1, [1, 1])], ids=["blurred", "dark"])
+def test_what_was_tried_in_vain_is_told(signal_to_noise: float, shortened: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A constant velocity, and shorter groups where darkness is not the cause."""
+    attempts: list[int] = []
+
+    def along(*given: Any) -> None:
+        attempts.append(given[-1])
+        given[3].append(Decision("group_size", 100, ""))
+        raise UntiedError(f"attempt {len(attempts)} fails", 1, (), (), np.zeros(0, int), signal_to_noise, None)
+
+    monkeypatch.setattr("photonpano.pipeline.estimate._along", along)
+    monkeypatch.setattr("photonpano.pipeline.estimate.shots_of", lambda *_: ())
+    plan = parse_spec(SPEC | {"motion": {"start": "none"}})
+    with pytest.raises(UntiedError) as caught:
+        estimate(plan, build_source(plan), [], Context(1))
+    assert attempts == shortened
+    names = ["motion: {start: constant-velocity}", "1/2 of the group size", "1/4 of the group size"]
+    tried = [
+        f"{name} was tried, too: attempt {number} fails" for number, name in enumerate(names[: len(shortened) - 1], start=2)
+    ]
+    assert str(caught.value).splitlines() == ["attempt 1 fails", *tried]
