@@ -89,7 +89,7 @@ def test_rates_of_another_motion_are_refused(capture: Path, tmp_path: Path) -> N
     ("prior", "message"),
     [
         ({"time_offset_s": 0.3}, r"of them, from 4\d\d to 599, are without; correct motion.prior.time_offset_s"),
-        ({"imu": "short"}, "covers 0.2 s, and the capture takes 0.599 s: to find the time offset"),
+        ({"imu": "short"}, "covers 0.2 s, and the capture takes 0.599 s: the time offset is found in files that cover it"),
     ],
 )
 def test_a_file_that_does_not_cover_the_capture_is_refused(

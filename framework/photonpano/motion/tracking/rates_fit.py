@@ -111,8 +111,9 @@ def _offsets_s(file: Path, measured: Rates, frames_s: FloatArray, spans_s: Float
     offsets_s = np.arange(measured.times_s[0], measured.times_s[-1] - frames_s[-1], period_s)
     if not 0 < len(offsets_s) <= _MOST_OFFSETS:
         raise InputError(
-            f"{file} covers {np.ptp(measured.times_s):g} s, and the capture takes {frames_s[-1]:g} s: to find the time offset, "
-            f"at least as many and at most {_MOST_OFFSETS * period_s:g} s more are needed; give motion.prior.time_offset_s"
+            f"{file} covers {np.ptp(measured.times_s):g} s, and the capture takes {frames_s[-1]:g} s: the time offset is found "
+            f"in files that cover it, and up to {_MOST_OFFSETS * period_s:g} s more; are the times in s? If so, give "
+            "motion.prior.time_offset_s, or leave out what is far from the capture"
         )
     return offsets_s
 
