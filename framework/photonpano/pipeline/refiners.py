@@ -93,8 +93,8 @@ def _refined(refiner: NamedRefiner, state: State, number: int) -> Refined | None
 
 def _change_px(before: FrameMotion, after: FrameMotion) -> float:
     """Return the mean displacement of the corners of the located frames."""
-    total = 0.0
-    for block in before.span.blocks(BLOCK_FRAMES):
-        first, last = (motion.homographies[block.start : block.stop] for motion in (before, after))
+    total, located = 0.0, np.flatnonzero(before.located)
+    for start in range(0, len(located), BLOCK_FRAMES):
+        first, last = (motion.homographies[located[start : start + BLOCK_FRAMES]] for motion in (before, after))
         total += float(corner_displacements(inverse(first) @ last, np.eye(3), before.frame_shape).mean(axis=-1).sum())
-    return total / len(before.span)
+    return total / max(len(located), 1)

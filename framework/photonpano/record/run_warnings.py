@@ -136,7 +136,8 @@ def uncertain_frames(motion: FrameMotion) -> list[str]:
 def refinement_warnings(refinements: Sequence[Refinement]) -> list[str]:
     """Warn of refiners whose motion was not used."""
     return [
-        f"the motion of the refiner {each.name!r} is not used, since it explains the photons worse: {each.kept_out}"
+        f"{'a further' if each.rounds else 'the'} motion of the refiner {each.name!r} is not used, since it explains the "
+        f"photons worse: {each.kept_out}"
         for each in refinements
         if each.kept_out
     ]
