@@ -55,7 +55,11 @@ def _one_direction(run: TestedRun) -> Found | None:
     return Found(weak, f"px, the error of a pair at {angle} degrees from x towards y; {strong:.2g} px across")
 
 
-@MOTION_TESTS.doubtful_above(_UNCERTAIN_PX, "the expected error of the motion is large", "use more light")
+@MOTION_TESTS.doubtful_above(
+    _UNCERTAIN_PX,
+    "the expected error of the motion is large",
+    "use more light; where few pairs tie parts together, more of them (graph.skips, graph.tie)",
+)
 def _uncertain(run: TestedRun) -> Found | None:
     motion = run.explained.motion
     known = motion.std_px[motion.located]
