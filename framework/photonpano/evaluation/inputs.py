@@ -32,6 +32,7 @@ class Truth:
         ideal_homographies: (T, 3, 3), those of a lens without distortion.
         around: whether the scene is an equirectangular panorama, 360 degrees wide; homographies then map to pixels of the
             camera that looks at its middle.
+        path: of the file, for messages.
     """
 
     homographies: FloatArray
@@ -40,6 +41,7 @@ class Truth:
     ideal_homographies: FloatArray
     turn: Turn | None = None
     around: bool = False
+    path: Path = Path("the truth")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,6 +122,7 @@ def load_truth(path: Path) -> Truth:
         ideal_homographies=homographies,
         turn=_turn(path, arrays),
         around=str(arrays.get("scene_projection", "planar")) == "spherical",
+        path=path,
     )
 
 

@@ -24,7 +24,7 @@ from photonpano.evaluation.trajectory import (
 from photonpano.geometry import Canvas, FrameTrajectory, inverse, scaled_ahead
 from photonpano.notebooks import facts
 from photonpano.record.contents import require_one_run
-from photonpano.values import Panorama
+from photonpano.values import FloatArray, FluxImage, Homography, Panorama
 
 # Renders the capture of a run along another motion on a canvas, with the settings of the run.
 Render: TypeAlias = "Callable[[Trajectory, Canvas], Panorama]"
@@ -114,38 +114,65 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Render | No
         )
     if not run.located.any():
         raise InputError(f"{folder}: the run located no frame, so that it has no score")
+    return score(run, truth, lambda: load_panorama(folder), render, folder)
+
+
+def score(
+    run: RunTrajectory,
+    truth: Truth,
+    panorama: Callable[[], tuple[FluxImage, FluxImage]] | None,
+    render: Render | None,
+    origin: Path,
+) -> Evaluation:
+    """Score a motion against the truth of the same capture, and the panorama, of flux and weight, if there is one.
+
+    Raises:
+        InputError: panorama and scene cannot be compared; `origin` is named as what was scored.
+    """
     motion, rotation = _motion_scores(run, truth)
     honest_share = float((motion.errors_px <= 3 * run.std_px)[run.located].mean())
-    if truth.scene is None:
-        return Evaluation(motion, honest_share, rotation=rotation)
+    evaluation = Evaluation(motion, honest_share, rotation=rotation)
+    if truth.scene is None or panorama is None:
+        return evaluation
+    flux, weight = panorama()
+    canvas = run.canvas_of((flux.shape[0], flux.shape[1]))
+    true_homographies = truth.homographies if run.camera is None else truth.ideal_homographies
+    picture, oracle, white = picture_scores(flux, weight, truth, canvas, motion.alignment, true_homographies, render, origin)
+    return replace(evaluation, panorama=picture, oracle=oracle, white_flux=white)
 
+
+def picture_scores(
+    flux: FluxImage,
+    weight: FluxImage,
+    truth: Truth,
+    canvas: Canvas,
+    alignment: Homography,
+    true_homographies: FloatArray,
+    render: Render | None,
+    origin: Path,
+) -> tuple[ImageScore, ImageScore | None, float]:
+    """Score a panorama, and the one that is rendered along the true motion, on the same pixels; and the flux that is white.
+
+    The alignment maps the plane of the canvas to that of the truth. See `score` for errors.
+    """
+    assert truth.scene is not None
     white = white_flux(truth.scene)
     if not white > 0:
-        raise InputError(f"{truth_path}: the scene is dark, so that the panorama cannot be compared with it")
-    flux, weight = load_panorama(folder)
+        raise InputError(f"{truth.path}: the scene is dark, so that the panorama cannot be compared with it")
     if flux.shape[2:] != truth.scene.shape[2:]:
         kinds = ["grey" if image.ndim == 2 else "in colour" for image in (flux, truth.scene)]
-        raise InputError(f"{folder}: the panorama is {kinds[0]}, and the true scene of {truth_path} is {kinds[1]}")
-    canvas = run.canvas_of((flux.shape[0], flux.shape[1]))
+        raise InputError(f"{origin}: the panorama is {kinds[0]}, and the true scene of {truth.path} is {kinds[1]}")
     around = truth.turn.camera.matrix if truth.around and truth.turn is not None else None
-    true_image = true_panorama(truth.scene, canvas, motion.alignment, around)
+    true_image = true_panorama(truth.scene, canvas, alignment, around)
     compared = covered(weight) & known(true_image) & known(flux)
     oracle = None
     if render is not None:
-        true_homographies = truth.homographies if run.camera is None else truth.ideal_homographies
-        true_motion = scaled_ahead(inverse(motion.alignment) @ true_homographies)
-        oracle = render(FrameTrajectory(true_motion), canvas)
+        oracle = render(FrameTrajectory(scaled_ahead(inverse(alignment) @ true_homographies)), canvas)
         compared &= covered(oracle.weight)
     if not compared.any():
-        raise InputError(f"{folder}: the panorama and the true scene have no pixel in common")
-    return Evaluation(
-        trajectory=motion,
-        honest_share=honest_share,
-        panorama=image_score(flux, true_image, compared, white),
-        oracle=None if oracle is None else image_score(oracle.flux, true_image, compared, white),
-        white_flux=white,
-        rotation=rotation,
-    )
+        raise InputError(f"{origin}: the panorama and the true scene have no pixel in common")
+    of_oracle = None if oracle is None else image_score(oracle.flux, true_image, compared, white)
+    return image_score(flux, true_image, compared, white), of_oracle, white
 
 
 def _motion_scores(run: RunTrajectory, truth: Truth) -> tuple[TrajectoryScore, RotationScore | None]:

@@ -1,0 +1,1 @@
+"""A fixed set of captures on which programs are compared."""
