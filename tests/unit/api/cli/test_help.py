@@ -50,7 +50,8 @@ def test_help_imports_nothing_heavy(program: list[str]) -> None:
 
 def test_commands_are_complete() -> None:
     words = "run batch check check-run render video verify explain info preview convert export simulate dark evaluate compare"
-    assert set(COMMANDS) == {*words.split(), "clean", "schema", "warm-up", "plugins list", "plugins show"}
+    groups = {"benchmark make", "benchmark score", "plugins list", "plugins show"}
+    assert set(COMMANDS) == {*words.split(), *groups, "clean", "schema", "warm-up"}
 
 
 @pytest.mark.parametrize("name", COMMANDS)
