@@ -16,7 +16,7 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "benchmarks"))
 from harness import IMAGES, Study, chosen, command
 from picture_parts import encoded
-from pictures import instant, movers, scan, scenes, street, tremor
+from pictures import gallery, instant, movers, scan, scenes, street, tremor
 
 PICTURES = {
     "readme levels interpolation": street.pictures,
@@ -28,6 +28,7 @@ PICTURES = {
     "night depth": scenes.pictures,
     "room": scenes.room,
     "mandrill": scan.mandrill,
+    "usaf usaf-contrast": gallery.usaf,
     "super-resolution": scenes.super_resolution,
     "high-speed": scenes.high_speed,
 }

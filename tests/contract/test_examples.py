@@ -8,6 +8,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import zipfile
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,7 @@ RUNS: dict[str, dict[str, Any]] = {
     | {"source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
 }
 """Specs to run, with overrides that make them small."""
-OTHERS = {"mandrill", "poses", "stratified-poses", "many-captures", "as-it-arrives", "windows"}
+OTHERS = {"mandrill", "usaf", "poses", "stratified-poses", "many-captures", "as-it-arrives", "windows"}
 """Specs that have tests of their own."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Specs with the same number of groups at every level."""
@@ -277,18 +278,42 @@ def test_example_of_many_captures_runs(examples, tmp_path):
     assert "<svg" in (out / "summary.html").read_text(encoding="utf-8")
 
 
-def test_example_of_a_real_capture_runs(examples, tmp_path, without_report):
-    """Groups of 16 frames are located along the velocity that all frames show; the fan turns by 3.7 degrees a frame."""
-    middle = "[{mask: {file: mandrill/mask.png}}, {crop: {rows: [80, 368], columns: [80, 368]}}, flat-field]"
-    small = {"corrections": middle, "refine": "[]", "levels": 1, "light": "steady"}
-    photonpano("run", examples / "mandrill.yaml", "--output", tmp_path / "run", **small)
+@pytest.mark.parametrize(
+    ("name", "middle", "turn_deg"),
+    [("mandrill", "{rows: [80, 368], columns: [80, 368]}", 3.71), ("usaf", "{rows: [80, 368], columns: [100, 352]}", 3.377)],
+)
+def test_example_of_a_real_capture_runs(examples, tmp_path, without_report, name, middle, turn_deg):
+    """Groups of 16 frames are located along the velocity that all frames show: of the mean turn of a fan."""
+    corrections = f"[{{mask: {{file: {name}/mask.png}}}}, {{crop: {middle}}}, flat-field]"
+    small = {"corrections": corrections, "refine": "[]", "levels": 1, "light": "steady"}
+    photonpano("run", examples / f"{name}.yaml", "--output", tmp_path / "run", **small)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["levels"][0]["located"] == record["levels"][0]["groups"] == 6
     start = next(decision for decision in record["decisions"] if decision["what"] == "start")
-    assert start["value"].startswith("a turn by -3.71")
+    assert start["value"].startswith(f"a turn by -{turn_deg}")
     homographies = np.load(tmp_path / "run" / "trajectory.npz")["homographies"]
     turned = np.degrees(np.unwrap(np.arctan2(homographies[:, 1, 0], homographies[:, 0, 0])))
-    assert np.polyfit(np.arange(8, 90), turned[8:90], 1)[0] == pytest.approx(3.71, abs=0.05)
+    assert np.polyfit(np.arange(8, 90), turned[8:90], 1)[0] == pytest.approx(turn_deg, abs=0.05)
+
+
+def test_captures_of_the_paper_are_unpacked_from_their_archive(examples, tmp_path):
+    """A bucket that is a folder, with an archive as the public one has, and hot pixels that are False."""
+    bucket, published = tmp_path / "bucket", examples / "quantavision" / "pano" / "vanvleck"
+    bucket.mkdir()
+    with zipfile.ZipFile(bucket / "pano.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("binary.npy", "arguments.json"):
+            archive.write(published / name, f"pano/vanvleck/{name}")
+            archive.writestr(f"pano/cs6floorlounge/{name}", "another capture")
+    hot = np.load(examples / "masks" / "hot.npy")
+    np.save(bucket / "colorSPAD_continuous_stream.npy", (~hot).astype(np.uint8))
+    script = runpy.run_path(str(examples / "paper_captures.py"))
+    script["download"]("vanvleck", tmp_path, f"file://{bucket}", f"file://{examples / 'masks' / 'filters.png'}")
+    assert (tmp_path / "quantavision/pano/vanvleck/binary.npy").read_bytes() == (published / "binary.npy").read_bytes()
+    np.testing.assert_array_equal(np.load(tmp_path / "masks" / "hot.npy"), hot)
+    shutil.copy(examples / "vanvleck.yaml", tmp_path)
+    assert "vanvleck.yaml: ok" in photonpano("check", tmp_path / "vanvleck.yaml")
+    with pytest.raises(SystemExit, match=r"has no vanvleck2/binary\.npy and no vanvleck2/arguments\.json; it may have moved"):
+        script["download"]("vanvleck2", tmp_path, f"file://{bucket}", "")
 
 
 @pytest.mark.parametrize(
