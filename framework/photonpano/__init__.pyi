@@ -9,6 +9,7 @@ from .api.convert import WrittenCapture as WrittenCapture
 from .api.convert import convert as convert
 from .api.dark import DarkMeasurement as DarkMeasurement
 from .api.dark import dark as dark
+from .api.demo import demo as demo
 from .api.evaluate import evaluate as evaluate
 from .api.explain import explain as explain
 from .api.explain import forecast as forecast

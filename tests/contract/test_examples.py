@@ -45,7 +45,6 @@ SMALL_TRAVEL = {"source.with.n_frames": 240, "source.with.frame_shape": "[96, 14
 }
 CAPTURES = {
     "capture": SMALL_STREET | GROUPS,
-    "demo-capture": SMALL_STREET | GROUPS | {"source.with.path": "{kind: pan, length_px: 60}"},
     "room-capture": {
         "source.with.n_frames": 240,
         "source.with.frame_shape": "[128, 160]",
@@ -70,7 +69,6 @@ RUNS: dict[str, dict[str, Any]] = {
     "kornia": UNREFINED,
     "chain": SHORT,
     "colmap": SHORT,
-    "demo": GROUPS,
     "swissspad": UNREFINED | {"levels": "[{scale: 1}, {scale: 1}, {}]"},
     "sums": SHORT | {"resample.with.group_size": 25},
     "visionsim": SHORT,
@@ -136,11 +134,8 @@ def examples(tmp_path_factory, small_capture, simulated) -> Path:
     """A copy of the folder, with the files that the specs read."""
     folder = tmp_path_factory.mktemp("checkout") / "examples" / "pipelines"
     shutil.copytree(EXAMPLES, folder, ignore=shutil.ignore_patterns("runs", "*.npy", "*.npz"))
-    demo = folder.parents[1] / "demo"
-    demo.mkdir()
-    for capture in (folder / "capture.npy", demo / "capture.npy"):
-        shutil.copy(small_capture, capture)
-        shutil.copy(truth_path(small_capture), truth_path(capture))
+    shutil.copy(small_capture, folder / "capture.npy")
+    shutil.copy(truth_path(small_capture), folder / "capture.truth.npz")
     frames = np.unpackbits(np.load(small_capture), axis=-1)
     np.save(folder / "sums.npy", frames[::2] + frames[1::2])
     convert(capture_plan(folder / "capture.npy", {"frame_rate_hz": 96800}, corrections=[]), folder / "capture.zarr")

@@ -20,7 +20,7 @@ from photonpano.specs import load_spec
 from photonpano.text import byte_size, counted, duration
 
 
-def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
+def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
     """Yield what a run has found, and where its files are."""
     record, directory = result.record, result.directory.resolve()
     for each in record["decisions"]:
@@ -54,14 +54,14 @@ def _lines(result: RunResult, *, strict: bool = False) -> Iterator[str]:
         yield f"report    {directory / 'report.html'}"
     for other in result.others:
         yield f"another   shot of {counted(other.record['source']['n_frames'], 'frame')}, run by itself:"
-        yield from _lines(other)
+        yield from lines_of_run(other)
     if strict and result.verdict is not None:
         require_trust(result.verdict, "all files of the run folder are written")
 
 
 @command(
     "scan.yaml --output runs/first --set render.scale=2",
-    _lines,
+    lines_of_run,
     notes="follow",
     spec=SPEC,
     changes=CHANGES,

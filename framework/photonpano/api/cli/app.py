@@ -21,7 +21,7 @@ from photonpano.errors import OutputError
 from photonpano.execution.interrupts import interrupted_by
 
 # The commands that `--help` lists before all others
-_FIRST = ("info", "check", "run", "batch", "check_run", "verify", "evaluate", "compare", "render", "video", "export")
+_FIRST = ("demo", "info", "check", "run", "batch", "check_run", "verify", "evaluate", "compare", "render", "video", "export")
 
 
 class _Command(TyperCommand):

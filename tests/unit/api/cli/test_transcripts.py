@@ -2,8 +2,9 @@
 
 A line `$ photonpano ...` is a command. Below it are the lines of standard output, those of standard error after `! `, and the
 exit code in brackets unless it is 0. `...` stands for anything; alone on a line, for any number of lines. `{here}` is the
-current folder. `% NAME` calls a function of `SET_UPS`, `> FILE` writes the lines up to `<` to a file, `$ ls` lists files, and
-`## ` begins a comment. With `TRANSCRIPTS=write` in the environment, what differs is written anew.
+current folder, and `photonpano 0.1.0` the installed version. `% NAME` calls a function of `SET_UPS`, `> FILE` writes the lines
+up to `<` to a file, `$ ls` lists files, and `## ` begins a comment. With `TRANSCRIPTS=write` in the environment, what differs
+is written anew.
 """
 
 import json
@@ -13,6 +14,7 @@ import shlex
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -43,6 +45,7 @@ from photonpano.plugins.registry.catalog import make_entry
 from photonpano.plugins.registry.plugins import observation_of
 from photonpano.values import Reason, Verdict
 
+INSTALLED = f"photonpano {version('photonpano')}"
 TRANSCRIPTS = sorted((Path(__file__).parent / "transcripts").glob("*.txt"))
 TREMBLING = Reason("the image moves within groups", 24.1, 2.0, "scatter of the shifts over their noise", "use smaller groups")
 TRUSTED, DOUBTFUL = Verdict("trusted", (), 1.0), Verdict("doubtful", (TREMBLING,), 24.123)
@@ -284,6 +287,7 @@ def test_commands_print_what_is_written(
                     Path(head[2:]).write_text(body.partition("<\n")[0], encoding="utf-8")
                 elif head.startswith("$ "):
                     found = output_of(shlex.split(head[2:]), invoke).replace(str(folder), "{here}")
+                    found = found.replace(INSTALLED, "photonpano 0.1.0")
                     if not pattern_of(body.strip("\n")).fullmatch(f"{found}\n"):
                         wrong.append(f"{path.name}: {head}\n--- written\n{body}\n--- found\n{found}")
                         step = f"{head}\n{found}"
