@@ -10,12 +10,13 @@ STEP := @printf '\n== %s\n'
 # The tests start Python hundreds of times: each must find its modules compiled, whatever the environment says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help install test demo docs paper bench clean
+.PHONY: help install test demo dist docs paper bench clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make demo     simulate a small capture, make its panorama, and score it'
 	@echo 'make test     run all checks and tests'
+	@echo 'make dist     build and check the wheel and the source distribution, in dist'
 	@echo 'make docs     build the documentation as a site'
 	@echo 'make paper    make the figures of the paper, which takes long'
 	@echo 'make bench    run the benchmarks, which takes long'
@@ -46,6 +47,12 @@ test: $(COMPLETE)
 demo: $(RUNS)
 	$(STEP) 'simulating a capture, making its panorama, and scoring it (a minute or two)'
 	@$(BIN)/photonpano demo demo --overwrite
+
+dist: $(COMPLETE)
+	$(STEP) 'the source distribution, and the wheel from it'
+	@rm -rf dist
+	@$(BIN)/python -m build --no-isolation
+	@$(BIN)/python -m twine check --strict dist/*
 
 docs: $(COMPLETE)
 	$(STEP) 'the site'

@@ -30,6 +30,8 @@ root_doc = "README"
 include_patterns = [
     "README.md",
     "CONTRIBUTING.md",
+    "CODE_OF_CONDUCT.md",
+    "SECURITY.md",
     "CHANGELOG.md",
     "docs/README.md",
     "docs/**/*.md",
@@ -50,7 +52,7 @@ napoleon_use_ivar = True
 toc_object_entries = False  # the side bar would list every name
 
 html_theme = "furo"
-html_title = "photonpano"
+html_title = f"photonpano {version}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_show_copyright = False
@@ -76,7 +78,9 @@ def parts_of(page: str) -> list[str]:
 def contents() -> Iterator[str]:
     """Yield the tables of contents, which the home page does not show."""
     examples = sorted(path.with_suffix("").relative_to(ROOT).as_posix() for path in ROOT.glob("examples/**/README.md"))
-    yield toctree("Overview", ["docs/README", "docs/site/gallery", "CONTRIBUTING", "CHANGELOG"])
+    others = "Other versions <https://photonpano.github.io/photonpano/>"
+    project = ["CONTRIBUTING", "CODE_OF_CONDUCT", "SECURITY", "CHANGELOG"]
+    yield toctree("Overview", ["docs/README", "docs/site/gallery", *project, others])
     for caption, pages in sections():
         yield toctree(caption, pages)
     yield toctree("Examples", examples)

@@ -7,11 +7,13 @@ import subprocess
 import tomllib
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
+from ruamel.yaml import YAML
 
 import photonpano
 from photonpano.reading.remote import LIBRARIES
@@ -21,7 +23,16 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 TOOLS = PROJECT["tool"]
 PLUGINS = {path.parent.name for path in ROOT.glob("plugins/*/__init__.py")}
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 CONTRACTS = {contract["name"]: contract for contract in TOOLS["importlinter"]["contracts"]}
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+    return content
+
+
+CITATION, RECIPE = read_yaml(ROOT / "CITATION.cff"), read_yaml(ROOT / "packaging" / "conda" / "recipe.yaml")
 
 
 def pins() -> dict[str, str]:
@@ -30,8 +41,25 @@ def pins() -> dict[str, str]:
     return {canonicalize_name(name): version for name, version in pairs}
 
 
-def test_version_is_the_same_everywhere() -> None:
-    assert PROJECT["project"]["version"] == photonpano.__version__
+def test_version_and_day_of_release_are_the_same_everywhere() -> None:
+    version = PROJECT["project"]["version"]
+    assert {photonpano.__version__, CITATION["version"], RECIPE["context"]["version"]} == {version}
+    newest = re.search(r"^## (\S+) - (\S+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert newest is not None
+    assert newest.groups() == (version, str(CITATION["date-released"]))
+    short = version.rpartition(".")[0]
+    assert f"This is version {short}. " in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"It is about photonpano {short}.\n" in (ROOT / "docs" / "reference" / "stability.md").read_text(encoding="utf-8")
+
+
+def test_conda_recipe_needs_what_the_project_needs() -> None:
+    names = {"matplotlib": "matplotlib-base", "opencv-python-headless": "py-opencv"}
+    own = {"pip", "python", "__unix"}
+    for kind, wanted in (("run", PROJECT["project"]["dependencies"]), ("host", PROJECT["build-system"]["requires"])):
+        lines = [line for line in RECIPE["requirements"][kind] if line.split()[0] not in own]
+        needs = map(Requirement, wanted)
+        assert {str(Requirement(line)) for line in lines} == {f"{names.get(r.name, r.name)}{r.specifier}" for r in needs}
+    assert PROJECT["project"]["requires-python"] == f">={RECIPE['context']['python_min']}"
 
 
 def test_every_dependency_is_pinned_to_a_version_that_it_allows() -> None:
@@ -101,3 +129,28 @@ def test_continuous_integration_can_be_started() -> None:
     assert script.stat().st_mode & 0o111
     subprocess.run(["bash", "-n", script], check=True)
     assert "make test" in script.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
+def test_workflow_names_targets_and_files_that_exist(path: Path) -> None:
+    text, workflow = path.read_text(encoding="utf-8"), read_yaml(path)
+    assert {"name", "on", "permissions", "jobs"} <= set(workflow)
+    targets = re.findall(r"\bmake (\w+) PYTHON=python", text)
+    assert [target for target in targets if not re.search(rf"^{target}:", MAKEFILE, re.MULTILINE)] == []
+    files = re.findall(r"(?:uses: \./|cache-dependency-path: )([\w./]+)", text)
+    assert [file for file in files if not (ROOT / file).is_file()] == []
+    assert targets or files
+
+
+def test_workflow_tests_every_python_that_the_classifiers_name() -> None:
+    named = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["project"]["classifiers"]))
+    matrix = read_yaml(ROOT / ".github" / "workflows" / "tests.yml")["jobs"]["tests"]["strategy"]["matrix"]
+    assert matrix["python"] == named
+
+
+def test_container_gets_what_the_wheel_is_built_from() -> None:
+    lines = re.findall(r"^COPY (.+) \S+$", (ROOT / "Dockerfile").read_text(encoding="utf-8"), re.MULTILINE)
+    copied = {name for line in lines for name in line.split()}
+    packages = {path.partition("/")[0] for path in TOOLS["hatch"]["build"]["targets"]["wheel"]["packages"]}
+    read = {fragment["path"] for fragment in TOOLS["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]["fragments"]}
+    assert copied == {"pyproject.toml", "constraints.txt", *packages, *read, *PROJECT["project"]["license-files"]}

@@ -1,15 +1,20 @@
-"""Build a third-party plugin, and install it beside an installed photonpano."""
+"""Build what is published, and a third-party plugin, and install them as users do."""
 
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import venv
+import zipfile
 from dataclasses import dataclass
+from email import message_from_bytes
 from pathlib import Path
 from subprocess import CompletedProcess
 
@@ -19,6 +24,8 @@ from typer.testing import CliRunner
 from photonpano.api.cli.app import app
 
 ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+FOLDERS = ROOT / "framework", ROOT / "plugins"
 EXAMPLE = ROOT / "examples" / "third_party_plugin"
 # Commands of one process, each with its exit code after what it prints.
 COMMANDS = """
@@ -36,8 +43,9 @@ for arguments in {commands!r}:
 
 
 def done(*command: str | Path, folder: Path = ROOT) -> CompletedProcess[str]:
-    """Run a command that has to succeed."""
-    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    """Run a command that has to succeed, with what is installed alone."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    process = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stdout + process.stderr
     return process
 
@@ -51,28 +59,34 @@ class Environment:
     folder: Path
 
 
-@pytest.fixture(scope="module")
-def environment(tmp_path_factory: pytest.TempPathFactory) -> Environment:
-    """A new virtual environment with the packages of the current one and the plugin.
+def environment_with(package: Path, folder: Path, line: str) -> Environment:
+    """Install a package into a new virtual environment in a folder.
 
-    It is built from a copy, to leave no files behind, with the installed hatchling, to download nothing.
+    It has the packages of the current one too, each folder of which is a line of a .pth file. Nothing is downloaded.
     """
-    folder = tmp_path_factory.mktemp("stranger")
-    source = shutil.copytree(EXAMPLE, folder / "source", ignore=shutil.ignore_patterns("__pycache__"))
     home = folder / "venv"
     venv.create(home, symlinks=True)
     scripts, site = (
         Path(sysconfig.get_path(name, "venv", {"base": str(home), "platbase": str(home)})) for name in ("scripts", "purelib")
     )
     seen = {sysconfig.get_path(name) for name in ("purelib", "platlib")}
-    # A folder that is only listed would be searched without its own .pth files, by which editable installs are found.
-    (site / "base.pth").write_text("".join(f"import site; site.addsitedir({path!r})\n" for path in sorted(seen)))
+    (site / "base.pth").write_text("".join(line.format(path) for path in sorted(seen)))
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", scripts / "python"]
-    done(*pip, "install", "--no-index", "--no-build-isolation", "--no-deps", source)
+    done(*pip, "install", "--no-index", "--no-build-isolation", "--no-deps", "--no-compile", package)
+    return Environment(scripts / "python", site, folder)
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Environment:
+    """The plugin beside the photonpano of the tests. It is built from a copy, to leave no files behind."""
+    folder = tmp_path_factory.mktemp("stranger")
+    source = shutil.copytree(EXAMPLE, folder / "source", ignore=shutil.ignore_patterns("__pycache__"))
+    # A folder that is only listed would be searched without its own .pth files, by which editable installs are found.
+    made = environment_with(source, folder, "import site; site.addsitedir({!r})\n")
     for name in ("tests", "scan.yaml"):  # and not the package, which has to come from the environment
         path = EXAMPLE / name
         (shutil.copytree if path.is_dir() else shutil.copy)(path, folder / name)
-    return Environment(scripts / "python", site, folder)
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -141,10 +155,69 @@ def test_names_of_missing_plugin_are_errors_with_suggestions(small_capture: Path
     assert last == "error: the spec has 2 problems"
 
 
-def test_source_distribution_excludes_example_plugin(tmp_path: Path) -> None:
-    done(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", tmp_path)
-    (archive,) = tmp_path.glob("*.tar.gz")
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the source distribution, and of the wheel that is built from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    done(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder)
+    return folder
+
+
+def test_source_distribution_excludes_example_plugin(built: Path) -> None:
+    (archive,) = built.glob("*.tar.gz")
     with tarfile.open(archive) as tar:
         inside = {Path(name).parts[1] for name in tar.getnames()}
-    ours = {"framework", "plugins", "README.md", "LICENSE", "constraints.txt", "pyproject.toml"}
-    assert inside == ours | {".gitignore", "PKG-INFO"}
+    files = {"README.md", "CHANGELOG.md", "CITATION.cff", "LICENSE", "constraints.txt", "pyproject.toml"}
+    assert inside == files | {"framework", "plugins", ".gitignore", "PKG-INFO"}
+
+
+def test_wheel_holds_every_file_of_the_packages(built: Path) -> None:
+    (wheel,) = built.glob("*.whl")
+    inside = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    there = {file.relative_to(folder).as_posix() for folder in FOLDERS for file in folder.rglob("*.*") if file.is_file()}
+    assert inside == {name for name in there if "__pycache__" not in name}
+    assert {name for name in inside if name.count("/") == 1 and name.endswith("/py.typed")} == {
+        f"{name.partition('/')[0]}/py.typed" for name in inside
+    }
+
+
+def test_package_index_shows_description_whose_links_lead_to_files_of_the_version(built: Path) -> None:
+    done(sys.executable, "-m", "twine", "check", "--strict", *built.iterdir())
+    (wheel,) = built.glob("*.whl")
+    archive = zipfile.ZipFile(wheel)
+    (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
+    description = message_from_bytes(archive.read(name)).get_payload()
+    home, tag = PROJECT["urls"]["Homepage"], f"v{PROJECT['version']}"
+    pages, pictures = f"{home}/blob/{tag}/", f"{home.replace('github.com', 'raw.githubusercontent.com')}/{tag}/"
+    images = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", description)
+    links = re.findall(r"\]\(([^)]+)\)", description)
+    assert images
+    assert [link for link in images if not link.startswith(pictures)] == []
+    targets = [link.removeprefix(pictures).removeprefix(pages).partition("#")[0] for link in links]
+    assert [target for target in targets if not (ROOT / target).is_file()] == []
+
+
+def test_demo_runs_from_installed_wheel(built: Path, tmp_path: Path) -> None:
+    (wheel,) = built.glob("*.whl")
+    installed = environment_with(wheel, tmp_path, "{}\n")  # the checkout is not there
+    for folder in FOLDERS:
+        for source in folder.rglob("*.py"):
+            copy_machine_code(source, installed.site / source.relative_to(folder))
+    where = "import photonpano, photonpano_core as core; print(photonpano.__file__, core.__file__, photonpano.__version__)"
+    *files, version = done(installed.python, "-c", where, folder=tmp_path).stdout.split()
+    assert all(Path(file).is_relative_to(installed.site) for file in files)
+    assert version == PROJECT["version"]
+    printed = done(installed.python.with_name("photonpano"), "demo", "made", "--small", folder=tmp_path).stdout
+    assert "verdict   trusted\n" in printed
+    assert "frames located             100.0 %\n" in printed
+    assert (tmp_path / "made" / "run" / "report.html").is_file()
+
+
+def copy_machine_code(source: Path, installed: Path) -> None:
+    """Give an installed module the machine code of the checkout, which takes a minute to compile: its source is the same."""
+    files = [*(source.parent / "__pycache__").glob(f"{source.stem}.*.nb[ci]")]
+    if files:
+        (installed.parent / "__pycache__").mkdir(exist_ok=True)
+        os.utime(installed, ns=(source.stat().st_atime_ns, source.stat().st_mtime_ns))
+    for file in files:
+        shutil.copy(file, installed.parent / "__pycache__")
