@@ -47,7 +47,8 @@ def test_run_and_its_motion_and_its_picture_score_alike(made: Path, tmp_path: Pa
     truths = made / "set" / "flat.truth.npz", made / "truths" / "sealed-fast.truth.npz"
     path = str(made / "set" / "flat.npy")
     entry = tmp_path / "entry"
-    spec = {"version": 1, "source": {"use": "packed-npy", "with": {"path": path}}, "levels": 1, "refine": []}
+    quick = {"levels": 1, "refine": [], "light": "steady", "resample": {"with": {"group_size": 100}}}
+    spec = {"version": 1, "source": {"use": "packed-npy", "with": {"path": path}}, **quick}
     run(parse_spec(spec, output=entry / "flat"))
     np.savez(entry / "sealed-fast.npz", homographies=load_truth(truths[1]).homographies)
     of_run, of_truth = score(made / "set", entry, made / "truths")
