@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import Truth, corner_errors, image_score, load_truth, true_panorama, white_flux
+from photonpano.evaluation.registration import alignment_of
 from photonpano.geometry import Canvas, apply, corners
-from photonpano.photometry import linear_to_srgb, tone_mapped
+from photonpano.photometry import tone_mapped
 
 SHAPE, N_FRAMES = (128, 192), 2000
 PAN = {"kind": "pan", "length_px": 150, "angle_deg": 20}
@@ -70,7 +71,6 @@ GIVEN = ("quantaodometry", "spano", "cqbpy")  # whose code stays outside the tre
 SHOWN = {"fast": (430, 270), "trembling": (512, 341), "people": (512, 341)}  # middle of what is shown, (x, y) in the scene
 SHOWN_SHAPE, TIMES = (80, 120), 2
 MIN_SHARE = 0.8  # of frames located, or of the scene shown, below which a score is not the best of its capture
-MIN_INLIERS = 12
 
 
 def result_of(peer: Peer, cube: Path, group: int, code: Path | None, python: Path | None, limit_s: float) -> Path | str:
@@ -104,37 +104,9 @@ def scores(found: Mapping[str, NDArray[Any]], truth: Truth) -> dict[str, float]:
 
 
 def to_scene(flux: NDArray[np.float32], truth: Truth) -> NDArray[np.float64] | None:
-    """Return the homography of a picture to the scene, found by SIFT, then by brightness; None if none is found."""
+    """Return the homography of a picture, NaN where it shows nothing, to the scene; None if none is found."""
     assert truth.scene is not None
-    scene = np.asarray(linear_to_srgb(truth.scene / white_flux(truth.scene)), np.float32)
-    known = np.isfinite(flux)
-    picture = np.asarray(linear_to_srgb(np.where(known, flux, 0) / np.nanquantile(flux, 0.99)), np.float32)
-    sift, (points, descriptors) = cv2.SIFT_create(), ([], [])
-    for image in (picture, scene):
-        blurred = cv2.GaussianBlur(np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8), (0, 0), 1.0)
-        keypoints, described = sift.detectAndCompute(blurred, None)
-        points.append(np.array([each.pt for each in keypoints]).reshape(-1, 2))
-        descriptors.append(described)
-    if descriptors[0] is None or len(points[0]) < MIN_INLIERS:
-        return None
-    pairs = [first for first, second in cv2.BFMatcher().knnMatch(*descriptors, 2) if first.distance < 0.8 * second.distance]
-    if len(pairs) < MIN_INLIERS:
-        return None
-    here, there = points[0][[each.queryIdx for each in pairs]], points[1][[each.trainIdx for each in pairs]]
-    place, agree = cv2.findHomography(here, there, cv2.RANSAC, 3.0)
-    if place is None or agree.sum() < MIN_INLIERS:
-        return None
-    ends = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-7)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    for _ in range(3):  # where the picture is not known, the scene stands in, at the place found before
-        truly = cv2.warpPerspective(scene, place, picture.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        filled = np.where(known, picture * (truly[known].mean() / picture[known].mean()), truly).astype(np.float32)
-        try:
-            _, refined = cv2.findTransformECC(filled, scene, place.astype(np.float32), cv2.MOTION_HOMOGRAPHY, ends, None, 3)
-        except cv2.error:
-            return None
-        place = refined.astype(np.float64)
-    return np.asarray(place, np.float64)
+    return alignment_of(np.nan_to_num(flux), np.isfinite(flux), truth.scene)
 
 
 def picture_scores(flux: NDArray[np.float32], place: NDArray[np.float64], truth: Truth) -> dict[str, float]:

@@ -15,13 +15,13 @@ from photonpano.evaluation.inputs import Truth
 from photonpano.geometry import Canvas
 from photonpano.photometry import linear_to_srgb, srgb_to_linear
 from photonpano.reading import read_picture
-from photonpano.values import FluxImage, Homography
+from photonpano.values import BoolArray, FluxImage, Homography
 
 PICTURES = (".png", ".tiff", ".tif", ".jpg", ".jpeg")
 _RATIO = 0.8  # of the distances to the best and second match (Lowe 2004)
 _INLIER_PX = 3.0
-_FEWEST = 20  # matches that agree on one homography
-_LEAST = 0.9  # correlation of picture and scene: right ones have 0.96 or more
+_FEWEST = 12  # matches that agree on one homography
+_LEAST = 0.6  # correlation of picture and scene: those of photonpano have 0.96 or more, poor panoramas of others 0.7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,14 +59,12 @@ def register_picture(path: Path, truth: Truth) -> RegisteredPicture:
     flux = np.ascontiguousarray(values[..., ::-1] if values.shape[2] == 3 else np.repeat(values, 3, axis=2))
     if not in_colour:
         flux = flux.mean(axis=-1)
-    scene = _grey(truth.scene, white_flux(truth.scene))
-    white = float(np.quantile(flux[shown], 0.99)) if shown.any() else 0.0
-    if not white > 0:
+    if not shown.any():
         raise InputError(f"{path}: the picture is black")
     for mirrored in (False, True):
         image = flux[:, ::-1] if mirrored else flux
         seen = shown[:, ::-1] if mirrored else shown
-        if (alignment := _aligned(_grey(image, white), seen, scene)) is not None:
+        if (alignment := alignment_of(image, seen, truth.scene)) is not None:
             break
     else:
         raise InputError(
@@ -88,11 +86,15 @@ def _grey(flux: FluxImage, white: float) -> NDArray[np.uint8]:
     return np.asarray(np.rint(255 * linear_to_srgb(np.nan_to_num(mean) / np.float32(white))), np.uint8)
 
 
-def _aligned(picture: NDArray[np.uint8], seen: NDArray[np.bool_], scene: NDArray[np.uint8]) -> Homography | None:
-    """Return the map from pixels of the picture to those of the scene, None if too few features agree, or the images do not."""
+def alignment_of(flux: FluxImage, seen: BoolArray, true: FluxImage) -> Homography | None:
+    """Return the map from pixels of a picture to those of the true scene, of grey levels or colours.
+
+    None if too few features agree, or the images do not. The picture shows something where it is `seen`, (H, W).
+    """
     import cv2 as opencv
 
     cv2: Any = opencv  # whose types ask for more than it does
+    picture, scene = _grey(flux, float(np.quantile(flux[seen], 0.99))), _grey(true, white_flux(true))
     sift = cv2.SIFT.create()
     mask = seen.astype(np.uint8)
     (points, words), (scene_points, scene_words) = sift.detectAndCompute(picture, mask), sift.detectAndCompute(scene, None)
