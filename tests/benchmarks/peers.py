@@ -136,11 +136,11 @@ def cell(result: Mapping[str, Any], what: str) -> str:
     if "why" in result or what not in result:
         return {"not given": "not given"}.get(result.get("why", ""), "stops" if "why" in result else "none")
     if what == MOTION:
-        lost = "" if result["located"] > 0.9995 else f", {result['located']:.0%} of the frames"
+        lost = "" if result["located"] > 0.9995 else f", {100 * result['located']:.0f} % of the frames"
         figure = f"{result['mean_px']:#.2g}"
         return f"{figure.rstrip('.')} px{lost}"
     if what == PICTURE:
-        return f"{result['psnr_db']:.1f} dB, {result['ssim']:.2f}, {result['shown']:.0%}"
+        return f"{result['psnr_db']:.1f} dB, {result['ssim']:.2f}, {100 * result['shown']:.0f} %"
     return f"{result['cpu_s']:.0f} s, {result['mib']:.0f} MiB"
 
 

@@ -46,7 +46,7 @@ def test_best_of_a_capture_has_all_of_it_and_peers_that_are_better_are_named(pee
     tables = peers.tables_of({"date": "today", "machine": "here", "results": {"flat": found}})
     cells = dict(line.strip("| ").split(" | ") for line in tables["motion"] if line.count("|") == 3 and line[2:3].strip())
     assert cells["COLMAP's SIFT"] == "**0.20 px**"
-    assert cells["cQBPy"] == "0.10 px, 50% of the frames"
+    assert cells["cQBPy"] == "0.10 px, 50 % of the frames"
     assert (cells["spano"], cells["quantaodometry"]) == ("stops", "not given")
     assert tables["motion"][-1] == "Better than photonpano: COLMAP's SIFT (flat)."
     assert tables["time"][-1] == "Better than photonpano: cQBPy (flat), COLMAP's SIFT (flat)."
