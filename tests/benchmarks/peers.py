@@ -75,7 +75,7 @@ MIN_SHARE = 0.8  # of frames located, or of the scene shown, below which a score
 
 def result_of(peer: Peer, cube: Path, group: int, code: Path | None, python: Path | None, limit_s: float) -> Path | str:
     """Run a program unless its result is there; return that, or why there is none."""
-    result = cube.with_name(f"{cube.stem.rpartition('-')[0]}-{peer.slug}.npz")
+    result = cube.with_name(f"{cube.stem.rpartition('-')[0] or cube.stem}-{peer.slug}.npz")
     why = result.with_suffix(".txt")
     if not result.exists() and not why.exists():
         script = Path(__file__).with_name("peer_programs.py")
