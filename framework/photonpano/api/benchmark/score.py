@@ -37,6 +37,8 @@ from photonpano.values import FluxImage, FrameSpan, Panorama
 _MOTION = ("", ".npz", ".csv", ".txt")  # a run folder, or a file
 _LARGEST = 100  # longest side of a panorama that is rendered, in sides of a frame
 _SECONDS = "seconds.csv"  # of an entry: a line `capture,seconds` for each
+_HEADER = ("capture", "error, px", "95 %", "located", "in 3 std", "PSNR, dB", "SSIM", "to oracle", "seconds", "note")
+_FORMS = ("{:.3f}", "{:.3f}", "{:.0%}", "{:.0%}", "{:.2f}", "{:.3f}", "{:.2f}", "{:.1f}")
 
 Pictures: TypeAlias = "tuple[FluxImage, FluxImage]"  # flux and weight
 Along: TypeAlias = "Callable[..., Panorama]"
@@ -72,26 +74,9 @@ class CaptureScore:
 
     def cells(self) -> list[str]:
         """Return the row of the table."""
-        share = "{:.0%}".format
-        forms = (
-            "{:.3f}".format,
-            "{:.3f}".format,
-            share,
-            share,
-            "{:.2f}".format,
-            "{:.3f}".format,
-            "{:.2f}".format,
-            "{:.1f}".format,
-        )
         values = list(asdict(self).values())[1:-1]
-        return [
-            self.capture,
-            *("-" if value is None else form(value) for value, form in zip(values, forms, strict=True)),
-            self.note,
-        ]
-
-
-_HEADER = ["capture", "error, px", "95 %", "located", "in 3 std", "PSNR, dB", "SSIM", "to oracle", "seconds", "note"]
+        shown = ("-" if value is None else form.format(value) for value, form in zip(values, _FORMS, strict=True))
+        return [self.capture, *shown, self.note]
 
 
 def _lines(scores: tuple[CaptureScore, ...], *, as_json: bool = False) -> Iterator[str]:
