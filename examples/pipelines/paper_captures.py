@@ -14,9 +14,10 @@ from pathlib import Path
 import fsspec
 import numpy as np
 
-BUCKET = "s3://public-datasets/quantavision"
+BUCKET = "s3://public-datasets"
+FOLDERS = ("quantavision", "quanta-vision/sequences")  # now, and before September 2026
 PUBLIC = {"anon": True, "endpoint_url": "https://web.s3.wisc.edu"}
-HOT_PIXELS = "colorSPAD_continuous_stream.npy"  # beside the captures, or in an archive of them
+HOT_PIXELS = "colorSPAD_continuous_stream.npy"  # in the archive of masks
 FILTERS = "https://raw.githubusercontent.com/WISION-Lab/photoncube/main/rgbw_oh_bn_color_ss2_corrected.png"
 
 
@@ -37,7 +38,9 @@ def download(capture: str, folder: Path, bucket: str = BUCKET, filters: str = FI
     wanted = {f"{capture}/binary.npy": place / "binary.npy", f"{capture}/arguments.json": place / "arguments.json"}
     wanted[HOT_PIXELS] = hot.with_name(HOT_PIXELS)
     files, root = fsspec.url_to_fs(bucket, **(PUBLIC if bucket.startswith("s3:") else {}))
-    for path in sorted(files.find(root)):
+    # The folder holds 2.4 TB: archives of other papers are not opened.
+    listed = [path for each in FOLDERS if files.exists(f"{root}/{each}") for path in sorted(files.find(f"{root}/{each}"))]
+    for path in (each for each in listed if "/pano" in each or "mask" in each):
         loose = {name: target for name, target in wanted.items() if path.endswith(name) and not target.exists()}
         for target in loose.values():
             with files.open(path) as source:

@@ -292,15 +292,20 @@ def test_example_of_a_real_capture_runs(examples, tmp_path, without_report, name
 
 
 def test_captures_of_the_paper_are_unpacked_from_their_archive(examples, tmp_path):
-    """A bucket that is a folder, with an archive as the public one has, and hot pixels that are False."""
+    """A bucket that is a folder, with archives as the public one has, and hot pixels that are False."""
     bucket, published = tmp_path / "bucket", examples / "quantavision" / "pano" / "vanvleck"
-    bucket.mkdir()
-    with zipfile.ZipFile(bucket / "pano.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+    (bucket / "quantavision" / "pano").mkdir(parents=True)
+    with zipfile.ZipFile(bucket / "quantavision" / "pano" / "pano_1.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("binary.npy", "arguments.json"):
-            archive.write(published / name, f"pano/vanvleck/{name}")
-            archive.writestr(f"pano/cs6floorlounge/{name}", "another capture")
+            archive.write(published / name, f"vanvleck/{name}")
+            archive.writestr(f"cs6floorlounge/{name}", "another capture")
+    (bucket / "quantavision" / "color.zip").write_bytes(b"an archive that is not opened")
     hot = np.load(examples / "masks" / "hot.npy")
-    np.save(bucket / "colorSPAD_continuous_stream.npy", (~hot).astype(np.uint8))
+    with (
+        zipfile.ZipFile(bucket / "quantavision" / "masks.zip", "w") as archive,
+        archive.open("hot_pixel_mask/colorSPAD_continuous_stream.npy", "w") as file,
+    ):
+        np.save(file, (~hot).astype(np.uint8))
     script = runpy.run_path(str(examples / "paper_captures.py"))
     script["download"]("vanvleck", tmp_path, f"file://{bucket}", f"file://{examples / 'masks' / 'filters.png'}")
     assert (tmp_path / "quantavision/pano/vanvleck/binary.npy").read_bytes() == (published / "binary.npy").read_bytes()
