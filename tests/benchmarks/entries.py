@@ -24,9 +24,9 @@ from photonpano.api.benchmark.captures import PUBLIC, Benchmark, BenchmarkCaptur
 from photonpano.api.benchmark.make import make
 from photonpano.api.benchmark.score import CaptureScore, score
 
-GROUPS = {"dark": 400, "fast": 50, "trembling": 50, "turn": 50}
-USUAL_GROUP = 100
-"""Frames in a group of the programs that need to be told."""
+GROUPS = {"dark": 150, "fast": 17, "loop": 33, "trembling": 50, "turn": 35}
+USUAL_GROUP = 75
+"""Frames in a group of the programs that need to be told: those in which the scene moves by about 10 px."""
 PEERS = {
     "OpenCV's Stitcher": Peer("stitcher"),
     "COLMAP's SIFT": Peer("colmap"),
