@@ -105,6 +105,8 @@ def test_wrong_folders_are_named(made: Path, tmp_path: Path) -> None:
 
     described = json.loads((made / "set" / "benchmark.json").read_text())
     (tmp_path / "old").mkdir()
-    (tmp_path / "old" / "benchmark.json").write_text(json.dumps({**described, "version": 0, "photonpano": "0.1.0"}))
+    (tmp_path / "old" / "benchmark.json").write_text(
+        json.dumps({**described, "version": 0, "photonpano": "0.1.0", "captures": []})
+    )
     with pytest.raises(InputError, match=r"describes version 0 of the benchmark, made by photonpano 0\.1\.0"):
         score(tmp_path / "old", tmp_path / "entry")

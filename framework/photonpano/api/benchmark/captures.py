@@ -20,6 +20,8 @@ VERSION: Literal[1] = 1  # of the set; raised whenever a capture changes
 DESCRIPTION = "benchmark.json"
 SEALED = "sealed-"  # prefix of the captures whose truth is not published
 _PUBLIC_SEED = b"photonpano benchmark 1"
+# Below these, seeds are drawn: nobody can try all of those of a sealed capture.
+_PUBLIC_SEEDS, _SEALED_SEEDS = 2**31, 2**63 - 1
 _DRAWS = 20  # paths that are tried for a capture, since some leave the scene
 _SHAKE = {"rms_px": 2, "roll_rms_deg": 0.05, "frequencies_hz": [60, 170, 400]}
 
@@ -83,6 +85,11 @@ class BenchmarkCapture(BaseModel):
     sha256: str  # of the file
 
 
+class _Version(BaseModel):
+    version: int
+    photonpano: str
+
+
 class Benchmark(BaseModel):
     """A set of captures that was written: the content of `benchmark.json`."""
 
@@ -97,13 +104,13 @@ class Benchmark(BaseModel):
         path = folder / DESCRIPTION
         if not path.exists():
             raise InputError(f"{folder} has no {DESCRIPTION}; give the folder that `photonpano benchmark make` wrote")
-        found = read_json(path, cls)
+        found = read_json(path, _Version)
         if found.version != VERSION:
             raise InputError(
                 f"{path} describes version {found.version} of the benchmark, made by photonpano {found.photonpano}, and this "
                 f"photonpano scores version {VERSION}: make the set again, or install that version"
             )
-        return found
+        return read_json(path, cls)
 
 
 def capture_plan(name: str, secret: bytes | None = None) -> Plan:
@@ -111,20 +118,20 @@ def capture_plan(name: str, secret: bytes | None = None) -> Plan:
 
     Paths that leave the scene are drawn again.
     """
-    seed = secret if name.startswith(SEALED) else _PUBLIC_SEED
+    seed, seeds = (secret, _SEALED_SEEDS) if name.startswith(SEALED) else (_PUBLIC_SEED, _PUBLIC_SEEDS)
     assert seed is not None
     changes, *_ = _CONDITIONS[name.removeprefix(SEALED)]
     rng = np.random.default_rng(np.frombuffer(hashlib.sha256(seed + name.encode()).digest(), np.uint32))
     problem: SpecError | None = None
     for _ in range(_DRAWS):
         settings = deepcopy({**_USUAL, **changes})
-        drawn = {key: int(rng.integers(2**31)) for key in ("scene", "path", "people", "clutter")}
+        drawn = {key: int(rng.integers(seeds)) for key in ("scene", "path", "people", "clutter")}
         for key in drawn.keys() & settings.keys():
             settings[key]["seed"] = drawn[key]
         if "seed" in (path := settings["path"]) and path["kind"] != "random-spline":
             del path["seed"]
             path |= {"loop": {"aspect": rng.uniform(1, 2)}, "turn": {"wobbles": rng.uniform(3, 7)}}[path["kind"]]
-        settings["seed"] = int(rng.integers(2**31))
+        settings["seed"] = int(rng.integers(seeds))
         try:
             plan = parse_spec({"version": 1, "source": {"use": "simulator", "with": settings}})
             with build_source(plan, look=False):
