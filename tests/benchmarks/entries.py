@@ -23,6 +23,7 @@ from photonpano import parse_spec, run
 from photonpano.api.benchmark.captures import PUBLIC, Benchmark, BenchmarkCapture
 from photonpano.api.benchmark.make import make
 from photonpano.api.benchmark.score import CaptureScore, score
+from photonpano.text import pixels, share
 
 GROUPS = {"dark": 150, "fast": 17, "loop": 33, "trembling": 50, "turn": 35}
 USUAL_GROUP = 75
@@ -70,8 +71,8 @@ def cells(scored: CaptureScore, stops: dict[str, str]) -> Iterator[str]:
     elif scored.error_px is None:
         yield "none"
     else:
-        lost = "" if scored.located_share is None or scored.located_share > 0.9995 else f", {scored.located_share:.0%}"
-        yield f"{scored.error_px:#.2g} px{lost}"
+        lost = "" if scored.located_share is None or scored.located_share > 0.9995 else f", {share(scored.located_share)}"
+        yield f"{pixels(scored.error_px)} px{lost}"
 
 
 def main(
@@ -102,10 +103,10 @@ def main(
         columns[row] = [text for each in scores for text in cells(each, stops)]
     rows = []
     for each, *others in zip(score(captures, ours), *columns.values(), strict=True):
-        motion = f"{each.error_px:#.2g} px", f"{each.honest_share:.0%}"
+        motion = f"{pixels(each.error_px)} px", share(each.honest_share)
         rows.append([each.capture, *motion, f"{each.psnr_db:.1f} dB", f"{each.seconds:.0f} s", *others])
     head = ["Capture", "photonpano", "in 3 std", "PSNR", "wall time", *columns]
-    made = f"{datetime.now(UTC):%Y-%m-%d}, {platform.machine()}, two cores."
+    made = f"{datetime.now(UTC):%Y-%m-%d}, {platform.machine()}, two cores, which had other work beside."
     write_tables(page, {"entries": [*table(head, rows), "", made]})
     print("\n".join(table(head, rows)))
 

@@ -106,7 +106,8 @@ def scores(found: Mapping[str, NDArray[Any]], truth: Truth) -> dict[str, float]:
 def to_scene(flux: NDArray[np.float32], truth: Truth) -> NDArray[np.float64] | None:
     """Return the homography of a picture, NaN where it shows nothing, to the scene; None if none is found."""
     assert truth.scene is not None
-    return alignment_of(np.nan_to_num(flux), np.isfinite(flux), truth.scene)
+    found = alignment_of(np.nan_to_num(flux), np.isfinite(flux), truth.scene)
+    return None if found is None else found[0]
 
 
 def picture_scores(flux: NDArray[np.float32], place: NDArray[np.float64], truth: Truth) -> dict[str, float]:

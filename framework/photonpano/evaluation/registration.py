@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from photonpano.errors import InputError
 from photonpano.evaluation.images import true_panorama, white_flux
 from photonpano.evaluation.inputs import Truth
-from photonpano.geometry import Canvas
+from photonpano.geometry import Canvas, corners, transform_points, translation
 from photonpano.photometry import linear_to_srgb, srgb_to_linear
 from photonpano.reading import read_picture
 from photonpano.values import BoolArray, FluxImage, Homography
@@ -20,8 +20,9 @@ from photonpano.values import BoolArray, FluxImage, Homography
 PICTURES = (".png", ".tiff", ".tif", ".jpg", ".jpeg")
 _RATIO = 0.8  # of the distances to the best and second match (Lowe 2004)
 _INLIER_PX = 3.0
+_MARGIN, _STEPS = 8, 100  # px of the scene around the picture, and iterations, of the registration by all pixels
 _FEWEST = 12  # matches that agree on one homography
-_LEAST = 0.6  # correlation of picture and scene: those of photonpano have 0.96 or more, poor panoramas of others 0.7
+_LEAST = 0.6  # correlation of picture and scene: poor panoramas have 0.7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +34,7 @@ class RegisteredPicture:
     canvas: Canvas  # whose plane is that of the picture
     alignment: Homography  # pixels of the picture to pixels of the scene
     mirrored: bool
+    correlation: float  # with the scene: of those of photonpano, 0.96 or more
 
 
 def register_picture(path: Path, truth: Truth) -> RegisteredPicture:
@@ -64,13 +66,14 @@ def register_picture(path: Path, truth: Truth) -> RegisteredPicture:
     for mirrored in (False, True):
         image = flux[:, ::-1] if mirrored else flux
         seen = shown[:, ::-1] if mirrored else shown
-        if (alignment := alignment_of(image, seen, truth.scene)) is not None:
+        if (found_at := alignment_of(image, seen, truth.scene)) is not None:
             break
     else:
         raise InputError(
             f"{path}: no homography maps the picture, as it is or mirrored, to the true scene so that they are alike; give the "
             "motion, or a panorama on a plane whose pixels are as large as those of frames"
         )
+    alignment, correlation = found_at
     canvas = Canvas(image.shape[0], image.shape[1], np.eye(3))
     true_image = true_panorama(truth.scene, canvas, alignment)
     both = seen & np.isfinite(true_image.reshape(*seen.shape, -1)).all(axis=-1)
@@ -78,7 +81,7 @@ def register_picture(path: Path, truth: Truth) -> RegisteredPicture:
     capped = np.minimum(true_image, white_flux(truth.scene))[both]
     gain = float((image[both] * capped).sum() / np.square(image[both], dtype=np.float64).sum())
     weight = np.broadcast_to(seen.astype(np.float32).reshape(*seen.shape, *(1,) * (image.ndim - 2)), image.shape)
-    return RegisteredPicture(np.asarray(gain * image, np.float32), np.array(weight), canvas, alignment, mirrored)
+    return RegisteredPicture(np.asarray(gain * image, np.float32), np.array(weight), canvas, alignment, mirrored, correlation)
 
 
 def _grey(flux: FluxImage, white: float) -> NDArray[np.uint8]:
@@ -86,8 +89,8 @@ def _grey(flux: FluxImage, white: float) -> NDArray[np.uint8]:
     return np.asarray(np.rint(255 * linear_to_srgb(np.nan_to_num(mean) / np.float32(white))), np.uint8)
 
 
-def alignment_of(flux: FluxImage, seen: BoolArray, true: FluxImage) -> Homography | None:
-    """Return the map from pixels of a picture to those of the true scene, of grey levels or colours.
+def alignment_of(flux: FluxImage, seen: BoolArray, true: FluxImage) -> tuple[Homography, float] | None:
+    """Return the map from pixels of a picture to those of the true scene, of grey levels or colours, and their correlation.
 
     None if too few features agree, or the images do not. The picture shows something where it is `seen`, (H, W).
     """
@@ -109,10 +112,16 @@ def alignment_of(flux: FluxImage, seen: BoolArray, true: FluxImage) -> Homograph
     alignment, inliers = cv2.findHomography(here, there, cv2.RANSAC, _INLIER_PX)
     if alignment is None or inliers.sum() < _FEWEST:
         return None
-    try:  # to a fraction of a pixel, by all pixels
-        ending = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-7)
-        start = np.linalg.inv(alignment).astype(np.float32)
-        correlation, refined = cv2.findTransformECC(scene, picture, start, cv2.MOTION_HOMOGRAPHY, ending, mask, 5)
+    # To a fraction of a pixel, by all pixels of the part of the scene that the picture shows.
+    outline = transform_points(alignment, corners((picture.shape[0], picture.shape[1])))
+    left, top = np.clip(np.floor(outline.min(axis=0)) - _MARGIN, 0, None).astype(int)
+    right, bottom = np.ceil(outline.max(axis=0)).astype(int) + _MARGIN
+    part, to_part = scene[top:bottom, left:right], translation(-left, -top)
+    try:
+        ending = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, 1e-7)
+        start = np.linalg.inv(to_part @ alignment).astype(np.float32)
+        correlation, refined = cv2.findTransformECC(part, picture, start, cv2.MOTION_HOMOGRAPHY, ending, mask, 5)
     except cv2.error:  # it does not converge
         return None
-    return np.linalg.inv(np.asarray(refined, np.float64)) if correlation > _LEAST else None
+    found = np.linalg.inv(to_part) @ np.linalg.inv(np.asarray(refined, np.float64))
+    return (found, float(correlation)) if correlation > _LEAST else None

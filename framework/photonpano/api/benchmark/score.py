@@ -35,6 +35,7 @@ from photonpano.text import columns
 from photonpano.values import FluxImage, FrameSpan, Panorama
 
 _MOTION = ("", ".npz", ".csv", ".txt")  # a run folder, or a file
+_POOR = 0.95  # correlation with the scene, below which a picture hardly fits: that of right ones is 0.96 or more
 _LARGEST = 100  # longest side of a panorama that is rendered, in sides of a frame
 _SECONDS = "seconds.csv"  # of an entry: a line `capture,seconds` for each
 _HEADER = ("capture", "error, px", "95 %", "located", "in 3 std", "PSNR, dB", "SSIM", "to oracle", "seconds", "note")
@@ -169,6 +170,8 @@ def _scored(
                 path,
             )
             note = "a panorama only, registered with the scene" + ", mirrored" * picture.mirrored
+            if picture.correlation < _POOR:
+                note += f"; it fits poorly (correlation {picture.correlation:.2f}), as one that is not on a plane does"
             below = None if oracle is None else oracle.psnr_db - scored.psnr_db
             return CaptureScore(
                 name, psnr_db=scored.psnr_db, ssim=scored.ssim, below_oracle_db=below, seconds=seconds, note=note
