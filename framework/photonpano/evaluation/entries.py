@@ -21,6 +21,7 @@ _COLUMNS = f"frame and {_MATRIX[0]} to {_MATRIX[-1]}, or frame, x and y, with an
 _TUM = "seconds, x, y, z and a quaternion x, y, z, w"
 # An entry in another convention has an error above this, which the right one divides by this at least.
 _WRONG_PX, _RATIO = 1.0, 3.0
+_FEWEST = 20  # located frames of an entry: the alignment has as many parameters as a frame has coordinates of corners
 _SCALES = (0.25, 0.5, 2.0, 4.0)  # sizes of frames that are tried, as shares of that of the capture
 
 
@@ -50,8 +51,11 @@ def read_motion(path: Path, capture: Expected) -> tuple[RunTrajectory, tuple[str
         return motion, ()
     read = {".npz": _from_archive, ".csv": _from_table, ".txt": _from_tum}[path.suffix]
     homographies, located, std_px, camera, notes = read(path, capture)
-    if not located.any():
-        raise InputError(f"{path}: no frame has finite numbers")
+    if located.sum() < min(_FEWEST, capture.n_frames):
+        raise InputError(
+            f"{path}: {located.sum()} frames have finite numbers; give {_FEWEST} or more, since fewer fit any truth once "
+            "they are aligned"
+        )
     if missing := capture.n_frames - int(located.sum()):
         notes = (*notes, f"{missing:,} frames are missing")
     frames = np.arange(capture.n_frames)
@@ -109,6 +113,8 @@ def _from_table(path: Path, capture: Expected) -> _Read:
             raise InputError(f"{path}: line {line} is not {_COLUMNS}: {dict(row)}") from None
         if not 0 <= frame < capture.n_frames:
             raise InputError(f"{path}: line {line} is of frame {frame}, and {_expected(capture)}, counted from 0")
+        if np.isfinite(std_px[frame]) or np.isfinite(homographies[frame]).any():
+            raise InputError(f"{path}: line {line} is of frame {frame} again; give one line for each frame")
         homographies[frame], std_px[frame] = matrix, std
     located = np.isfinite(homographies).all(axis=(1, 2))
     return _safe(homographies, located, path), located, std_px, None, ()
