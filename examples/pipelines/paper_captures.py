@@ -37,9 +37,12 @@ def download(capture: str, folder: Path, bucket: str = BUCKET, filters: str = FI
     hot, coloured = folder / "masks" / "hot.npy", folder / "masks" / "filters.png"
     wanted = {f"{capture}/binary.npy": place / "binary.npy", f"{capture}/arguments.json": place / "arguments.json"}
     wanted[HOT_PIXELS] = hot.with_name(HOT_PIXELS)
-    files, root = fsspec.url_to_fs(bucket, **(PUBLIC if bucket.startswith("s3:") else {}))
-    # The folder holds 2.4 TB: archives of other papers are not opened.
-    listed = [path for each in FOLDERS if files.exists(f"{root}/{each}") for path in sorted(files.find(f"{root}/{each}"))]
+    try:
+        files, root = fsspec.url_to_fs(bucket, **(PUBLIC if bucket.startswith("s3:") else {}))
+        # The folder holds 2.4 TB: archives of other papers are not opened.
+        listed = [path for each in FOLDERS if files.exists(f"{root}/{each}") for path in sorted(files.find(f"{root}/{each}"))]
+    except Exception as error:
+        sys.exit(f"error: {bucket} cannot be listed: {error}")
     for path in (each for each in listed if "/pano" in each or "mask" in each):
         loose = {name: target for name, target in wanted.items() if path.endswith(name) and not target.exists()}
         for target in loose.values():

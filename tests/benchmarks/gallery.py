@@ -39,8 +39,11 @@ def fetched(data: Path) -> None:
     for name, (place, sha256) in FILES.items():
         path = data / name
         if not path.exists():
-            with urllib.request.urlopen(place + name) as answer, path.with_suffix(".part").open("wb") as part:
-                shutil.copyfileobj(answer, part)
+            try:
+                with urllib.request.urlopen(place + name) as answer, path.with_suffix(".part").open("wb") as part:
+                    shutil.copyfileobj(answer, part)
+            except OSError as error:
+                raise SystemExit(f"{place}{name} cannot be downloaded: {error}; put the file into {data}") from None
             path.with_suffix(".part").replace(path)
         if (found := hashlib.sha256(path.read_bytes()).hexdigest()) != sha256:
             raise SystemExit(f"{path} has the SHA-256 {found}, and not {sha256}: remove it, and start again")

@@ -91,6 +91,8 @@ def test_wrong_folders_are_named(made: Path, tmp_path: Path) -> None:
     (tmp_path / "short").write_text("12345")
     with pytest.raises(InputError, match="holds 5 bytes, which can be guessed; give a secret of 16 bytes or more"):
         make(tmp_path / "other", ["sealed-dark"], tmp_path / "short", tmp_path / "truths")
+    with pytest.raises(OutputError, match=r"sealed-fast\.truth\.npz is there already"):
+        make(tmp_path / "other", ["sealed-fast"], made / "secret", made / "truths")
     with pytest.raises(InputError, match=r"has no benchmark\.json; give the folder that `photonpano benchmark make` wrote"):
         score(tmp_path, tmp_path)
     (tmp_path / "entry").mkdir()

@@ -48,14 +48,11 @@ def read_motion(path: Path, capture: Expected) -> tuple[RunTrajectory, tuple[str
         motion = load_run_trajectory(path)
         if motion.frame_shape != capture.frame_shape or len(motion.located) != capture.n_frames:
             raise InputError(f"{path} is a run of {_size(len(motion.located), motion.frame_shape)}, and {_expected(capture)}")
+        _require_enough(path, motion.located)
         return motion, ()
     read = {".npz": _from_archive, ".csv": _from_table, ".txt": _from_tum}[path.suffix]
     homographies, located, std_px, camera, notes = read(path, capture)
-    if located.sum() < min(_FEWEST, capture.n_frames):
-        raise InputError(
-            f"{path}: {located.sum()} frames have finite numbers; give {_FEWEST} or more, since fewer fit any truth once "
-            "they are aligned"
-        )
+    _require_enough(path, located)
     if missing := capture.n_frames - int(located.sum()):
         notes = (*notes, f"{missing:,} frames are missing")
     frames = np.arange(capture.n_frames)
@@ -198,6 +195,13 @@ def _safe(homographies: FloatArray, located: BoolArray, path: Path) -> FloatArra
     except (ValueError, np.linalg.LinAlgError) as error:
         raise InputError(f"{path}: homographies must be invertible") from error
     return homographies
+
+
+def _require_enough(path: Path, located: BoolArray) -> None:
+    if located.sum() < _FEWEST:
+        raise InputError(
+            f"{path}: {located.sum()} frames are located; give {_FEWEST} or more, since fewer fit any truth once aligned"
+        )
 
 
 def _size(n_frames: int, frame_shape: tuple[int, int]) -> str:

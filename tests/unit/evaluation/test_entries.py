@@ -132,7 +132,7 @@ def text_of(lines: str) -> Callable[[Path], object]:
             "line 2 is of frame 40, and the capture has 40 frames of 60x90, counted from 0",
         ),
         ("a.csv", text_of(f"frame,{MATRIX}\n0{',0' * 9}\n"), "homographies must be invertible"),
-        ("a.csv", text_of("frame,x,y\n0,nan,nan\n"), "0 frames have finite numbers; give 20 or more"),
+        ("a.csv", text_of("frame,x,y\n0,nan,nan\n"), "0 frames are located; give 20 or more"),
         ("a.csv", text_of("frame,x,y\n0,1,2\n0,1,2\n"), "line 3 is of frame 0 again"),
         ("a.txt", text_of("0 0 0 0 0 0 1\n"), "is not a trajectory as TUM writes it"),
         ("a.txt", text_of("0.05 0 0 0 0 0 0 1\n"), "are frames 50 to 50 at 1,000 Hz, .*: count seconds from the first frame"),

@@ -66,7 +66,7 @@ def make(
 
     Raises:
         InputError: there is no such capture, or the secret is missing or too short.
-        OutputError: the folder is there already, or cannot be written.
+        OutputError: the folder, or a truth of a sealed capture, is there already, or cannot be written.
     """
     folder = Path(folder)
     chosen = captures or (PUBLIC if secret is None else ALL)
@@ -80,16 +80,18 @@ def make(
         )
     seed = None if secret is None else _secret(Path(secret))
     require_new(folder, overwrite)
+    sealed_truths = {name: Path(truths, f"{name}.truth.npz") for name in sealed} if truths is not None else {}
+    for path in sealed_truths.values():
+        require_new(path, overwrite)
     described = {}
     with atomic_folder(folder) as written, usual(progress).stage("benchmark", len(chosen), "captures") as advance:
         for name in chosen:
             plan = capture_plan(name, seed)
             made = simulate(plan, written / f"{name}.npy", Quiet())
-            if name in sealed:
+            if name in sealed_truths:
                 assert made.truth is not None
-                assert truths is not None
-                Path(truths).mkdir(parents=True, exist_ok=True)
-                shutil.move(made.truth, Path(truths) / made.truth.name)
+                sealed_truths[name].parent.mkdir(parents=True, exist_ok=True)
+                shutil.move(made.truth, sealed_truths[name])
             described[name] = described_capture(made.path, plan)
             advance(1)
         benchmark = Benchmark(version=VERSION, photonpano=__version__, captures=described)
