@@ -102,12 +102,12 @@ def _data(evaluation: Evaluation) -> dict[str, Any]:
         "corner_error_px": {name: getattr(motion, f"{name}_px") for name in ("mean", "median", "p95", "max")},
         "located_share": motion.located_share,
         "within_three_std_share": evaluation.honest_share,
-        "rotation": _given(evaluation.rotation, "mean_deg", "max_deg", "focal_error"),
+        "rotation": _given(evaluation.rotation, "mean_deg", "max_deg", "focal_error", "focal_std"),
         "panorama": _given(evaluation.panorama, "psnr_db", "ssim", "compared_share"),
         "oracle": _given(evaluation.oracle, "psnr_db", "ssim", "compared_share"),
         "below_oracle_db": evaluation.below_oracle_db,
     }
 
 
-def _given(score: ImageScore | RotationScore | None, *names: str) -> dict[str, float] | None:
+def _given(score: ImageScore | RotationScore | None, *names: str) -> dict[str, float | None] | None:
     return None if score is None else {name: getattr(score, name) for name in names}

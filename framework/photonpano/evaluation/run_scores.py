@@ -21,9 +21,9 @@ from photonpano.evaluation.trajectory import (
     rotation_errors,
     turned_alignment,
 )
-from photonpano.geometry import Canvas, FrameTrajectory, inverse, scaled_ahead
+from photonpano.geometry import Camera, Canvas, FrameTrajectory, inverse, scaled_ahead
 from photonpano.notebooks import facts
-from photonpano.record.contents import require_one_run
+from photonpano.record.contents import recorded_json, require_one_run
 from photonpano.values import FloatArray, FluxImage, Homography, Panorama
 
 # Renders the capture of a run along another motion on a canvas, with the settings of the run.
@@ -72,7 +72,7 @@ class Evaluation:
             rows += [
                 ("rotation error, mean", f"{rotation.mean_deg:.4f} degrees"),
                 ("rotation error, worst", f"{rotation.max_deg:.4f} degrees"),
-                ("focal length", f"{of_focal_length(rotation.focal_error)}, which the corner errors include"),
+                ("focal length", of_focal_length(rotation.focal_error, rotation.focal_std)),
             ]
         for name, score in (("panorama", self.panorama), ("oracle", self.oracle)):
             if score is not None:
@@ -114,7 +114,17 @@ def evaluate(run_folder: Path | str, truth_path: Path | str, render: Render | No
         )
     if not run.located.any():
         raise InputError(f"{folder}: the run located no frame, so that it has no score")
-    return score(run, truth, lambda: load_panorama(folder), render, folder)
+    result = score(run, truth, lambda: load_panorama(folder), render, folder)
+    if result.rotation is None or run.camera is None:
+        return result
+    return replace(result, rotation=replace(result.rotation, focal_std=_expected_focal_error(folder, run.camera)))
+
+
+def _expected_focal_error(folder: Path, camera: Camera) -> float | None:
+    """Return the relative error that a run expects of its focal length; None if its run.json does not say."""
+    levels = (recorded_json(folder) or {}).get("levels") or [{}]
+    std_px = (levels[-1].get("camera") or {}).get("std_focal_px")
+    return None if std_px is None else std_px / camera.focal_px
 
 
 def score(

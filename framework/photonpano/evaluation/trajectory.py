@@ -78,10 +78,13 @@ class Turn:
     camera: Camera
 
 
-def of_focal_length(relative_error: float) -> str:
-    """Write the error of a focal length in words: "5.20 % too short"."""
+def of_focal_length(relative_error: float, expected: float | None = None) -> str:
+    """Write the error of a focal length in words: "5.20 % too short, where 4.00 % was expected"."""
     percent = 100 * relative_error
-    return f"{abs(percent):.2f} % too {'long' if percent > 0 else 'short'}" if abs(percent) >= 0.005 else "right within 0.01 %"
+    if abs(percent) < 0.005:
+        return "right within 0.01 %"
+    error = f"{abs(percent):.2f} % too {'long' if percent > 0 else 'short'}"
+    return f"{error}, where {100 * expected:.2f} % was expected" if expected else error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,13 +92,15 @@ class RotationScore:
     """Errors of rotations after the best common rotation, and of the focal length.
 
     Statistics are over the located frames. `errors_deg`, (T,), is the angle between the true and the estimated rotation of
-    every frame. `focal_error` is relative, above 0 if the estimate is too long.
+    every frame. `focal_error` is relative, above 0 if the estimate is too long; `focal_std` is the relative error that the run
+    expected, 0 of a focal length that was given, None if the run does not say.
     """
 
     errors_deg: FloatArray
     mean_deg: float
     max_deg: float
     focal_error: float
+    focal_std: float | None = None
 
 
 def rotation_errors(estimated: Turn, true: Turn, located: BoolArray) -> RotationScore:

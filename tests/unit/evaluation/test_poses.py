@@ -1,5 +1,6 @@
 """Scores of poses, and of a camera that turns all the way round against a scene all around it."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -284,8 +285,21 @@ def test_evaluate_compares_corners_through_the_lens_that_the_run_found(turn):
 
 
 def test_focal_length_is_compared_in_words():
-    found = [of_focal_length(error) for error in (-0.05199, 0.1, 4e-5)]
-    assert found == ["5.20 % too short", "10.00 % too long", "right within 0.01 %"]
+    found = [of_focal_length(*error) for error in ((-0.05199, 0.04), (0.1, 0), (0.1,), (4e-5, 0.01))]
+    assert found == [
+        "5.20 % too short, where 4.00 % was expected",
+        "10.00 % too long",
+        "10.00 % too long",
+        "right within 0.01 %",
+    ]
+
+
+def test_evaluate_reads_the_expected_error_of_the_focal_length(turn):
+    assert evaluation.evaluate(turn.folder, turn.truth).rotation.focal_std is None
+    levels = [{"camera": None}, {"camera": {"std_focal_px": 0.03 * FOCAL}}]
+    record = {"photonpano": "0.2.0", "spec": {}, "levels": levels}
+    (turn.folder / "run.json").write_text(json.dumps(record))
+    assert evaluation.evaluate(turn.folder, turn.truth).rotation.focal_std == pytest.approx(0.03)
 
 
 def test_evaluate_scores_homographies_of_part_of_a_turn(turn):
