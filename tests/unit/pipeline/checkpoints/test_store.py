@@ -265,8 +265,15 @@ def test_log_repeats_decisions_unless_they_are_taken_again(store: Store, written
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("run", {"seed": 1}), ("graph", {"skips": [1]}), ("source", {"use": "simulator", "with": {"flux": 0.7}}), ("levels", 3)],
-    ids=["seed", "graph", "source", "levels"],
+    [
+        ("run", {"seed": 1}),
+        ("graph", {"skips": [1]}),
+        ("source", {"use": "simulator", "with": {"flux": 0.7}}),
+        ("levels", 3),
+        ("motion", {"model": "homography"}),
+        ("camera", {"focal_px": 500}),
+    ],
+    ids=["seed", "graph", "source", "levels", "motion", "camera"],
 )
 def test_fingerprint_tells_what_results_depend_on(key: str, value: object) -> None:
     spec = {"version": 1, "source": {"use": "simulator"}, "levels": 2}
