@@ -158,20 +158,30 @@ def test_other_shots_are_numbered_by_their_length_and_those_that_fail_are_left_o
     tiny_spec: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spans = [FrameSpan(0, 10), FrameSpan(10, 40), FrameSpan(40, 60), FrameSpan(60, 100)]
-    record: Any = {"decisions": [{"what": "shots", "value": listed(map(str, spans))}]}
+    record: Any = {
+        "decisions": [{"what": "shots", "value": listed(map(str, spans))}],
+        "source": {"frame_rate_hz": 100.0},
+    }
 
     def run(plan: Plan) -> Plan:
         if plan.output.directory.name == "run.panorama-3":
             raise LocationError("too dark")
         return plan
 
-    spec = tiny_spec | {"render": {"reference": 5, "movers": 15}}
+    imu = tmp_path / "imu.csv"
+    imu.write_text("t_s,wx_rad_s,wy_rad_s,wz_rad_s\n0,0,0,0\n1,0,0,0\n")
+    turning = {"motion": {"model": "rotation", "prior": {"imu": str(imu), "time_offset_s": 7.5}}, "camera": {"focal_px": 80}}
+    spec = tiny_spec | turning | {"render": {"reference": 5, "movers": 15}}
     plans = list(run_others(parse_spec(spec, output=tmp_path / "run"), record, run, Quiet()))
     found = [(each.output.directory.name, each.document["source"]["with"]["frames"], each.document["render"]) for each in plans]
     assert [(name, frames, render["reference"], render["movers"]) for name, frames, render in found] == [
         ("run.panorama-2", [10, 40], "middle", 5),
         ("run.panorama-4", [0, 10], 5, "hide"),
     ]
+    # The gyroscope's time at the first frame of each shot.
+    priors = [(each.motion.prior, each.document["motion"]["prior"]) for each in plans]
+    offsets_s = [(prior and prior.time_offset_s, document["time_offset_s"]) for prior, document in priors]
+    assert offsets_s == [(7.6, 7.6), (7.5, 7.5)]
     name = tmp_path / "run.panorama-3"
     assert caplog.messages == [f"no panorama of frames 40 to 59, another shot, was written into {name}: too dark"]
 

@@ -94,18 +94,23 @@ def run_others(plan: Plan, record: RunRecord, run: Callable[[Plan], ResultT], pr
     for folder, shot in other_shots(shots, plan.output.directory).items():
         progress.note(f"{plan.output.directory} is finished; {shot}, another shot, are run into {folder}")
         try:
-            yield run(_narrowed(plan, shot).having("output", directory=folder))
+            narrowed = _narrowed(plan, shot, record["source"]["frame_rate_hz"])
+            yield run(narrowed.having("output", directory=folder))
         except Exception as error:
             message = str(error) if isinstance(error, PhotonpanoError) else described(error)
             logger.warning("no panorama of %s, another shot, was written into %s: %s", shot, folder, message)
 
 
-def _narrowed(plan: Plan, shot: FrameSpan) -> Plan:
+def _narrowed(plan: Plan, shot: FrameSpan, rate_hz: float | None) -> Plan:
     """Return a plan that reads the frames of a shot alone, which count from the first frame that `plan` reads."""
     config = plan.source.config
     first = config.frames[0] if isinstance(config, PartOfCapture) and config.frames is not None else 0
     plan = plan.having("source", frames=(first + shot.start, first + shot.stop))
     plan = plan.having("graph", exclude=(), tie=None)  # their frames count from that of the whole
+    prior = plan.motion.prior
+    if prior is not None and prior.time_offset_s != "find" and rate_hz is not None:
+        offset_s = prior.time_offset_s + shot.start / rate_hz
+        plan = plan.having("motion", prior=prior.model_copy(update={"time_offset_s": offset_s}))
     for key, default in (("reference", "middle"), ("movers", "hide")):
         if isinstance(frame := getattr(plan.render, key), int):
             plan = plan.having("render", **{key: frame - shot.start if shot.start <= frame < shot.stop else default})
