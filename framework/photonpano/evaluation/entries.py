@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from photonpano.errors import InputError
-from photonpano.evaluation.inputs import RunTrajectory, Truth, load_run_trajectory
+from photonpano.evaluation.inputs import RunTrajectory, Truth, frame_shape_of, load_run_trajectory, read_numbers
 from photonpano.evaluation.trajectory import corner_errors
 from photonpano.geometry import Camera, normalised, rescaling, scaled_ahead, translation
-from photonpano.reading import read_arrays, reading
+from photonpano.reading import reading
 from photonpano.values import BoolArray, FloatArray, Homography
 
 _MATRIX = tuple(f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
@@ -65,21 +65,23 @@ _Read = tuple[FloatArray, BoolArray, FloatArray, Camera | None, tuple[str, ...]]
 
 
 def _from_archive(path: Path, capture: Expected) -> _Read:
-    arrays = read_arrays(path, "the motion of an entry, `homographies` (frames, 3, 3)")
+    content = "the motion of an entry, `homographies` (frames, 3, 3)"
+    arrays = read_numbers(path, content, (), ("homographies", "located", "std_px", "frame_shape"))
     found = arrays.get("homographies")
-    if found is None or found.ndim != 3 or found.shape[1:] != (3, 3) or found.dtype.kind not in "fiu":
+    if found is None or found.ndim != 3 or found.shape[1:] != (3, 3):
         shape = "none" if found is None else f"the shape {found.shape}"
         raise InputError(f"{path} must hold `homographies` of the shape ({capture.n_frames}, 3, 3), got {shape}")
     if len(found) != capture.n_frames:
         raise InputError(
             f"{path} has {len(found):,} homographies, and {_expected(capture)}: give one for each frame, or a .csv file"
         )
-    located = np.asarray(arrays.get("located", np.ones(len(found))), bool) & np.isfinite(found).all(axis=(1, 2))
-    std_px = np.asarray(arrays.get("std_px", np.full(len(found), np.nan)), np.float64)
-    if len(located) != len(found) or std_px.shape != (len(found),):
+    located = arrays.get("located", np.ones(len(found))).astype(bool)
+    std_px = arrays.get("std_px", np.full(len(found), np.nan)).astype(np.float64)
+    if not located.shape == std_px.shape == (len(found),):
         raise InputError(f"{path}: located and std_px must have a value for each of {len(found):,} frames")
+    located &= np.isfinite(found).all(axis=(1, 2))
     homographies, notes = _safe(found.astype(np.float64), located, path), tuple[str, ...]()
-    height, width = np.asarray(arrays.get("frame_shape", capture.frame_shape)).astype(int).reshape(2).tolist()
+    height, width = frame_shape_of(path, arrays) if "frame_shape" in arrays else capture.frame_shape
     true_height, true_width = capture.frame_shape
     if (height, width) != capture.frame_shape:
         if abs(height / true_height - width / true_width) > 1 / min(height, width):
@@ -90,7 +92,7 @@ def _from_archive(path: Path, capture: Expected) -> _Read:
 
 
 def _from_table(path: Path, capture: Expected) -> _Read:
-    with reading(path, "is not a table; separate its columns by commas"), path.open(newline="", encoding="utf-8") as file:
+    with reading(path, "is not a table; separate its columns by commas"), path.open(newline="", encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file))
     names = set(rows[0]) if rows else set()
     matrices = {"frame", *_MATRIX} <= names

@@ -112,9 +112,9 @@ def load_truth(path: Path) -> Truth:
         raise InputError(
             f"{path} is the truth of a camera that travels, which has poses and no homographies; score a run with `pose` by it"
         )
-    arrays = _read_archive(path, _TRUTH, ("homographies", "frame_shape"), optional)
+    arrays = read_numbers(path, _TRUTH, ("homographies", "frame_shape"), optional)
     scene = arrays.get("scene")
-    frame_shape, homographies = _frame_shape(path, arrays), _homographies(path, arrays)
+    frame_shape, homographies = frame_shape_of(path, arrays), _homographies(path, arrays)
     return Truth(
         homographies=homographies @ _lens(path, arrays, frame_shape),
         frame_shape=frame_shape,
@@ -143,7 +143,7 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
     required, error = ("homographies", "canvas", "frame_shape", "located"), ("std_px",)
     of_camera = ("camera_matrix", "distortion", "horizon")
     names = ((*required, *error), of_camera) if needs_std_px else (required, (*error, *of_camera))
-    arrays = _read_archive(path, "the trajectory of a run", *names)
+    arrays = read_numbers(path, "the trajectory of a run", *names)
     homographies = _homographies(path, arrays)
     canvas, located = arrays["canvas"], arrays["located"]
     std_px = arrays.get("std_px", np.full(len(homographies), np.nan))
@@ -155,15 +155,13 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
         raise InputError(f"{path}: located must have a flag for each of {len(homographies)} frames, got {located.shape}")
     if std_px.shape != (len(homographies),):
         raise InputError(f"{path}: std_px must have a number for each of {len(homographies)} frames, got {std_px.shape}")
-    camera, projection = None, str(arrays.get("projection", "planar"))
-    if projection not in PROJECTIONS or (projection != "planar" and "camera_matrix" not in arrays):
+    camera, projection = _camera(path, arrays), str(arrays.get("projection", "planar"))
+    if projection not in PROJECTIONS or (projection != "planar" and camera is None):
         raise InputError(f"{path}: the projection {projection} is not known, or lacks its camera_matrix")
-    if "camera_matrix" in arrays:
-        camera = Camera(arrays["camera_matrix"].astype(np.float64), arrays["distortion"].astype(np.float64))
     return RunTrajectory(
         homographies,
         canvas.astype(np.float64),
-        _frame_shape(path, arrays),
+        frame_shape_of(path, arrays),
         located.astype(bool),
         std_px.astype(np.float64),
         camera,
@@ -197,8 +195,8 @@ def read_tiff(path: Path) -> FluxImage:
         return np.asarray(tifffile.imread(path), dtype=np.float32)
 
 
-def _read_archive(path: Path, content: str, required: tuple[str, ...], optional: tuple[str, ...]) -> Mapping[str, NDArray[Any]]:
-    """Read named arrays; a pickle is never loaded."""
+def read_numbers(path: Path, content: str, required: tuple[str, ...], optional: tuple[str, ...]) -> Mapping[str, NDArray[Any]]:
+    """Read an archive of named arrays, and nothing from pickles; `InputError` if one is missing, or has no numbers."""
     arrays = read_arrays(path, content)
     missing = [name for name in required if name not in arrays]
     if missing:
@@ -240,16 +238,25 @@ def _homographies(path: Path, arrays: Mapping[str, NDArray[Any]]) -> FloatArray:
 
 def _turn(path: Path, arrays: Mapping[str, NDArray[Any]]) -> Turn | None:
     """Return the rotations and the camera of a truth that has them."""
-    if not {"rotations", "camera_matrix"} <= set(arrays):
+    camera = _camera(path, arrays)
+    if camera is None or "rotations" not in arrays:
         return None
-    rotations, matrix = arrays["rotations"].astype(np.float64), arrays["camera_matrix"].astype(np.float64)
+    rotations = arrays["rotations"].astype(np.float64)
     if rotations.shape != arrays["homographies"].shape or not np.isfinite(rotations).all():
         raise InputError(f"{path}: rotations must be finite and of the shape of homographies, got {rotations.shape}")
+    return Turn(rotations, camera)
+
+
+def _camera(path: Path, arrays: Mapping[str, NDArray[Any]]) -> Camera | None:
+    """Return the camera of a motion that has one; another model of the lens, of two numbers, counts as none."""
+    if "camera_matrix" not in arrays:
+        return None
+    matrix, distortion = arrays["camera_matrix"].astype(np.float64), arrays.get("distortion", np.zeros(4)).astype(np.float64)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.linalg.det(matrix):
         raise InputError(f"{path}: camera_matrix must be finite and invertible, of the shape (3, 3)")
-    distortion = arrays.get("distortion", np.zeros(4))
-    # Another model of the lens has two numbers.
-    return Turn(rotations, Camera(matrix, distortion.astype(np.float64) if distortion.shape == (4,) else np.zeros(4)))
+    if distortion.shape not in ((2,), (4,)) or not np.isfinite(distortion).all():
+        raise InputError(f"{path}: distortion must be finite, k1, k2, p1 and p2, got {distortion.tolist()}")
+    return Camera(matrix, distortion if len(distortion) == 4 else np.zeros(4))
 
 
 def _lens(path: Path, arrays: Mapping[str, NDArray[Any]], frame_shape: tuple[int, int]) -> Homography:
@@ -264,7 +271,8 @@ def _lens(path: Path, arrays: Mapping[str, NDArray[Any]], frame_shape: tuple[int
     return translation(*middle) @ np.diag([scale, scale, 1.0]) @ translation(*-middle)
 
 
-def _frame_shape(path: Path, arrays: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
+def frame_shape_of(path: Path, arrays: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
+    """Return (height, width) of the frames of an archive; `InputError` if it is none."""
     shape = arrays["frame_shape"]
     if shape.shape != (2,) or shape.dtype.kind not in "iu" or shape.min() < 1:
         raise InputError(f"{path}: frame_shape must be two positive integers (height, width), got {shape.tolist()}")

@@ -58,6 +58,12 @@ def test_table_may_leave_frames_out(tmp_path: Path, motion: np.ndarray, truth: T
     assert notes == ("20 frames are missing",)
 
 
+def test_table_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    rows = [f"{frame},{frame},0" for frame in range(N_FRAMES)]
+    (tmp_path / "a.csv").write_text("\n".join(["frame,x,y", *rows]), encoding="utf-8-sig")  # as Excel writes it
+    assert read_motion(tmp_path / "a.csv", CAPTURE)[0].located.all()
+
+
 def test_table_of_shifts_and_angles_turns_frames_about_their_middle(tmp_path: Path) -> None:
     angles = np.linspace(0, 30, N_FRAMES)
     rows = [f"{frame},{3 * frame},{-frame},{angle},0.25" for frame, angle in enumerate(angles)]
@@ -150,6 +156,21 @@ def text_of(lines: str) -> Callable[[Path], object]:
             "a.npz",
             lambda path: np.savez(path, homographies=np.stack([np.eye(3)] * 40), frame_shape=(30, 30)),
             "is of frames of 30x30, and the capture has 40 frames of 60x90",
+        ),
+        (
+            "a.npz",
+            lambda path: np.savez(path, homographies=np.stack([np.eye(3)] * 40), frame_shape=(40, 60, 90)),
+            r"frame_shape must be two positive integers \(height, width\), got \[40, 60, 90\]",
+        ),
+        (
+            "a.npz",
+            lambda path: np.savez(path, homographies=np.stack([np.eye(3)] * 40), std_px=["unknown"] * 40),
+            "std_px must contain numbers",
+        ),
+        (
+            "a.npz",
+            lambda path: np.savez(path, homographies=np.stack([np.eye(3)] * 40), located=np.ones((40, 1), bool)),
+            "located and std_px must have a value for each of 40 frames",
         ),
     ],
 )

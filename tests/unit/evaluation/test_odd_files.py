@@ -179,6 +179,13 @@ CASES: Mapping[str, Change] = {
     "truth, frame_shape: no width": true("frame_shape", lambda _: np.array([60, 0])),
     "truth, scene: two colours": true("scene", lambda _: np.zeros((4, 4, 2))),
     "truth, undistorted_corners: three": lambda capture: capture.true.update(undistorted_corners=np.zeros((3, 2))),
+    "run, camera_matrix: alone": lambda capture: capture.trajectory.update(camera_matrix=np.diag([80.0, 80, 1])),
+    "run, camera_matrix: four numbers": lambda capture: capture.trajectory.update(
+        camera_matrix=np.eye(2), distortion=np.zeros(4)
+    ),
+    "run, distortion: three numbers": lambda capture: capture.trajectory.update(
+        camera_matrix=np.eye(3), distortion=np.zeros(3)
+    ),
 }
 
 
