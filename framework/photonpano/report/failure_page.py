@@ -85,9 +85,7 @@ def _ends_of_parts(lost: UntiedError) -> list[dict[str, Any]]:
         return []
     parts = [np.flatnonzero(lost.parts == part) for part in np.flatnonzero(np.bincount(lost.parts) > 1)[:MAX_PAIRS]]
     ends = sorted({int(part[end]) for part in parts for end in (0, -1)}) if len(parts) > 1 else []
-    spans = [lost.groups[index].span for index in ends]
-    pictures = [_pictures([lost.merged(index)])[0] for index in ends]
-    return [{"frame": int(span.centre), "uri": picture} for span, picture in zip(spans, pictures, strict=True)]
+    return [{"frame": int(lost.groups[index].reference), "uri": _pictures([lost.merged(index)])[0]} for index in ends]
 
 
 def _spread(failures: Sequence[FailureRecord], most: int) -> list[FailureRecord]:

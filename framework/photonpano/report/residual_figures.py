@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from photonpano.filtering import SYSTEMATIC_PX
-from photonpano.geometry import Canvas, apply, inverse
+from photonpano.geometry import Canvas, apply, inverse, rescaling
 from photonpano.merging.light import amplitudes_on
 from photonpano.report.drawing import (
     BAR_IN,
@@ -143,8 +143,8 @@ def flicker_over_panorama(light: Light | None, canvas: Canvas) -> str | None:
     shape = canvas.shape
     step = max(1, max(shape) // _FLICKER_PIXELS)
     small = -(-shape[0] // step), -(-shape[1] // step)
-    to_small = np.diag([1 / step, 1 / step, 1.0])
-    cosine, sine = amplitudes_on(light, replace(canvas, height=small[0], width=small[1], transform=to_small @ canvas.transform))
+    coarse = replace(canvas, height=small[0], width=small[1], transform=rescaling(1 / step) @ canvas.transform)
+    cosine, sine = amplitudes_on(light, coarse)
     extent = -0.5, small[1] * step - 0.5, small[0] * step - 0.5, -0.5
     depth = np.hypot(cosine, sine)
     with maps_figure(*shape, 2) as (figure, (left, right)):

@@ -223,6 +223,7 @@ def test_page_of_failed_run_shows_exposures_that_did_not_match(failed, record, e
         assert sentence in text
     assert "Motion" not in text
     assert page.count("data:image/jpeg") == 4 + 4  # of pairs, and of the ends of parts that can be tied by hand
+    assert re.findall(r'"frame": (\d+)', page) == ["50", "250", "350", "450"]  # the instants that exposures are seen from
     [figure] = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
     assert [name for name in ("part 1", "part 2", "part 3", "other parts", "alone") if f">{name}<" in figure] == [
         "part 1",
