@@ -121,7 +121,7 @@ def arrived_frames(path: Location) -> int | None:
     if not path.exists() or size_of(path) < _SHORTEST_HEADER:
         return None
     header = npy_header(path)
-    n_frames, *of_frame = header.shape
+    n_frames, *of_frame = header.shape or (0,)
     frame_bytes = math.prod(of_frame) * header.dtype.itemsize
     return min(n_frames, (size_of(path) - header.offset) // frame_bytes) if frame_bytes else 0
 

@@ -18,6 +18,7 @@ from typing import Any
 
 from photonpano.compiling import notify_on_first_compile
 from photonpano.contracts.protocols import Piped
+from photonpano.contracts.rules import attributing
 from photonpano.errors import InputError, OutputError, PhotonpanoError, described
 from photonpano.execution.context import Context, Progress
 from photonpano.execution.interrupts import is_interrupt
@@ -111,7 +112,7 @@ def _followable(plan: Plan) -> Callable[[Any], Any]:
         )
     if isinstance(config, PartOfCapture) and config.frames is not None:
         raise plan.error("source.with.frames", "a part of a capture cannot be followed; remove this key")
-    return contribution.arrived
+    return attributing(plan.source.label, "the frames so far")(contribution.arrived)
 
 
 def _standard_input() -> int:

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano import InputError, OutputError, RunResult, SpecError, parse_spec, run
+from photonpano import InputError, OutputError, PluginError, RunResult, SpecError, parse_spec, run
+from photonpano.contracts.protocols import Arrived
 from photonpano.report import LiveFigures
 
 
@@ -243,6 +244,31 @@ def test_missing_file_is_waited_for(tmp_path: Path) -> None:
 def test_file_of_another_kind_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "a.npy").write_text("This is a text, and no array, however long it gets. " * 5)
     with pytest.raises(InputError, match=r"a\.npy is not a \.npy file"):
+        follow(spec("packed-npy", path=str(tmp_path / "a.npy")), tmp_path / "run", end_after=60)
+
+
+@pytest.mark.parametrize("at_first", [True, False])
+def test_source_that_fails_while_frames_arrive_is_named_and_ends_the_run(
+    at_first: bool, moving_frames: np.ndarray, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "a.npy", moving_frames)
+    plan = parse_spec(spec("packed-npy", path=str(tmp_path / "a.npy")), output=tmp_path / "run")
+    main = threading.get_ident()
+
+    def arrived(_: object) -> Arrived:
+        if at_first or threading.get_ident() != main:
+            raise ValueError("no luck")
+        return Arrived(None)
+
+    contribution: Any = replace(plan.source.contribution, arrived=arrived)  # type: ignore[call-arg]
+    plan = replace(plan, source=replace(plan.source, contribution=contribution))
+    with pytest.raises(PluginError, match=r"^source 'packed-npy' of .* failed at the frames so far: ValueError: no luck"):
+        run(plan, follow=True, end_after=60)
+
+
+def test_array_without_frames_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.array(5, np.uint8))
+    with pytest.raises(InputError, match=r"a\.npy has the shape \(\); a packed capture has 3 dimensions"):
         follow(spec("packed-npy", path=str(tmp_path / "a.npy")), tmp_path / "run", end_after=60)
 
 
