@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from photonpano.contracts.results import POSES
@@ -17,6 +16,7 @@ from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.estimate import require_centre
 from photonpano.pipeline.obstacles import naming_obstacles
 from photonpano.pipeline.run_steps import BegunRun
+from photonpano.record.picture_files import png_of
 from photonpano.record.poses import Poses, colmap, in_standard_world, nerfstudio, ply, tum
 from photonpano.record.run_json import poses_record, verdict_record
 from photonpano.record.run_warnings import poses_warnings
@@ -134,11 +134,7 @@ def _of_views(camera: Camera, estimate: PoseEstimate, stream: StreamInfo, rate: 
 
 
 def _picture(flux: FluxImage) -> bytes:
-    """Return an exposure as PNG, grey or in colour, 8 bits in sRGB."""
+    """Return an exposure as PNG, 8 bits in sRGB."""
     known = np.isfinite(flux)
     white = float(np.quantile(flux[known], _WHITE_QUANTILE)) if known.any() else 1.0
-    picture = tone_mapped(flux, max(white, 1e-12))
-    encoded, png = cv2.imencode(".png", picture)
-    if not encoded:
-        raise OutputError(f"OpenCV could not encode an exposure of {picture.shape} as PNG")
-    return png.tobytes()
+    return png_of(tone_mapped(flux, max(white, 1e-12)))

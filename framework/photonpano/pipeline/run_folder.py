@@ -11,7 +11,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
@@ -37,6 +36,7 @@ from photonpano.motion.loop import LevelResult
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
 from photonpano.record.contents import MAPS, RECORD, contents_of, names_of_results, recorded_contents, recorded_json
+from photonpano.record.picture_files import png_of
 from photonpano.record.schema import FileContent, RunRecord
 from photonpano.values import FluxImage, Panorama
 
@@ -72,13 +72,9 @@ class RunFolder:
 
     def write_results(self, panorama: RenderedPanorama, motion: FrameMotion) -> None:
         """Write panorama.png (8 bits, sRGB) and trajectory.npz."""
-        picture = panorama.picture
-        encoded, png = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
-        if not encoded:
-            raise OutputError(f"OpenCV could not encode the panorama of {panorama.picture.shape} as PNG")
-        sphere = photo_sphere(panorama.canvas, picture.shape[:2])
+        png, sphere = png_of(panorama.picture), photo_sphere(panorama.canvas, panorama.picture.shape[:2])
         with self.writing():
-            (self.staging / "panorama.png").write_bytes(png.tobytes() if sphere is None else with_xmp(png.tobytes(), sphere))
+            (self.staging / "panorama.png").write_bytes(png if sphere is None else with_xmp(png, sphere))
             motion_arrays: dict[str, Any] = {
                 "homographies": motion.homographies,
                 "canvas": panorama.canvas.transform,
@@ -258,8 +254,7 @@ def _write_level(folder: Path, result: LevelResult, white_flux: float, context: 
                 head = {"descr": "<f4", "fortran_order": False, "shape": (len(groups), *exposure.flux.shape)}
                 np.lib.format.write_array_header_1_0(file, head)
             file.write(np.ascontiguousarray(exposure.flux, "<f4").tobytes())
-            _, picture = cv2.imencode(".png", tone_mapped(exposure.flux, white_flux))
-            (folder / f"{name}-{number:0{digits}}.png").write_bytes(picture.tobytes())
+            (folder / f"{name}-{number:0{digits}}.png").write_bytes(png_of(tone_mapped(exposure.flux, white_flux)))
             advance(1)
     instants = np.array([group.reference for group in groups])
     np.savez(

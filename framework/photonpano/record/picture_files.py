@@ -62,10 +62,15 @@ def write_pictures(path: Path, pictures: Iterable[Picture], names: Sequence[str]
 def write_pngs(folder: Path, pictures: Iterable[Picture], names: Sequence[str]) -> None:
     """Write pictures, (H, W) or (H, W, 3) with red first, into a folder under these names, without suffix."""
     for name, picture in zip(names, pictures, strict=True):
-        encoded, png = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
-        if not encoded:
-            raise OutputError(f"OpenCV could not encode a picture of {picture.shape} as PNG")
-        (folder / f"{name}.png").write_bytes(png.tobytes())
+        (folder / f"{name}.png").write_bytes(png_of(picture))
+
+
+def png_of(picture: Picture) -> bytes:
+    """Return a picture, (H, W) or (H, W, 3) with red first, as PNG; `OutputError` if OpenCV cannot encode it."""
+    encoded, png = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
+    if not encoded:
+        raise OutputError(f"OpenCV could not encode a picture of {picture.shape} as PNG")
+    return png.tobytes()
 
 
 def advancing(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
