@@ -92,8 +92,7 @@ def accumulate(
     """
     advance = advance or (lambda _: None)
     capture = capture_of(source)
-    light = capture.light
-    terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
+    terms = None if capture.light is None else LightTerms.of(capture.light, [chunk.span for chunk in chunks])
     canvas = onto if isinstance(onto, Canvas) else Canvas(*shape, onto)
     if in_order is None:
         visible = _visible(capture, chunks, canvas)
@@ -113,9 +112,9 @@ def accumulate(
             counts[part.box] += part.counts
             coverages[:, *part.box] += part.coverages
             advance(part.n_frames)
-    if light is None or terms is None:
+    if terms is None:
         return PhotonSum(counts, coverages[0])
-    lit = terms.lit_frames(coverages, light, canvas)
+    lit = terms.lit_frames(coverages, canvas)
     return PhotonSum(counts, lit.weight, lit)
 
 

@@ -114,13 +114,11 @@ class LightTerms:
         of_class = self.classes[span.start : span.stop] == np.array(self.present)[:, None]
         return np.asarray((of_class.astype(float) @ values.T).ravel())
 
-    def lit_frames(self, coverages: FluxImage, light: Light, onto: Homography | Canvas) -> LitFrames:
+    def lit_frames(self, coverages: FluxImage, canvas: Canvas) -> LitFrames:
         """Return the frames and gains of each pixel, from (number, H, W) coverages of a canvas."""
-        shape = coverages.shape[1:]
-        by_class = coverages.reshape(len(self.present), -1, *shape)
+        by_class = coverages.reshape(len(self.present), -1, *canvas.shape)
         gains = by_class[:, 1].copy()
-        canvas = onto if isinstance(onto, Canvas) else Canvas(shape[0], shape[1], onto)
-        for index, image in enumerate(amplitudes_on(light, canvas)):
+        for index, image in enumerate(amplitudes_on(self.light, canvas)):
             gains += image * by_class[:, 2 + index]
         return LitFrames(np.ascontiguousarray(by_class[:, 0]), np.maximum(gains, 0))
 

@@ -57,8 +57,7 @@ def sums_on(
 ) -> PhotonSums:
     """Sum the counts and the frames of the pixels whose centres fall into each cell of a canvas."""
     capture = capture_of(source)
-    light = capture.light
-    terms = None if light is None else LightTerms.of(light, [chunk.span for chunk in chunks])
+    terms = None if capture.light is None else LightTerms.of(capture.light, [chunk.span for chunk in chunks])
     lit = np.zeros(canvas.shape, np.float32)
     seen = np.zeros((1 if terms is None else terms.number, *canvas.shape), np.float32)
     parts = divided(canvas.height, max(1, canvas.height // _PART_ROWS))
@@ -72,7 +71,7 @@ def sums_on(
         for chunk in batch:
             advance(len(chunk.span))
     deque(adding, maxlen=0)
-    lit_frames = None if terms is None or light is None else terms.lit_frames(seen, light, canvas.transform)
+    lit_frames = None if terms is None else terms.lit_frames(seen, canvas)
     return _photons(source, lit, seen[0], lit_frames)
 
 
