@@ -22,7 +22,6 @@ from .matched_turns import turn_of as turn_of
 from .phase import correlation_peaks as correlation_peaks
 from .phase import correlation_surface as correlation_surface
 from .phase import shift_between as shift_between
-from .phase import shift_by_phase as shift_by_phase
 from .phase import shift_of_spectra as shift_of_spectra
 from .point_locator import PointLocator as PointLocator
 from .points import MIN_NOISE_PX as MIN_NOISE_PX

@@ -21,7 +21,7 @@ def shift_between(moving: View, fixed: View, peak_px: float = 1.5) -> FloatArray
     Args:
         moving: one image.
         fixed: the other one, on the same grid.
-        peak_px: see `shift_by_phase`.
+        peak_px: see `shift_of_spectra`.
     """
     both = moving.seen & fixed.seen
     if not both.any():
@@ -30,19 +30,7 @@ def shift_between(moving: View, fixed: View, peak_px: float = 1.5) -> FloatArray
     distance = cv2.distanceTransform(np.pad(both, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     window = np.sin(np.pi / 2 * np.minimum(distance / (_TAPER * min(both.shape)), 1)) ** 2
     first, second = (window * (view.image - view.image[both].mean()) for view in (moving, fixed))
-    return shift_by_phase(first, second, peak_px)
-
-
-def shift_by_phase(
-    moving: NDArray[np.float32], fixed: NDArray[np.float32], peak_px: float, gaussian_peak: bool = True
-) -> FloatArray | None:
-    """Return the shift (x, y) in px between two windowed images of mean 0, (H, W) and 0 at the borders; None without texture.
-
-    The inverse transform of the normalised cross-power spectrum peaks at the shift. All frequencies have the same weight in it,
-    also those that hold only noise; so it is blurred, which makes the peak a Gaussian of the standard deviation `peak_px`. It
-    is located by a Gaussian through three values, or by a parabola.
-    """
-    return shift_of_spectra(fft.rfft2(moving), fft.rfft2(fixed), moving.shape, peak_px, gaussian_peak)
+    return shift_of_spectra(fft.rfft2(first), fft.rfft2(second), both.shape, peak_px, gaussian_peak=True)
 
 
 def shift_of_spectra(
@@ -50,9 +38,15 @@ def shift_of_spectra(
     fixed: NDArray[np.complexfloating],
     shape: tuple[int, ...],
     peak_px: float,
-    gaussian_peak: bool = True,
+    *,
+    gaussian_peak: bool,
 ) -> FloatArray | None:
-    """Return the shift (x, y) in px between two images (H, W) from their spectra, (H, W // 2 + 1): see `shift_by_phase`."""
+    """Return the shift (x, y) in px between two windowed images of mean 0, (H, W), from their spectra; None without texture.
+
+    The inverse transform of the normalised cross-power spectrum peaks at the shift. All frequencies have the same weight in it,
+    also those that hold only noise; so it is blurred, which makes the peak a Gaussian of the standard deviation `peak_px`. It
+    is located by a Gaussian through three values, or by a parabola. The spectra are (H, W // 2 + 1).
+    """
     surface = correlation_surface(fixed * moving.conj(), shape, peak_px)
     if surface is None:
         return None

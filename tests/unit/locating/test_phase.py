@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano.locating import Follows, View, correlation_peaks, correlation_surface, follows, shift_between, shift_by_phase
+from photonpano.locating import Follows, View, correlation_peaks, correlation_surface, follows, shift_between, shift_of_spectra
 
 SHAPE = (80, 120)
 
@@ -14,9 +14,9 @@ def noise(seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("gaussian_peak", [True, False])
-def test_shift_by_phase_finds_cyclic_shift(gaussian_peak: bool) -> None:
-    image = noise()
-    shift = shift_by_phase(image, np.roll(image, (-7, 50), axis=(0, 1)), 1.5, gaussian_peak)
+def test_shift_of_spectra_finds_cyclic_shift(gaussian_peak: bool) -> None:
+    spectra = (np.fft.rfft2(image) for image in (noise(), np.roll(noise(), (-7, 50), axis=(0, 1))))
+    shift = shift_of_spectra(*spectra, SHAPE, 1.5, gaussian_peak=gaussian_peak)
     np.testing.assert_allclose(shift, [50, -7], atol=0.05)
 
 
