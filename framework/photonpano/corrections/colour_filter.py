@@ -21,7 +21,6 @@ from photonpano.values import Bayer, Decision
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from photonpano.capture import Capture
     from photonpano.contracts.protocols import Source
     from photonpano.corrections.pixels import Decide, Pixels
     from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Response

@@ -30,6 +30,7 @@ class ImageScore:
         psnr_db: peak signal-to-noise ratio, `-10 log10(mean squared difference)`; infinite for equal images.
         ssim: mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 px) over the pixels whose whole window is
             compared; NaN if there is none.
+        compared_share: share of the pixels of the image that are compared.
     """
 
     psnr_db: float
@@ -142,9 +143,8 @@ def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography, aroun
 
 def _scene_points(canvas: Canvas, alignment: Homography, around: FloatArray | None, scene_shape: tuple[int, ...]) -> FloatArray:
     """Return the pixels of the scene that the pixels of a canvas show: (H, W, 2); see `true_panorama`."""
-    (p, s), (q, r) = canvas.columns(), canvas.rows()
-    rays = np.stack([np.outer(r, p), np.broadcast_to(q[:, None], canvas.shape), np.outer(r, s)], axis=-1)
-    on_plane = rays @ (alignment @ np.linalg.inv(canvas.plane_to_rays)).T
+    pixels = np.stack(np.meshgrid(np.arange(canvas.width), np.arange(canvas.height)), axis=-1)
+    on_plane = canvas.on_plane(pixels) @ alignment.T
     if around is None:
         depth = on_plane[..., 2:]
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,1 +1,1 @@
-"""The loop of the paper, the motion graph, the panorama, and the run folder."""
+"""One run, from its beginning to its end: components, passes, executors, checkpoints, observers, and the run folder."""

@@ -1,1 +1,1 @@
-"""The record of a run, `run.json`: its schema, and what writes and reads it."""
+"""What a run leaves as files: `run.json` and its schema, fingerprints of captures, pictures, and poses for other programs."""
