@@ -75,6 +75,13 @@ def test_bytes_of_results_depend_neither_on_threads_nor_on_where_the_spec_comes_
     assert hashes[1:] == hashes[:-1]
 
 
+@pytest.mark.parametrize("model", ["auto", "rotation"])
+def test_capture_of_one_exposure_has_a_panorama_and_no_camera(run: Callable[..., RunResult], model: str) -> None:
+    record = run("resample.with.group_size=160", f"motion.model={model}").record
+    assert [(level["groups"], level["camera"]) for level in record["levels"]] == [(1, None)]
+    assert record["warnings"][0].startswith("only one exposure was located")
+
+
 @pytest.mark.parametrize("wrong", ["frame rate", "backend"])
 def test_run_without_report_keeps_its_results(
     run: Callable[..., RunResult], tmp_path: Path, wrong: str, monkeypatch: pytest.MonkeyPatch
