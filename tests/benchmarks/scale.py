@@ -32,12 +32,12 @@ from scheduling import Costs, Kind, Measured, prediction
 from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulated
 
 from photonpano import ExecutorContext, FrameSpan, Source, discover, parse_spec, run
+from photonpano.capture import capture_of
 from photonpano.execution import CaptureElsewhere, LocalExecutor
 from photonpano.execution.context import Quiet
 from photonpano.execution.remote import packed as packed_for_worker
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging import chunks_of
-from photonpano.pipeline.executors import as_read
 from photonpano_dask.configs import DaskConfig
 
 DASK = discover().find("executor", "dask").contribution
@@ -120,7 +120,7 @@ def measured(cube: Path, n_frames: int) -> Measured:
 
     @contextmanager
     def executor_of(_: Any, source: Source) -> Iterator[Measuring]:
-        executors.append(Measuring(as_read(source), lambda: stages.title))
+        executors.append(Measuring(capture_of(source).source, lambda: stages.title))
         yield executors[0]
 
     spec = packed(cube, None, resample={"with": {"group_size": GROUP_SIZE}}, run={"threads": 1})

@@ -69,7 +69,7 @@ class DarkCounts(Correction):
         return replace(noted, valid=pixels.valid & ~high, dark_rates=np.where(high, np.float32(0), noted.dark_rates))
 
 
-def measure_dark(source: Source, advance: Callable[[int], object] | None = None) -> DarkFrames:
+def measure_dark(source: Source, advance: Callable[[int], object]) -> DarkFrames:
     """Measure the dark counts of a capture that was recorded with the lens covered; `advance` is given numbers of frames read.
 
     The rate of a binary pixel is `-ln(1 - k / n)` for k counts in n frames, as its flux is. The rate of other pixels is the
@@ -79,8 +79,7 @@ def measure_dark(source: Source, advance: Callable[[int], object] | None = None)
     counts = np.zeros(info.frame_shape, np.uint64)
     for span, summed in zip(spans, capture_of(source).chunks(spans), strict=True):
         counts += summed
-        if advance is not None:
-            advance(len(span))
+        advance(len(span))
     mean = (counts / info.n_frames).astype(np.float32)
     return DarkFrames(source.response.flux(mean, info.n_frames) if info.kind == "binary" else mean, info.n_frames)
 

@@ -85,7 +85,7 @@ class Still:
     why: str  # a clause on the masked pixels
 
 
-def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike: Sequence[BoolArray] | None = None) -> Still:
+def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike: Sequence[BoolArray]) -> Still:
     """Find what stands still while the rest of the frame moves, from (M, H, W) sums of binary frames at M times of a capture.
 
     A pixel that sees one thing all the time varies by photon noise only; a pixel that the scene moves past varies by its
@@ -93,12 +93,12 @@ def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike:
     part that moves by s px (root mean square) over a mean squared gradient g varies by about g s^2. Single pixels stand if they
     differ from their neighbours all the time.
 
-    Pixels of each mask in `alike` may be compared with each other, such as those of one colour; by default all. The parts are
-    those that most of the pixels show.
+    Pixels of each mask in `alike` may be compared with each other, such as those of one colour. The parts are those that most
+    of the pixels show.
     """
     import cv2
 
-    colours = [usable & part for part in alike] if alike else [usable]
+    colours = [usable & part for part in alike]
     single = np.logical_or.reduce([_single_pixels(sums, n_frames, part) for part in colours])
     moving, stood = _parts(sums, n_frames, max(colours, key=np.count_nonzero) & ~single)
     standing = _continued(stood, ~moving)

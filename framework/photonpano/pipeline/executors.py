@@ -31,7 +31,7 @@ def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
     if plan.executor is None:
         yield LocalExecutor(thread_count(plan.run.threads))
         return
-    read = as_read(source)
+    read = capture_of(source).source  # as its plugin gives it: it is opened anew in each process
     names = ("photonpano", *library_versions(plan), *(each["plugin"] for each in plugin_records(plan)))
     here = met_by(dict.fromkeys(names), read)
     # Not the document, which hides the passwords of URLs.
@@ -45,11 +45,6 @@ def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
         yield executor
     finally:
         executor.close()
-
-
-def as_read(source: Source) -> PluginSource:
-    """Return the source of a capture as its plugin gives it, which is opened anew in each process."""
-    return capture_of(source).source
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +76,7 @@ class CaptureOpener:
         """Open the capture, whatever this process has."""
         _WHILE_THE_PROCESS_LIVES.enter_context(one_thread_inside())
         spec = {"version": 1, "source": {"use": self.source, "with": self.keys}, "corrections": [], "run": {"seed": self.seed}}
-        return as_read(build_source(parse_spec(spec, output="unused")))
+        return build_source(parse_spec(spec, output="unused")).source
 
 
 _WHILE_THE_PROCESS_LIVES = ExitStack()

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError
+from photonpano.execution.threads import in_order
 from photonpano.merging import binned_mean, binning_of
 from photonpano.motion.tracking.spans import (
     SHORTEST,
@@ -54,8 +54,7 @@ def summarise(source: Source, threads: int = 1) -> CaptureSummary:
         flux = _mean_flux(source, [binned_mean(source, source.info.span)], n_frames)
         return CaptureSummary(flux, None, f"{n_frames} frames are too few to estimate a motion")
     centres = ((np.arange(_PLACES) + 0.5) / _PLACES * n_frames).tolist()
-    with ThreadPoolExecutor(threads, thread_name_prefix="summary") as pool:
-        places = list(pool.map(lambda centre: _measure(source, centre, lengths), centres))
+    places = list(in_order(lambda centre: _measure(source, centre, lengths), centres, threads))
     flux = float(np.mean([flux for flux, _ in places]))
     speeds = sorted((speed for _, speed in places if speed is not None), key=lambda speed: -speed.px)
     if len(speeds) < 2:  # one may agree by chance

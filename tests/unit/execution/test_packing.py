@@ -17,7 +17,7 @@ from photonpano.corrections import ColourFilter, HotPixels, Vignette, corrected_
 from photonpano.corrections.lighting import in_light
 from photonpano.execution.remote import packed, unpacked
 from photonpano.geometry import Camera
-from photonpano.pipeline.executors import CaptureOpener, as_read, met_elsewhere
+from photonpano.pipeline.executors import CaptureOpener, met_elsewhere
 from photonpano.testing import MemorySource
 
 SHAPE, N = (24, 32), 60
@@ -41,8 +41,8 @@ def capture() -> Capture:
 def test_sources_arrive_as_they_left(name: str) -> None:
     here, there = capture(), capture()
     sent = WRAPPERS[name](here)
-    data = packed(sent, as_read(here))
-    arrived: Source = unpacked(data, as_read(there))
+    data = packed(sent, capture_of(here).source)
+    arrived: Source = unpacked(data, capture_of(there).source)
     np.testing.assert_array_equal(arrived.counts(SPAN), sent.counts(SPAN))
     np.testing.assert_array_equal(arrived.valid, sent.valid)
     assert arrived.info == sent.info
@@ -61,7 +61,7 @@ def test_sources_arrive_as_they_left(name: str) -> None:
 
 def test_frames_do_not_travel() -> None:
     here = capture_of(MemorySource(np.zeros((5000, *SHAPE), bool)), "a source of this test")
-    assert len(packed(part_of(here, FrameSpan(0, 4000)), as_read(here))) < 2000
+    assert len(packed(part_of(here, FrameSpan(0, 4000)), here.source)) < 2000
 
 
 def test_what_cannot_travel_is_named() -> None:
@@ -110,7 +110,7 @@ def test_run_on_copies_has_the_same_bytes(tmp_path: Path, monkeypatch: pytest.Mo
 
     @contextmanager
     def executor_elsewhere(_: Any, source: Source) -> Iterator[Elsewhere]:
-        elsewhere.capture = as_read(source)
+        elsewhere.capture = capture_of(source).source
         yield elsewhere
 
     monkeypatch.setattr(run_module, "executor_of", executor_elsewhere)
