@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter1d, uniform_filter, uniform_filter1d
 from photonpano.capture import before, capture_of
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.corrections.lighting.finding import speed_px
-from photonpano.corrections.lighting.gains import scene_canvas
+from photonpano.corrections.lighting.gains import least_weight, scene_canvas
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
 from photonpano.geometry import PATCHES, Camera, Canvas
@@ -117,9 +117,8 @@ def find_background(
     """
     tolerance = _EXACT if exact else _ROUGH
     seen = _seen(source, trajectory, camera, span, context)
-    if seen is None or len(seen.spans) < _FEWEST_SUMS:
+    if seen is None or len(seen.spans) < _FEWEST_SUMS or not (known := seen.known).any():
         return None
-    known = seen.known
     usual, _ = _usual(seen, seen.root)
     steady = seen.steady(usual)
     usual, sure = _usual(seen, steady)
@@ -183,22 +182,27 @@ def _seen(source: Source, trajectory: Trajectory, camera: Camera | None, span: F
     motions = trajectory.at([each.centre for each in spans])
     fine = scene_canvas(camera, motions, source.info.frame_shape, 2 / CELL_PX)
     canvas = fine.part(0, 0, fine.height // 2 * 2, fine.width // 2 * 2)
-    summed = partial(_brightness, source, canvas)
+    summed = partial(_brightness, source, canvas, _COVERED * least_weight(source, CELL_PX))
     root, std = (
         np.array(images) for images in zip(*context.in_order(summed, [*zip(spans, motions, strict=True)]), strict=True)
     )
     return _Seen(spans, motions, canvas, root, std)
 
 
-def _brightness(source: Source, canvas: Canvas, place: tuple[FrameSpan, Homography]) -> tuple[FluxImage, FluxImage]:
-    """Return the square root of the flux of squares in a sum of frames, and its standard deviation: (h, w) each."""
+def _brightness(
+    source: Source, canvas: Canvas, covered: float, place: tuple[FrameSpan, Homography]
+) -> tuple[FluxImage, FluxImage]:
+    """Return the square root of the flux of squares in a sum of frames, and its standard deviation: (h, w) each.
+
+    A square is seen in the share `covered` of the frames at least. `place` is the span, and where its frames lie.
+    """
     span, homography = place
     photons = accumulate(source, [Chunk(span, homography)], canvas, canvas.shape)
     frames = photons.weight if photons.lit is None else photons.lit.frames.sum(axis=0)
     counts, weight, frames = (
         cv2.GaussianBlur(each, (0, 0), _BLUR)[1::2, 1::2] for each in (np.maximum(photons.counts, 0), photons.weight, frames)
     )
-    seen = frames > _COVERED * len(span)
+    seen = frames > covered * len(span)
     mean = np.where(seen, counts / np.maximum(weight, np.float32(1e-3)), 0).astype(np.float32)
     exposure = np.maximum(weight * np.float32(np.pi * (_BLUR * CELL_PX) ** 2), np.float32(1))
     flux = source.response.flux(mean, exposure)

@@ -1,5 +1,6 @@
 """What moves before the background is told from it, and left out of what is merged and compared."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -61,6 +62,15 @@ def shares(found: object, frames: range, side: int = 32, speed: float = 0.06) ->
         hits.append(hidden[square].mean())
         false.append(hidden[~square].mean())
     return float(np.mean(hits)), float(np.mean(false))
+
+
+def test_what_walks_is_hidden_behind_filters_of_which_few_pixels_see_much() -> None:
+    gains = np.tile(np.array([[0.2, 0.4], [1.0, 0.2]], np.float32), (SHAPE[0] // 2, SHAPE[1] // 2))
+    found = find_background(replace(capture_of(panned(with_mover=True)), weight=gains), MOTION, None, ALL, Context(1))
+    assert found is not None
+    hit, false = shares(found, range(100, 1500, 100))
+    assert hit > 0.97
+    assert false < 0.25
 
 
 @pytest.mark.parametrize("light", [0.0, 0.4], ids=["steady", "flickering"])

@@ -99,7 +99,7 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
     while canvas.height * canvas.width > 4 * _MOST_CELLS:
         half *= 2
         canvas = scene_canvas(camera, motions, shape, 1 / half)
-    covered = _COVERED * _least_weight(source, 2 * half)
+    covered = _COVERED * least_weight(source, 2 * half) * float(source.valid.mean())
 
     seen = partial(_seen, source, canvas, half, covered)
     parts = list(context.in_order(seen, list(zip(spans, motions, strict=True))))
@@ -115,14 +115,14 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
     )
 
 
-def _least_weight(source: Source, side: int) -> float:
-    """Return the least weight of a square of `side` px: masked pixels, and those of faint colours, weigh less."""
+def least_weight(source: Source, side: int) -> float:
+    """Return the least mean weight of the valid pixels of a square of `side` px: those of faint colours weigh less than 1."""
     weights = weights_of(source)
     if weights is None:
         return 1.0
     weight, valid = (cv2.blur(each, (side, side)) for each in (weights, source.valid.astype(np.float32)))
     inside = valid >= min(0.5, float(valid.max()))
-    return float((weight[inside] / valid[inside]).min() * source.valid.mean())
+    return float((weight[inside] / valid[inside]).min())
 
 
 def _seen(
