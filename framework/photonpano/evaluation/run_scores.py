@@ -163,7 +163,8 @@ def picture_scores(
 ) -> tuple[ImageScore, ImageScore | None, float]:
     """Score a panorama, and the one that is rendered along the true motion, on the same pixels; and the flux that is white.
 
-    The alignment maps the plane of the canvas to that of the truth. See `score` for errors.
+    Flux and weight are (H, W) or (H, W, 3). The alignment, (3, 3), maps the plane of the canvas to that of the truth, as the
+    true homographies, (T, 3, 3), map pixels of a frame. Raises as `score`.
     """
     assert truth.scene is not None
     white = white_flux(truth.scene)

@@ -229,7 +229,7 @@ def binning_of(source: Source) -> int:
 
 
 def binned_mean(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the mean count per frame of a span in binned pixels; NaN where no pixel is valid."""
+    """Return the mean count per frame of a span in binned pixels, (h, w); NaN where no pixel is valid."""
     capture = before(source, None)
     if len(pieces := capture.pieces(span)) > 1:
         means = np.array([binned_mean(source, each) for each in pieces])

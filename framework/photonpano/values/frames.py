@@ -37,7 +37,7 @@ class FrameSpan:
 
 
 def true_spans(flags: BoolArray) -> list[FrameSpan]:
-    """Return the runs of frames whose flag is set, in order."""
+    """Return the runs of frames whose flag, of (T,), is set, in order."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [FrameSpan(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 

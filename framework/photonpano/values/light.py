@@ -41,7 +41,7 @@ class Light:
 
     @classmethod
     def of_frames(cls, gain: FloatArray, frequency: float = 0.0, std: FloatArray | None = None) -> Light:
-        """Return light that is the same all over the scene."""
+        """Return light of (T,) gains that is the same all over the scene; their (T,) standard deviations are 0 by default."""
         nothing = np.zeros_like(gain) if std is None else std
         return cls(gain, np.zeros((0, len(gain))), np.zeros((0, 1, 1), np.float32), np.eye(3), frequency, nothing)
 

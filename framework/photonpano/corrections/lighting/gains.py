@@ -148,7 +148,10 @@ def _seen(
 
 
 def scene_canvas(camera: Camera | None, motions: FloatArray, frame_shape: tuple[int, int], scale: float) -> Canvas:
-    """Return a canvas that holds all frames: a sphere if the camera, None unless it turns, turns far."""
+    """Return a canvas that holds all frames, `scale` pixels to one of a frame: a sphere if the camera turns far, or a plane.
+
+    The motions are (N, 3, 3), pixels of a frame to pixels of the reference plane; the camera is None unless it turns.
+    """
     if camera is not None:
         covered = covered_by(camera.rotations(motions), camera, frame_shape)
         if covered.field_of_view > _WIDEST:
