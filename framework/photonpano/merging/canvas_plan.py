@@ -27,6 +27,7 @@ from photonpano.values import FloatArray, FrameSpan
 BYTES_PER_PIXEL = 40  # peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests
 # A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time.
 MAX_EXCESS = 16
+_LEAST_SCALE = 0.05  # that render.scale may have
 # Up to the first field of view, "auto" takes a plane; beyond the second, a plane is refused.
 _PLANAR_DEGREES, _WIDEST_PLANE_DEGREES = 90, 100
 # Up to the first distance from b = 0, "auto" takes a cylinder; beyond the second, a cylinder is refused.
@@ -63,7 +64,7 @@ def plan_canvas(
     Raises:
         ExtentError: no frame shows the extent.
         CanvasTooLargeError: the canvas has more than `MAX_EXCESS` times the pixels that fit into memory; the message suggests
-            a scale that fits.
+            a scale that fits, if there is one.
         LocationError: frames reach the horizon of the reference plane.
         ProjectionError: the motion does not suit the projection.
     """
@@ -74,12 +75,13 @@ def plan_canvas(
     if excess > MAX_EXCESS:
         fitting = scale * np.sqrt(MAX_EXCESS / excess)
         digit = 10.0 ** (np.floor(np.log10(fitting)) - 1)  # two are significant; rounded down, the suggestion fits
+        suggested = float(np.floor(fitting / digit) * digit)
+        lower = f"lower render.scale from {scale:g} to {suggested:g}, " if suggested >= _LEAST_SCALE else ""
         raise CanvasTooLargeError(
             f"the panorama would have {canvas.height}x{canvas.width} px, {excess:.0f} times what fits into the "
             f"{memory / 1024**3:.2g} GiB of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
-            "More often means that the motion is wrong. Raise run.memory, "
-            f"lower render.scale from {scale:g} to {np.floor(fitting / digit) * digit:g}, "
-            "or choose a render.reference nearer to the middle of the motion"
+            f"More often means that the motion is wrong. Raise run.memory, {lower}or choose a render.reference nearer to the "
+            "middle of the motion"
         )
     return canvas
 

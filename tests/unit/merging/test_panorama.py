@@ -40,6 +40,11 @@ def test_plan_canvas_refuses_canvas_far_beyond_memory(pan: Callable) -> None:
     )
 
 
+def test_plan_canvas_suggests_no_scale_that_specs_refuse(pan: Callable) -> None:
+    with pytest.raises(CanvasTooLargeError, match=r"Raise run\.memory, or choose a render\.reference"):
+        plan_canvas(pan(1e5), ALL, SHAPE, 1.0, GIB // 4096)
+
+
 @pytest.mark.parametrize(("scale", "memory"), [(8.0, GIB // 8), (1.0, GIB // 256), (0.9, GIB // 256)])
 def test_plan_canvas_suggests_largest_scale_that_fits(pan: Callable, scale: float, memory: int) -> None:
     with pytest.raises(CanvasTooLargeError) as caught:
