@@ -52,7 +52,7 @@ def on_canvas(
     The picture may be smaller than its canvas. The alignment is (3, 3), pixels of its reference plane to pixels of that of the
     common canvas. `whites` are the flux that is white in the picture, and in the result; None keeps the levels.
     """
-    pixels = np.stack(np.meshgrid(np.arange(common.width), np.arange(common.height)), axis=-1)
+    pixels = np.stack(np.meshgrid(np.arange(float(common.width)), np.arange(float(common.height))), axis=-1)
     places = canvas.pixels(common.on_plane(pixels) @ (canvas.plane_to_rays @ inverse(alignment)).T).astype(np.float32)
     reduction = np.array([canvas.width / picture.shape[1], canvas.height / picture.shape[0]], np.float32)
     x, y = np.moveaxis((places + 0.5) / reduction - 0.5, -1, 0)

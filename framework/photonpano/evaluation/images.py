@@ -143,7 +143,7 @@ def true_panorama(scene: FluxImage, canvas: Canvas, alignment: Homography, aroun
 
 def _scene_points(canvas: Canvas, alignment: Homography, around: FloatArray | None, scene_shape: tuple[int, ...]) -> FloatArray:
     """Return the pixels of the scene that the pixels of a canvas show: (H, W, 2); see `true_panorama`."""
-    pixels = np.stack(np.meshgrid(np.arange(canvas.width), np.arange(canvas.height)), axis=-1)
+    pixels = np.stack(np.meshgrid(np.arange(float(canvas.width)), np.arange(float(canvas.height))), axis=-1)
     on_plane = canvas.on_plane(pixels) @ alignment.T
     if around is None:
         depth = on_plane[..., 2:]
