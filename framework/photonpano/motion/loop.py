@@ -70,7 +70,7 @@ def estimate_motion(
     previous: Trajectory | None = None,
     timeline: Timeline | None = None,
     model: MotionModel = HOMOGRAPHIES,
-    corrects: bool = False,
+    corrected: Trajectory | None = None,
     known: FrameSpan | None = None,
     gyroscope: Gyroscope | None = None,
 ) -> list[LevelResult]:
@@ -82,8 +82,9 @@ def estimate_motion(
 
     The homography of the frame `reference` is the identity. With `until_converged`, the loop ends as soon as another level
     would gain nothing: see `converges`. `previous` is the motion known so far, which each level replaces; one that
-    `corrects` keeps its tremor, and one that is `known` in some frames alone was extrapolated to the others. Without a
-    timeline, no frame is missing or repeated. A `gyroscope` ties exposures, and knows how they tremble.
+    is `known` in some frames alone was extrapolated to the others. A motion that is `corrected`, by default that of the
+    gyroscope, is not replaced: it keeps its tremor, and goes on beyond the first and the last exposure. Without a timeline, no
+    frame is missing or repeated. A `gyroscope` ties exposures, and knows how they tremble.
 
     Raises:
         InputError: the images contradict points that are tied by hand, or the gyroscope.
@@ -91,8 +92,9 @@ def estimate_motion(
         PluginError: a component failed, or broke its contract.
     """
     results: list[LevelResult] = []
-    along = None if gyroscope is None else gyroscope.trajectory(reference)
-    previous, timeline = along if previous is None else previous, timeline or Timeline.regular(source.info.n_frames)
+    if corrected is None and gyroscope is not None:
+        corrected = gyroscope.trajectory(reference)
+    previous, timeline = corrected if previous is None else previous, timeline or Timeline.regular(source.info.n_frames)
     for level in levels:
         if results and context.time_limit.leaves_out("further levels"):
             break
@@ -108,7 +110,7 @@ def estimate_motion(
             start = start and replace(start, timeline=timeline)
         exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start, known)
         located = locate(exposures, graph, context, model, start, gyroscope)
-        trajectory = interpolate(level, located, timeline, reference, clock, previous if corrects else along)
+        trajectory = interpolate(level, located, timeline, reference, clock, corrected)
         require_agreement(ties_of(graph.tie, seen), groups, located.solution.located, trajectory)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))

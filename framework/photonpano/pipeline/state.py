@@ -69,14 +69,17 @@ class State:
     refined: FrameMotion | None = None
     known_fit: MotionFit | None = None
 
-    def located(self, levels: Sequence[Level], previous: Trajectory | None, corrects: bool = False) -> State:
-        """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels."""
+    def located(self, levels: Sequence[Level], previous: Trajectory | None, corrected: Trajectory | None = None) -> State:
+        """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels.
+
+        They correct the start, or the motion that is `corrected`, instead of replacing it.
+        """
         if not levels:
             return self
         before = [each for each in self.results if each.level.number < levels[0].number]
         given = self.plan.graph, self.reference, self.context, self.plan.until_converged, previous, self.timeline, self.model
         known = self.results[-1].located.covered if self.results else None
-        results = estimate_motion(self.source, levels, *given, corrects, known, self.gyroscope)
+        results = estimate_motion(self.source, levels, *given, corrected or self.start, known, self.gyroscope)
         return replace(self, results=(*before, *results), outdated=False)
 
     def relocated(self) -> State:
@@ -89,7 +92,7 @@ class State:
         if self.motion.camera is not None:
             motion = RotationTrajectory(motion, self.motion.camera, self.reference)
         result = self.results[-1]
-        again = replace(self, model=result.located.solution.model).located([result.level], motion, corrects=True)
+        again = replace(self, model=result.located.solution.model).located([result.level], motion, motion)
         again = replace(again, refined=None, known_fit=None)
         known, before = self.motion.std_px, replace(self, refined=None).motion.std_px
         finite = np.isfinite(known) & np.isfinite(before)

@@ -15,6 +15,7 @@ from photonpano.geometry import from_parameters, inverse, normalised, translatio
 from photonpano.motion.level import Level
 from photonpano.motion.loop import LevelResult, ReferencedTrajectory, converges, estimate_motion
 from photonpano.motion.timeline import Cut, Timeline
+from photonpano.motion.tracking.velocity import ConstantVelocity, Velocity
 from photonpano.specs.settings import GraphSettings
 
 N_FRAMES = 120
@@ -119,6 +120,16 @@ def test_the_motion_converges_while_changes_shrink_and_exceed_their_error(
     """As with a tremor, whose changes do not shrink; the expected error is 0.2 px."""
     results = [Mock(change_px=each, converged=each is not None and each < 0.2) for each in changes_px]
     assert converges(results) is expected
+
+
+def test_motion_that_is_corrected_goes_on_beyond_the_exposures(run: Callable, make_level: Callable, known_motion: type) -> None:
+    """A fan turns by 3 degrees a frame, and drifts by 0.1 px beyond each end, where the interpolator stands still."""
+    fan = ConstantVelocity(Velocity(np.radians(3), np.zeros(2), np.array([30.0, 20.0])), 60)
+    drifting = known_motion(lambda frame: fan.at([frame])[0] @ translation(0.02 * (frame - 60), 0))
+    levels = [make_level(drifting, number=number) for number in (1, 2)]
+    *_, result = run(*levels, previous=fan, corrected=fan)
+    frames = np.arange(N_FRAMES)
+    np.testing.assert_allclose(result.trajectory.at(frames), drifting.at(frames), atol=0.1)
 
 
 def raising(error: BaseException) -> Callable[..., Any]:
