@@ -64,7 +64,7 @@ def captures(data: Path) -> Iterator[tuple[str, str, Path | Mapping[str, Any]]]:
         settings = {"path": str(path.resolve()), **sections.pop("settings", {})}
         return {"version": 1, "source": {"use": use, "with": settings}, **sections}
 
-    turns = "mask, flat field, constant velocity"
+    turns = "mask, flat field, constant velocity, homographies"
     yield "mandrill on a fan", turns, EXAMPLES / "pipelines" / "mandrill.yaml"
     yield "USAF 1951 on a fan", turns, EXAMPLES / "pipelines" / "usaf.yaml"
     helicopter = {"frame_shape": [250, 248], "frame_rate_hz": 20_000}
