@@ -30,7 +30,7 @@ from photonpano import (
 )
 from photonpano.geometry import Camera, camera_matrix, positions_of
 from photonpano.locating import blur_against_noise, stabilised_8_bit
-from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, counted, too_few_averages
+from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, counted, starts_of, too_few_averages
 from photonpano_colmap.pose_noise import PoseNoise, pose_noise
 from photonpano_colmap.posing.merging import lit_counts
 from photonpano_colmap.posing.path import PoseSpline, left_out
@@ -92,11 +92,7 @@ class AveragesEstimator:
         if size == "auto":
             size, reason = chosen_size(self._context.capture(), n_frames)
             self._context.decide("group_size", size, reason)
-        if self._config.step == "auto":  # side by side, and the last one ends with the capture
-            starts = np.linspace(0, n_frames - size, -(-n_frames // size)).round().astype(int).tolist()
-        else:
-            starts = list(range(0, n_frames - size + 1, self._config.step))
-        spans = [FrameSpan(start, start + size) for start in starts if n_frames >= size]
+        spans = [FrameSpan(start, start + size) for start in starts_of(n_frames, size, self._config.step)]
         if problem := too_few_averages(n_frames, len(spans), size):
             raise LocationError(problem)
         return spans

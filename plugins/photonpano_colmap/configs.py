@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
 from photonpano import Config
@@ -14,9 +15,19 @@ SEEDS = 2**31  # seeds of the library are below this
 MIN_AVERAGES = 5  # a spline through fewer poses would be a guess
 
 
+def starts_of(n_frames: int, size: int, step: int | Literal["auto"]) -> list[int]:
+    """Return the first frame of each average of `size` frames that lies in a capture."""
+    if n_frames < size:
+        return []
+    if step != "auto":
+        return list(range(0, n_frames - size + 1, step))
+    # Side by side, and the last one ends with the capture.
+    return [round(start) for start in np.linspace(0, n_frames - size, -(-n_frames // size))]
+
+
 def counted(averages: int) -> str:
     """Return a number of averages in words."""
-    return "1 average" if averages == 1 else f"{max(0, averages)} averages"
+    return "1 average" if averages == 1 else f"{averages} averages"
 
 
 def too_few_averages(n_frames: int, averages: int, size: int) -> str | None:

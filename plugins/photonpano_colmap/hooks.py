@@ -6,7 +6,13 @@ from collections.abc import Iterator
 
 import photonpano_colmap as plugin
 from photonpano import LocatorContribution, PoseEstimatorContribution, Requirement, StreamInfo, hookimpl
-from photonpano_colmap.configs import ColmapAveragesConfig, PycolmapTwoViewConfig, StratifiedPoseConfig, too_few_averages
+from photonpano_colmap.configs import (
+    ColmapAveragesConfig,
+    PycolmapTwoViewConfig,
+    StratifiedPoseConfig,
+    starts_of,
+    too_few_averages,
+)
 
 _REQUIRES = (Requirement("pycolmap", "photonpano[colmap]"),)
 
@@ -47,6 +53,6 @@ def photonpano_pose_estimators() -> Iterator[PoseEstimatorContribution]:
 def _problems_of_averages(config: ColmapAveragesConfig, stream: StreamInfo) -> list[str]:
     if config.group_size == "auto":
         return []
-    step = config.group_size if config.step == "auto" else config.step
-    problem = too_few_averages(stream.n_frames, 1 + (stream.n_frames - config.group_size) // step, config.group_size)
+    starts = starts_of(stream.n_frames, config.group_size, config.step)
+    problem = too_few_averages(stream.n_frames, len(starts), config.group_size)
     return [problem] if problem else []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -170,6 +170,26 @@ def test_few_averages_are_refused() -> None:
     assert problem == words
     with pytest.raises(LocationError, match=words):
         AveragesEstimator(config, SimpleNamespace()).estimate(MemorySource(np.zeros((160, 8, 8))), CameraGuess(), Quiet())
+
+
+@pytest.mark.parametrize(
+    ("n_frames", "step", "refused"),
+    [
+        (1000, "auto", True),
+        (1001, "auto", False),
+        (1150, "auto", False),
+        (1249, 250, True),
+        (1250, 250, False),
+        (100, 50, True),
+    ],
+)
+def test_the_check_counts_the_averages_that_the_run_makes(n_frames: int, step: int | Literal["auto"], refused: bool) -> None:
+    config, stream = ColmapAveragesConfig(group_size=250, step=step), StreamInfo(n_frames, 8, 8, None)
+    assert bool(discover().find("pose-estimator", "colmap-averages").contribution.check(config, stream)) == refused
+    with pytest.raises(LocationError, match="at least 5 are needed" if refused else "keypoints"):
+        AveragesEstimator(config, SimpleNamespace(seed=0)).estimate(
+            MemorySource(np.zeros((n_frames, 8, 8))), CameraGuess(), Quiet()
+        )
 
 
 @pytest.mark.parametrize(
