@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from photonpano.values import BoolArray, FluxImage, Response
 
 _STEP = 0.01  # relative step of numerical derivatives
-_NEARLY = 0.9  # frames in which a pixel was dark, by its flux, below which it is saturated
+_NEARLY = 0.9  # counts, over all frames, that a saturated pixel may lack: one dark binary frame is one
+_ROUNDING = 1e-6  # relative rounding error of a mean count
 _MANY_FRAMES = 1e12
 _EXACT_FRAMES = 1e4  # for which the variance of a frame is derived, where stabilised scales hold
 _FLUXES = 4000  # fluxes at which the signal-to-noise ratio is computed, to find where it is 1
@@ -93,7 +94,7 @@ def frame_variance(
 
 
 def saturated(flux: FluxImage, weight: FluxImage, response: Response) -> BoolArray:
-    """Find the pixels that were lit in every frame: their flux is a lower bound.
+    """Find the pixels that had the highest count in every frame, such as a photon in each binary one: flux is a lower bound.
 
     Args:
         flux: any shape, photons per pixel per frame; NaN counts as not saturated.
@@ -102,7 +103,8 @@ def saturated(flux: FluxImage, weight: FluxImage, response: Response) -> BoolArr
     """
     frames = np.maximum(weight, 1)
     highest = response.mean_count(np.array([np.inf], np.float32))
-    nearly = response.flux(np.asarray(highest * (1 - np.float32(_NEARLY) / frames), np.float32), frames)
+    lacking = np.maximum(np.float32(_NEARLY) / frames, np.float32(_ROUNDING) * highest)
+    nearly = response.flux(np.asarray(highest - lacking, np.float32), frames)
     return np.asarray((flux >= nearly) & (weight > 0))
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from photonpano import Response
 from photonpano.photometry import (
     BinaryResponse,
     BinarySumResponse,
@@ -119,6 +120,15 @@ def test_saturated_finds_pixels_lit_in_every_frame() -> None:
     weight = np.array([N, N, N, 0], np.float32)
     flux = debiased(BinaryResponse().flux(lit / N, np.float32(N)), weight, BinaryResponse())
     np.testing.assert_array_equal(saturated(flux, weight, BinaryResponse()), [True, False, False, False])
+
+
+@pytest.mark.parametrize("response", [BinarySumResponse(255), IntensityResponse(2.0, 16.0, 255.0, 1.0)], ids=["sums", "levels"])
+@pytest.mark.parametrize("n_frames", [1, 2, 100, 1000])
+def test_a_pixel_that_lacks_one_count_in_one_frame_is_not_saturated(response: Response, n_frames: int) -> None:
+    counts = np.array([255, 255 - 1 / n_frames, 250, 30], np.float32)
+    flux = response.flux(counts, np.float32(n_frames))
+    found = saturated(flux, np.full(4, n_frames, np.float32), response)
+    np.testing.assert_array_equal(found, [True, False, False, False])
 
 
 @pytest.mark.parametrize(
