@@ -129,8 +129,10 @@ def require_agreement(ties: Ties | None, groups: Sequence[Group], located: BoolA
         return
     worst = int((away_px / ties.tolerance_px).argmax())
     # Only ties across the same frames can contradict each other.
-    (last, first), apart_px = ties.frames[worst], np.linalg.norm(away - away[worst], axis=1)
-    other = int(np.where((ties.frames[:, 1] < last) & (first < ties.frames[:, 0]), apart_px, 0).argmax())
+    last, first = ties.frames[worst]
+    across = (ties.frames[:, 1] < last) & (first < ties.frames[:, 0])
+    apart_px = np.where(across, np.linalg.norm(away - away[worst], axis=1), 0)
+    other = int(apart_px.argmax())
     if apart_px[other] > ties.tolerance_px[worst]:
         named = listed(map(str, sorted(ties.lines[[worst, other]])))
         raise InputError(
