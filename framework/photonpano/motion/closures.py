@@ -39,12 +39,12 @@ def closure_candidates(
     if graph.closure_overlap is None:
         return []
     instants, lengths = instants_of(groups), lengths_of(groups)
-    length = float(np.median(lengths))
+    length = float(np.quantile(lengths, 0.5, method="lower"))  # one that occurs
     spacing = float(np.median(np.diff(instants))) if len(groups) > 1 else length
     chosen = np.flatnonzero(solution.located & (lengths == length))[:: max(1, round(length / spacing))]
     min_interval = _MIN_SKIP * max([1.0, *graph.skips]) * length
     pairs: list[tuple[int, int]] = []
-    step = -(-len(chosen) // _MAX_EXPOSURES)
+    step = max(1, -(-len(chosen) // _MAX_EXPOSURES))
     for position, moving in list(enumerate(chosen))[::step]:
         earlier = chosen[:position]
         overlap = _overlaps(solution.homographies[moving], solution.homographies[earlier], frame_shape)

@@ -50,8 +50,8 @@ def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int,
 def alike(pairs: Sequence[tuple[int, int]], to_plane: FloatArray, shape: tuple[int, int]) -> list[tuple[int, int]]:
     """Leave out the pairs that see too little alike by the motion known so far, (N, 3, 3), if others tie their exposures."""
     seen = [pair for pair in pairs if not why_implausible(inverse(to_plane[pair[1]]) @ to_plane[pair[0]], shape)]
-    labels = component_labels(len(to_plane), np.array(seen, dtype=int).reshape(-1, 2))
-    return seen if labels.max() == component_labels(len(to_plane), np.array(pairs, dtype=int)).max() else list(pairs)
+    left, tied = (component_labels(len(to_plane), np.array(some, dtype=int).reshape(-1, 2)) for some in (seen, pairs))
+    return seen if left.max() == tied.max() else list(pairs)
 
 
 def excluded_pairs(groups: Sequence[Group], frames: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:

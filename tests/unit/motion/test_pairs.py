@@ -333,6 +333,21 @@ def test_candidates_skip_exposures_that_are_not_located_and_groups_of_another_le
     assert len(pairs) >= 16
 
 
+@pytest.mark.parametrize(
+    ("lengths", "lost", "pairs"),
+    [((10, 10, 10, 20, 20, 20), (), [(2, 0)]), ((10, 10, 10, 20), (0, 1, 2), [])],
+    ids=["two lengths", "none of the typical length"],
+)
+def test_candidates_have_a_length_that_occurs(
+    lengths: tuple[int, ...], lost: tuple[int, ...], pairs: list[tuple[int, int]]
+) -> None:
+    stops = np.cumsum(lengths).tolist()
+    spread = [Group(FrameSpan(stop - size, stop), stop - (size + 1) / 2) for stop, size in zip(stops, lengths, strict=True)]
+    located = ~np.isin(np.arange(len(lengths)), lost)
+    homographies = np.array([translation(x, 0) for x in (0, 100, 0, 100, 200, 300)[: len(lengths)]])
+    assert candidates(spread, homographies, located, skips=()) == pairs
+
+
 @given(
     places=st.lists(st.tuples(st.floats(-80, 80), st.floats(-40, 40)), min_size=1, max_size=40),
     step=st.integers(20, 150),
@@ -367,3 +382,4 @@ def test_pairs_that_see_too_little_alike_are_left_out_unless_exposures_would_los
     to_plane = np.array([translation(x, 0) for x in (0, 30, 95, 300)])
     assert alike([(1, 0), (2, 0), (2, 1)], to_plane[:3], (60, 101)) == [(1, 0), (2, 1)]
     assert alike([(1, 0), (2, 1), (3, 2)], to_plane, (60, 101)) == [(1, 0), (2, 1), (3, 2)]
+    assert alike([], to_plane[:1], (60, 101)) == []
