@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from photonpano import Panorama
-from photonpano.geometry import apply
+from photonpano.geometry import transform_points
 from photonpano.photometry import tone_mapped
 
 Picture: TypeAlias = NDArray[np.uint8]
@@ -123,7 +123,7 @@ def place(panorama: Panorama, point: Sequence[float], radius: tuple[int, int], w
     """Return the surroundings of a point of the reference plane, magnified twice."""
     height, width = panorama.flux.shape[:2]
     radius = min(radius[0], width // 2), min(radius[1], height // 2)
-    x, y = apply(panorama.canvas, np.array([point]))[0].round().astype(int)
+    x, y = transform_points(panorama.canvas, np.array([point]))[0].round().astype(int)
     x, y = int(np.clip(x, radius[0], width - radius[0])), int(np.clip(y, radius[1], height - radius[1]))
     return magnified(picture(around(panorama.flux, (x, y), radius), white), 2)
 

@@ -11,7 +11,7 @@ from harness import EXAMPLES, Study
 from numpy.typing import NDArray
 
 from photonpano import load_panorama, load_spec, load_trajectory, open_source, run, warp
-from photonpano.geometry import apply, translation
+from photonpano.geometry import transform_points, translation
 
 # From pixels of the middle frame of usaf.yaml to the chart, upright, 4 px for each.
 _TILT_RAD, _ZOOM, _CHART_SIZE = np.deg2rad(31.8), 4.0, (1000, 1240)
@@ -90,7 +90,7 @@ def _profile(image: NDArray[np.float32], middle: tuple[float, float], period: fl
     across, along = np.arange(-1.25 * period, 1.25 * period, 0.5), np.linspace(-0.9 * period, 0.9 * period, 15)
     first, second = np.meshgrid(across, along)
     points = np.stack([second, first] if level else [first, second], axis=-1) + middle
-    x, y = np.moveaxis(apply(np.linalg.inv(_to_chart()), points).astype(np.float32), -1, 0)
+    x, y = np.moveaxis(transform_points(np.linalg.inv(_to_chart()), points).astype(np.float32), -1, 0)
     profile = cv2.remap(image, x, y, cv2.INTER_LINEAR).mean(axis=0)
     wave = np.cos(2 * np.pi * across / period)
     return float(profile[wave > np.sqrt(0.5)].mean()), float(profile[wave < -np.sqrt(0.5)].mean())

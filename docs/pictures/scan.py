@@ -11,7 +11,7 @@ import tifffile
 from harness import EXAMPLES, Study, groups
 
 from photonpano import FrameSpan, load_panorama, load_spec, open_source, run
-from photonpano.geometry import apply
+from photonpano.geometry import transform_points
 
 from . import finished
 
@@ -34,7 +34,7 @@ def pictures(study: Study) -> Iterator[tuple[str, draw.Picture]]:
     panoramas = {f"{name}.yaml": load_panorama(folder) for name, folder in runs.items()}
     places = {}
     for name, panorama in panoramas.items():
-        x, y = apply(panorama.canvas, np.array([PLACE]))[0].round().astype(int)
+        x, y = transform_points(panorama.canvas, np.array([PLACE]))[0].round().astype(int)
         places[name] = draw.magnified(draw.picture(draw.around(panorama.flux, (x, y), (54, 54)), 0.67), 3)
     yield "baselines.png", draw.beside(draw.all_labelled(places))
     yield "hot-pixels.png", hot_pixels(study)

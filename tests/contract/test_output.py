@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from photonpano.geometry import apply, corners
+from photonpano.geometry import corners, transform_points
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.run import RunResult
 from photonpano.record.schema import LevelRecord, RunRecord
@@ -105,10 +105,10 @@ def test_canvas_maps_the_reference_frame_to_the_panorama(folder: Path, trajector
     """Every located frame lies on the panorama, and its middle was seen."""
     coverage = tifffile.imread(folder / "coverage.tiff")
     to_panorama = trajectory["canvas"] @ trajectory["homographies"][trajectory["located"]]
-    placed = apply(to_panorama, corners(SHAPE))
+    placed = transform_points(to_panorama, corners(SHAPE))
     assert placed.min() > -0.5
     assert (placed.max(axis=(0, 1)) < np.array(coverage.shape[::-1]) - 0.5).all()
-    middles = np.rint(apply(to_panorama, [[(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2]])[:, 0]).astype(int)
+    middles = np.rint(transform_points(to_panorama, [[(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2]])[:, 0]).astype(int)
     assert coverage[middles[:, 1], middles[:, 0]].min() > 100
 
 

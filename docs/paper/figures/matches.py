@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from paper.figures.study import QUICK_STREET, Claim, Numbers, rounded
 
 from photonpano import FrameSpan, Group, Located, StageContext, discover, open_source, parse_spec
-from photonpano.geometry import FrameTrajectory, apply, corner_displacements, inverse
+from photonpano.geometry import FrameTrajectory, corner_displacements, inverse, transform_points
 
 BLUR_PX = (0, 3, 6, 12, 20, 30)  # blur of the frames, which are 30 px apart
 PHOTONS = (3000, 300, 100, 30, 10, 3)  # per pixel per frame, from little noise to much
@@ -91,7 +91,7 @@ def correct_matches(moving: draw.Picture, fixed: draw.Picture, motion: NDArray[n
         return 0
     at = np.array([first[match.queryIdx].pt for match in matches])
     to = np.array([second[match.trainIdx].pt for match in matches])
-    return int((np.linalg.norm(apply(motion, at) - to, axis=-1) < CORRECT_PX).sum())
+    return int((np.linalg.norm(transform_points(motion, at) - to, axis=-1) < CORRECT_PX).sum())
 
 
 def heat_maps(numbers: Numbers, width: int) -> draw.Picture:

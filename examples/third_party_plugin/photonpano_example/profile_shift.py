@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import Located, NotLocated, VirtualExposure
-from photonpano.geometry import apply, translation
+from photonpano.geometry import transform_points, translation
 from photonpano.locating import ImageLimits, View, motion_from_images, view_of
 from photonpano_example.profiles import offset, profile
 
@@ -28,7 +28,7 @@ class ProfileShift:
     def register(self, moving: View, fixed: View, initial: NDArray[np.float64] | None) -> Located | NotLocated:
         """Estimate the shift of `moving` onto `fixed`, starting from `initial`; see `photonpano.Locator`."""
         middle = (np.array([moving.shape[::-1]]) - 1) / 2
-        x, y = (0.0, 0.0) if initial is None else (apply(initial, middle) - middle)[0]
+        x, y = (0.0, 0.0) if initial is None else (transform_points(initial, middle) - middle)[0]
         furthest = int(self.reach * max(moving.shape))
         for _ in range(ROUNDS):
             there = fixed.seen_from(translation(x, y))

@@ -14,7 +14,16 @@ import pytest
 
 from photonpano.contracts.loop import LOCATED, NOT_LOCATED, contract_for
 from photonpano.contracts.protocols import LocatesTurns
-from photonpano.geometry import Camera, apply, corner_displacements, corners, from_parameters, inverse, jacobian, translation
+from photonpano.geometry import (
+    Camera,
+    corner_displacements,
+    corners,
+    from_parameters,
+    inverse,
+    jacobian,
+    transform_points,
+    translation,
+)
 from photonpano.plugins.contributions import LocatorContribution
 from photonpano.testing.captures import photographed, read_only, rolled
 from photonpano.testing.conformance import must_not_raise, passing
@@ -192,7 +201,7 @@ class LocatorConformance(AnswerConformance):
             # Expected corner error, given the parameters that are not estimated, which are exact here.
             covariance = np.linalg.inv(matrix[np.ix_(free, free)])
             predicted.append(np.trace(to_corners[:, free] @ covariance @ to_corners[:, free].T))
-            errors.append(np.sum((apply(found.homography, frame) - apply(true, frame)) ** 2))
+            errors.append(np.sum((transform_points(found.homography, frame) - transform_points(true, frame)) ** 2))
         actual_px, expected_px = (float(np.sqrt(np.mean(squares) / 4)) for squares in (errors, predicted))
         ratio = actual_px / expected_px
         assert 1 / self.information_factor < ratio < self.information_factor, (

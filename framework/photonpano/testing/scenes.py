@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from photonpano.geometry import apply
+from photonpano.geometry import transform_points
 from photonpano.values import BoolArray, FloatArray, Homography
 
 _WAVES = 64
@@ -52,7 +52,7 @@ class Scene:
             shape: (height, width) of the image.
         """
         y, x = np.mgrid[: shape[0], : shape[1]]
-        return self.flux(apply(homography, np.stack([x.ravel(), y.ravel()], axis=1))).reshape(shape)
+        return self.flux(transform_points(homography, np.stack([x.ravel(), y.ravel()], axis=1))).reshape(shape)
 
 
 def textured(shape: tuple[int, int], flux: float = 0.5, contrast: float = 0.8, seed: int = 0) -> FloatArray:

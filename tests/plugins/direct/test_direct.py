@@ -13,7 +13,6 @@ import pytest
 from photonpano import FrameSpan, Group, Located, NotLocated, VirtualExposure
 from photonpano.geometry import (
     Camera,
-    apply,
     corner_displacements,
     corners,
     inverse,
@@ -21,6 +20,7 @@ from photonpano.geometry import (
     patch_centres,
     rotation_matrices,
     scaled_ahead,
+    transform_points,
     translation,
 )
 from photonpano.locating import NO_TEXTURE, NOTHING_SEEN
@@ -53,7 +53,7 @@ def test_information_predicts_scatter_over_noisy_pairs(seen_from: Callable, brig
         assert located.evidence["noise_ratio"] == pytest.approx(1, abs=0.2)
         to_corners = jacobian(located.homography, frame).reshape(8, 8)
         predicted.append(np.trace(to_corners @ np.linalg.inv(located.information) @ to_corners.T))
-        errors.append(np.sum((apply(located.homography, frame) - apply(true, frame)) ** 2))
+        errors.append(np.sum((transform_points(located.homography, frame) - transform_points(true, frame)) ** 2))
     assert 0.5 < np.sqrt(np.mean(errors) / np.mean(predicted)) < 2
 
 
@@ -79,7 +79,7 @@ def test_structure_in_one_per_cent_of_the_frame_is_found_and_gradients_alone_are
         register(photographed(before_a_sky(70, 120), 2 * n), photographed(before_a_sky(72, 125), 2 * n + 1), STILL)
         for n in range(8)
     ]
-    shifts = [apply(each.homography, np.array([[120.0, 75.0]]))[0] for each in found if isinstance(each, Located)]
+    shifts = [transform_points(each.homography, np.array([[120.0, 75.0]]))[0] for each in found if isinstance(each, Located)]
     assert len(shifts) == 8
     np.testing.assert_allclose(shifts, np.tile([125, 77], (len(shifts), 1)), atol=1.2)
     sky = np.tile(np.linspace(0.05, 0.15, SHAPE[0])[:, None], SHAPE[1])
@@ -117,7 +117,7 @@ def test_patches_lie_where_the_motion_has_them_by_their_information(seen_from: C
         located = register(seen_from(true, seed=2 * seed), seen_from(STILL, seed=2 * seed + 1), true)
         assert isinstance(located, Located)
         assert located.patches is not None
-        away = apply(located.homography, places) + located.patches.shifts - apply(true, places)
+        away = transform_points(located.homography, places) + located.patches.shifts - transform_points(true, places)
         each = np.einsum("pi,pij,pj->p", away, located.patches.information, away) / 2
         squares.append(each[np.trace(located.patches.information, axis1=1, axis2=2) > 0])
     assert np.concatenate(squares).size > 12 * 100
@@ -138,7 +138,7 @@ def test_patches_show_what_no_homography_follows(street: np.ndarray, photograph:
     assert isinstance(located, Located)
     assert located.patches is not None
     places = patch_centres(SHAPE)
-    expected = places + bend(places) - apply(located.homography, places)
+    expected = places + bend(places) - transform_points(located.homography, places)
     weights = located.patches.information[:, 1, 1]
     slope = (weights * expected[:, 1] * located.patches.shifts[:, 1]).sum() / (weights * expected[:, 1] ** 2).sum()
     assert slope == pytest.approx(1, abs=0.15)
@@ -282,7 +282,7 @@ def places() -> tuple[np.ndarray, np.ndarray]:
 def interpolated(image: np.ndarray) -> np.ndarray:
     """Warp an image by linear interpolation; NaN outside."""
     y, x = np.mgrid[: SMALL[0], : SMALL[1]]
-    u, v = apply(HOMOGRAPHY, np.stack([x.ravel(), y.ravel()], axis=-1)).T
+    u, v = transform_points(HOMOGRAPHY, np.stack([x.ravel(), y.ravel()], axis=-1)).T
     seen = (u >= 0) & (u <= SMALL[1] - 1) & (v >= 0) & (v <= SMALL[0] - 1)
     left = np.clip(np.floor(u), 0, SMALL[1] - 2).astype(int)
     top = np.clip(np.floor(v), 0, SMALL[0] - 2).astype(int)

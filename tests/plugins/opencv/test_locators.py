@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photonpano import Located, NotLocated, VirtualExposure
-from photonpano.geometry import apply, corner_displacements, from_parameters, generators, jacobian, translation
+from photonpano.geometry import corner_displacements, from_parameters, generators, jacobian, transform_points, translation
 from photonpano.locating import View
 from photonpano_opencv.brightness import EccLocator, PhaseCorrelationLocator
 from photonpano_opencv.configs import OpencvEccConfig, OpencvOrbConfig, PhaseCorrelationConfig
@@ -142,7 +142,7 @@ def test_information_predicts_errors_if_camera_also_rolls(seen_from: Callable) -
         true /= true[2, 2]
         motion = register(PHASE, seen_from(true, 2 * seed), seen_from(STILL, 2 * seed + 1))
         assert isinstance(motion, Located), motion
-        errors.append(np.sum((apply(motion.homography, points) - apply(true, points)) ** 2, axis=1))
+        errors.append(np.sum((transform_points(motion.homography, points) - transform_points(true, points)) ** 2, axis=1))
         j = jacobian(motion.homography, points)
         predicted.append(np.trace(j @ np.linalg.inv(motion.information) @ j.transpose(0, 2, 1), axis1=1, axis2=2))
     # The parameters have a third of the standard deviation of the prior, so that the pairs are accepted.

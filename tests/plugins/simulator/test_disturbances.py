@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.geometry import apply, corners
+from photonpano.geometry import corners, transform_points
 from photonpano.testing.scenes import z_scores
 from photonpano_simulator.config import FrameObject, Lens, Sensor, SimulatorConfig
 from photonpano_simulator.lens import undistorted
@@ -58,7 +58,7 @@ def test_distorted_frames_agree_with_the_truth(simulated: Simulated) -> None:
     assert truth["distortion"].tolist() == [-0.2, 0.05]
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
-    seen = apply(truth["homographies"][0], undistorted(lensed(-0.2, 0.05), pixels)).astype(np.float32)
+    seen = transform_points(truth["homographies"][0], undistorted(lensed(-0.2, 0.05), pixels)).astype(np.float32)
     flux = cv2.remap(truth["scene"], seen[:, :1], seen[:, 1:], cv2.INTER_LINEAR).reshape(SHAPE)
     z = deviations(source, flux)
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
@@ -97,7 +97,9 @@ def test_gains_scale_the_flux_of_the_frames(simulated: Simulated) -> None:
     source = simulated(**STILL, flux=0.3, sensor={"gain_std": 0.2, "dirt": {"specks": 3}}, lens={"vignette": 0.3})
     clean = simulated(**STILL, flux=0.3)
     truth = source.truth()
-    x, y = apply(truth["homographies"][0], np.stack(np.meshgrid(np.arange(52), np.arange(40)), axis=-1).reshape(-1, 2)).T
+    x, y = transform_points(
+        truth["homographies"][0], np.stack(np.meshgrid(np.arange(52), np.arange(40)), axis=-1).reshape(-1, 2)
+    ).T
     scene = cv2.remap(truth["scene"], x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR).reshape(SHAPE)
     assert abs(deviations(source, scene * truth["gains"]).var() - 1) < 5 * np.sqrt(2 / scene.size)
     assert "gains" not in clean.truth()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import InputError
-from photonpano.geometry import apply, corners, translation
+from photonpano.geometry import corners, transform_points, translation
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.paths import camera_path
 
@@ -30,7 +30,7 @@ def homographies(path: dict[str, Any], n_frames: int = 2001, seed: int = 0, **se
 
 
 def centres(maps: np.ndarray) -> np.ndarray:
-    return apply(maps, [[(FRAME[1] - 1) / 2, (FRAME[0] - 1) / 2]])[:, 0]
+    return transform_points(maps, [[(FRAME[1] - 1) / 2, (FRAME[0] - 1) / 2]])[:, 0]
 
 
 def steps(maps: np.ndarray) -> np.ndarray:
@@ -77,10 +77,10 @@ def test_pan_is_a_straight_line() -> None:
 def test_perspective_follows_the_focal_length() -> None:
     """At the angle a from the axis, a small step of the camera covers 1 / cos(a)^2 as much of the scene."""
     maps = homographies({"kind": "pan", "length_px": 800}, 3)
-    width = np.diff(apply(maps, [[247, 126.5], [248, 126.5]])[..., 0], axis=1)[:, 0]
+    width = np.diff(transform_points(maps, [[247, 126.5], [248, 126.5]])[..., 0], axis=1)[:, 0]
     angle = np.arctan(400 / FOCAL)
     np.testing.assert_allclose(width, [1 / np.cos(angle) ** 2, 1, 1 / np.cos(angle) ** 2], rtol=1e-6)
-    assert abs(apply(maps[2], corners(FRAME))[1, 1] - apply(maps[1], corners(FRAME))[1, 1]) > 0.5
+    assert abs(transform_points(maps[2], corners(FRAME))[1, 1] - transform_points(maps[1], corners(FRAME))[1, 1]) > 0.5
 
 
 def test_loop_returns_to_its_start() -> None:

@@ -104,7 +104,7 @@ def photonpano_renderers() -> Iterable[RendererContribution]:
         from pydantic import Field
 
         from photonpano import Config, FrameSpan, Panorama, RendererContribution, capture_of, hookimpl
-        from photonpano.geometry import apply
+        from photonpano.geometry import transform_points
 
 
         class NearestConfig(Config):
@@ -121,7 +121,7 @@ def photonpano_renderers() -> Iterable[RendererContribution]:
                 for frame in range(span.start, span.stop, self.every):
                     counts = capture_of(source).corrected_counts(FrameSpan(frame, frame + 1))
                     to_canvas = canvas.transform @ trajectory.at([frame])[0]
-                    column, row = np.rint(apply(to_canvas, np.stack([x, y], axis=1))).astype(int).T
+                    column, row = np.rint(transform_points(to_canvas, np.stack([x, y], axis=1))).astype(int).T
                     inside = (column >= 0) & (column < canvas.width) & (row >= 0) & (row < canvas.height)
                     at = row[inside], column[inside]
                     np.add.at(weight, at, 1)
