@@ -1,4 +1,4 @@
-"""Locator built on COLMAP."""
+"""Locator and pose estimators built on COLMAP."""
 
 import lazy_loader
 

@@ -80,7 +80,7 @@ class _Assembly:
     camera: Camera
     first: PoseEstimate  # of the averages; with the records of all levels, and the frames that any of them lost
     level: PosedLevel
-    before: FloatArray
+    before: FloatArray  # (T, 3, 4), poses of all frames by the level before
 
     def estimate(self) -> PoseEstimate:
         level, frames, std_focal = self.level, _frames(self.source), self.level.adjusted.std_focal_px

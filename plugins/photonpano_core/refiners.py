@@ -108,7 +108,7 @@ def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatAr
     """
     size = min(WINDOW, len(steps))
     noise = variances + SYSTEMATIC_PX**2
-    found = separated(wiggles + steps, noise, size, SIGNIFICANT, SLOW)
+    found = separated(wiggles + steps, noise, size)
     return Filtered(found.signal - wiggles, found.std)
 
 
@@ -130,13 +130,12 @@ def _wiggles(trajectory: Trajectory, instants: FloatArray, frame_shape: tuple[in
     return wiggles
 
 
-def separated(values: FloatArray, variances: FloatArray, size: int, significant: float, slow: tuple[int, float]) -> Filtered:
+def separated(values: FloatArray, variances: FloatArray, size: int) -> Filtered:
     """Estimate a motion (S,) whose spectrum is not known, in windows of `size` that overlap by half.
 
-    In each window the motion is a Gaussian process. Its power at the frequencies that stand out from the noise by the factor
-    `significant` is estimated by expectation and maximisation (Dempster et al. 1977), and the motion as its expectation (Wiener
-    1949), also where nothing was measured and the variance is infinite. `slow` is the number of the lowest frequencies that
-    must also exceed a constant of a size, and this size.
+    In each window the motion is a Gaussian process. Its power at the frequencies that stand out from the noise is estimated by
+    expectation and maximisation (Dempster et al. 1977), and the motion as its expectation (Wiener 1949), also where nothing was
+    measured and the variance is infinite.
     """
     n = len(values)
     known = np.isfinite(variances)
@@ -144,7 +143,7 @@ def separated(values: FloatArray, variances: FloatArray, size: int, significant:
     measured = np.where(known, values, 0.0)
     starts = sorted({*range(0, n - size + 1, max(1, size // 2)), n - size})
     windows = [slice(start, start + size) for start in starts]
-    standing = _standing_out([(measured[each], noise[each]) for each in windows], significant, slow)
+    standing = _standing_out([(measured[each], noise[each]) for each in windows])
     taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
     signal, variance, total = np.zeros(n), np.zeros(n), np.zeros(n)
     for window, allowed in zip(windows, standing, strict=True):
@@ -155,16 +154,16 @@ def separated(values: FloatArray, variances: FloatArray, size: int, significant:
     return Filtered(signal / total, np.sqrt(np.maximum(variance / total, 0)))
 
 
-def _standing_out(windows: list[tuple[FloatArray, FloatArray]], significant: float, slow: tuple[int, float]) -> BoolArray:
+def _standing_out(windows: list[tuple[FloatArray, FloatArray]]) -> BoolArray:
     """Return the frequencies of each window whose power exceeds that of the noise: (W, size + 1)."""
-    lowest, floor = slow
+    lowest, floor = SLOW
     excess = []
     for values, noise in windows:
         precision = float((1 / noise).sum())
         power = np.abs(np.fft.rfft(values / noise, 2 * len(values))) ** 2 / precision
         power[: 2 * lowest] /= 1 + floor**2 * precision
         excess.append(power)
-    return np.asarray(uniform_filter(np.array(excess), _NEIGHBOURS, mode="nearest") > significant)
+    return np.asarray(uniform_filter(np.array(excess), _NEIGHBOURS, mode="nearest") > SIGNIFICANT)
 
 
 def _expected(values: FloatArray, noise: FloatArray, allowed: BoolArray) -> tuple[FloatArray, FloatArray]:

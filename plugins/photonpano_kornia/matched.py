@@ -25,7 +25,7 @@ from photonpano.locating import (
     stabilised_8_bit,
 )
 from photonpano_kornia.configs import KorniaFeaturesConfig, KorniaLoftrConfig
-from photonpano_kornia.runtime import device_of, images_on, loftr_from, one_thread, seeded
+from photonpano_kornia.runtime import device_of, image_on, loftr_from, one_thread, seeded
 
 _FAR = 1e3  # descriptor distance of keypoints beyond the search radius; true ones are at most 2
 _SMALLEST_SIDE = 32  # px: four of the cells that LoFTR matches first
@@ -71,7 +71,7 @@ class FeatureLocator(PointLocator):
             sift = SIFTFeatureScaleSpace(
                 config.max_keypoints, config.upright, device=self._device, descriptor_backend="pyramid"
             )
-            frames, _, descriptors = sift(images_on(self._device, image) / 255, images_on(self._device, mask) > 0)
+            frames, _, descriptors = sift(image_on(self._device, image) / 255, image_on(self._device, mask) > 0)
             # kornia pads its result with empty frames.
             filled = laf_is_filled(frames)[0]
             return SiftFeatures(
@@ -85,8 +85,7 @@ class FeatureLocator(PointLocator):
 
     def _matches(self, moving: SiftFeatures, fixed: SiftFeatures, initial: Homography | None) -> Iterator[Matches]:
         for guide in [initial, None] if initial is not None else [None]:
-            with one_thread(), torch.inference_mode():
-                pairs = self._matched(moving, fixed, guide)
+            pairs = self._matched(moving, fixed, guide)
             here, there = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]]
             yield Matches(here, there, guide is not None, moving.sizes[pairs[:, 0]])
 
@@ -161,7 +160,7 @@ class LoftrLocator:
 
     def _matched(self, moving: Picture, fixed: Picture) -> tuple[FloatArray, FloatArray]:
         """Return the matched points of both images, (N, 2) each, that are not masked in either."""
-        images = (images_on(self._device, each.image) / 255 for each in (moving, fixed))
+        images = (image_on(self._device, each.image) / 255 for each in (moving, fixed))
         answer = self._network(dict(zip(("image0", "image1"), images, strict=True)))
         # LoFTR has the centre of the first pixel at (0.5, 0.5).
         here, there = (answer[key].cpu().numpy().astype(np.float64) - 0.5 for key in ("keypoints0", "keypoints1"))

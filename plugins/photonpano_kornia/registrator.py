@@ -39,7 +39,7 @@ from photonpano.locating import (
     view_pyramid,
 )
 from photonpano_kornia.configs import KorniaRegistratorConfig
-from photonpano_kornia.runtime import device_of, images_on, one_thread
+from photonpano_kornia.runtime import device_of, image_on, one_thread
 
 _COARSE_TOLERANCE = 4  # tolerance of coarser layers, which initialise the finest, relative to `converged_px`
 _ROUNDS = 3  # most descents on a layer; the weights of pixels are updated in between
@@ -98,7 +98,7 @@ class RegistratorLocator:
 class _Descent:
     def __init__(self, moving: View, fixed: View, free: tuple[int, ...], device: torch.device) -> None:
         self._moving, self._fixed, self._free, self._device = moving, fixed, list(free), device
-        self._here, self._there = images_on(device, moving.image), images_on(device, fixed.image)
+        self._here, self._there = image_on(device, moving.image), image_on(device, fixed.image)
         # The image is continued beyond its border, which would bias the alignment; weights mask these pixels.
         self._warper = HomographyWarper(*moving.shape, padding_mode="border", align_corners=False)
         self._unit = unit_square(moving.shape)
@@ -114,7 +114,7 @@ class _Descent:
             # The inverse variances of the differences between pixels, 0 where one of them is masked.
             certainty = np.zeros(both.shape, np.float32)
             certainty[both] = 1 / (1 / self._moving.weight[both] + 1 / there.weight[both])
-            weights = images_on(self._device, certainty)
+            weights = image_on(self._device, certainty)
             root = self._root_of_curvature(weights) if root is None else root
             if root is None:
                 return NotLocated(NO_TEXTURE)

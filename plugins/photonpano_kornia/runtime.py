@@ -35,9 +35,9 @@ def device_of(name: str) -> torch.device:
     return torch.device(name)
 
 
-def images_on(device: torch.device, *images: NDArray[Any]) -> torch.Tensor:
-    """Copy (H, W) images into a float32 tensor of shape (1, C, H, W)."""
-    return torch.stack([torch.tensor(image, dtype=torch.float32, device=device) for image in images])[None]
+def image_on(device: torch.device, image: NDArray[Any]) -> torch.Tensor:
+    """Copy an (H, W) image into a float32 tensor of shape (1, 1, H, W)."""
+    return torch.tensor(image, dtype=torch.float32, device=device)[None, None]
 
 
 @contextmanager

@@ -110,7 +110,7 @@ class _Chunks(BinarySource):
     def __init__(self, array: Location, metadata: Metadata, layout: FrameLayout, frame_rate_hz: float | None) -> None:
         super().__init__(metadata.shape[0], layout, frame_rate_hz)
         self._array, self._metadata = array, metadata
-        self._decoders = [_decoder(array, codec.name, codec.configuration) for codec in reversed(metadata.compressors)]
+        self._decoders = [_decoder(array, codec.name) for codec in reversed(metadata.compressors)]
         starts = range(0, metadata.shape[0], metadata.chunk_shape[0])
         self._pieces = Pieces([*starts, metadata.shape[0]], self._frames, in_parts=False)
 
@@ -149,7 +149,7 @@ class _Chunks(BinarySource):
         self._pieces.close()
 
 
-def _decoder(array: Location, name: str, configuration: dict[str, Any]) -> Any:
+def _decoder(array: Location, name: str) -> Any:
     """Return a function that takes back what a codec did to bytes."""
     if name == "gzip":
         return lambda data: zlib.decompress(data, wbits=31)
@@ -159,7 +159,7 @@ def _decoder(array: Location, name: str, configuration: dict[str, Any]) -> Any:
     import numcodecs.blosc
     import numcodecs.zstd
 
-    del configuration  # the compressed data contain it
+    # The compressed data contain the settings of the codec.
     return numcodecs.blosc.Blosc().decode if name == "blosc" else numcodecs.zstd.Zstd().decode
 
 

@@ -8,11 +8,10 @@ import numpy as np
 
 from photonpano.geometry.camera import Camera, nearest_rotations
 from photonpano.geometry.canvas import PROJECTIONS, Canvas
-from photonpano.geometry.homographies import translation
+from photonpano.geometry.homographies import BLOCK_FRAMES, translation
 from photonpano.values import FloatArray
 
 _SIDE_POINTS = 16  # points of an outline along each side of a frame
-_BLOCK_FRAMES = 4096  # the outlines of this many frames are mapped at a time, which bounds the memory
 _GAP = 0.02  # a gap of less than this, in radians, in what frames cover of a turn is none
 
 _PRIOR = 1e-3  # how much the mean of what is down counts, beside the directions of rows
@@ -70,8 +69,8 @@ def covered_by(rotations: FloatArray, camera: Camera, frame_shape: tuple[int, in
     directions = camera.directions(outline_of(frame_shape))
     ahead = camera.directions(np.array([(frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2]))
     firsts, lasts, low, high = [], [], np.inf, -np.inf
-    for start in range(0, len(rotations), _BLOCK_FRAMES):
-        block = rotations[start : start + _BLOCK_FRAMES]
+    for start in range(0, len(rotations), BLOCK_FRAMES):
+        block = rotations[start : start + BLOCK_FRAMES]
         middle, points = (PROJECTIONS["spherical"].points(each @ np.swapaxes(block, -1, -2)) for each in (ahead, directions))
         middle = middle.reshape(-1, 2)
         beside = np.remainder(points[..., 0] - middle[:, :1] + np.pi, 2 * np.pi) - np.pi

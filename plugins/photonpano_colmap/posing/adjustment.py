@@ -67,9 +67,7 @@ class Adjusted:
     excess: float  # that in standard deviations, relative to what is expected
 
 
-def adjust(
-    poses: FloatArray, points: FloatArray, observations: Observations, camera: Camera, finds_focal: bool = False
-) -> Adjusted:
+def adjust(poses: FloatArray, points: FloatArray, observations: Observations, camera: Camera, finds_focal: bool) -> Adjusted:
     """Solve for the poses (V, 3, 4) and points (N, 3), each observed twice or more, that agree best with the observations.
 
     `finds_focal`: whether to solve for the focal length, too.

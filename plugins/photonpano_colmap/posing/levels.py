@@ -170,7 +170,7 @@ def interpolate(
     points: FloatArray,
     observations: Observations,
     camera: Camera,
-    finds_focal: bool = False,
+    finds_focal: bool,
 ) -> PosedLevel:
     """Adjust exposures and points to the observations, and correct the path by the poses of the exposures."""
     exposures = merged.exposures

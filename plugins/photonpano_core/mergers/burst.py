@@ -71,8 +71,7 @@ class _Burst:
             place = fixed + direction
             while 0 <= place < len(self._spans):
                 before, earlier = place - direction, place - 2 * direction
-                known = min(earlier, fixed) >= 0 and abs(before - fixed) >= 1
-                start = 2 * found[before] - found[earlier] if known else found[before]
+                start = found[before] if before == fixed else 2 * found[before] - found[earlier]
                 variance = noise[place] + noise[fixed]
                 found[place] = aligned(images[fixed], images[place], self._grid, start, variance)
                 place += direction

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from photonpano import FloatArray, InputError
-from photonpano.geometry import Camera, camera_matrix, rotation_matrices
+from photonpano.geometry import Camera, camera_matrix, positions_of, rotation_matrices
 from photonpano_simulator.paths import looking, random_path, random_spline, shake_rotations, sums_of_sines
 from photonpano_simulator.sensor import Draw, generator
 from photonpano_simulator.travel.planes import Planes, trace
@@ -53,11 +53,6 @@ def poses_of(config: TravelConfig, middle: FloatArray, seed: int) -> FloatArray:
     return np.concatenate([rotations, -rotations @ positions[:, :, None]], axis=2)
 
 
-def centres(poses: FloatArray) -> FloatArray:
-    """Return where the camera is: (T, 3) in m."""
-    return np.asarray(-np.swapaxes(poses[:, :, :3], 1, 2) @ poses[:, :, 3:])[:, :, 0]
-
-
 def require_free(poses: FloatArray, camera: Camera, frame_shape: tuple[int, int], planes: Planes, room: FloatArray) -> None:
     """Require that the camera stays in the scene, passes through no surface that rests, and sees nothing but the scene.
 
@@ -65,7 +60,7 @@ def require_free(poses: FloatArray, camera: Camera, frame_shape: tuple[int, int]
     """
     last = len(poses) - 1
     frames = np.unique(np.linspace(0, last, min(len(poses), _CHECKED)).astype(int))
-    at = centres(poses[frames])
+    at = positions_of(poses[frames])
     outside = np.flatnonzero(((at < room[0]) | (at > room[1])).any(axis=1))
     if outside.size:
         low, high = (", ".join(f"{each:g}" for each in corner) for corner in room)

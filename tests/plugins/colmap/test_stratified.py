@@ -167,7 +167,7 @@ def test_noise_of_located_groups_does_not_move_the_path() -> None:
     views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
     pixels = projected(poses[views], points[numbers], MATRIX) + rng.normal(0, 0.3, (3000, 2))
     observations = Observations(numbers, views, pixels, np.tile(0.3**2 * np.eye(2), (3000, 1, 1)))
-    level = interpolate(groups, Merged(merged.exposures, TRUE, None), points, observations, CAMERA)
+    level = interpolate(groups, Merged(merged.exposures, TRUE, None), points, observations, CAMERA, finds_focal=False)
     located = _after_similarity(positions_of(level.adjusted.poses), positions_of(poses))
     path = _after_similarity(positions_of(level.path.at([group.reference for group in groups])), positions_of(poses))
     assert np.sqrt(np.mean(path**2)) < 0.7 * np.sqrt(np.mean(located**2)), (path, located)
@@ -189,7 +189,7 @@ def test_adjustment_finds_poses_and_knows_its_errors() -> None:
         pixels = projected(true[views], points[numbers], MATRIX) + rng.normal(0, 0.1, (3000, 2))
         observations = Observations(numbers, views, pixels, np.tile(0.1**2 * np.eye(2), (3000, 1, 1)))
         start = posed(rotation_matrices(rng.normal(0, 0.003, (20, 3))) @ true[:, :, :3], positions_of(true))
-        found = adjust(start, points + rng.normal(0, 0.02, points.shape), observations, CAMERA)
+        found = adjust(start, points + rng.normal(0, 0.02, points.shape), observations, CAMERA, finds_focal=False)
         errors.append(_after_similarity(positions_of(found.poses), positions_of(true)))
         expected.append(found.std_position)
         assert found.confirmed.mean() > 0.95
@@ -206,7 +206,7 @@ def test_patches_at_edges_of_things_count_less() -> None:
     pixels = projected(true[views], points[numbers], MATRIX) + rng.normal(0, 0.05, (3000, 2))
     pixels[numbers < 15, 0] += 0.15 * (views[numbers < 15] - 10)
     observations = Observations(numbers, views, pixels, np.tile(0.05**2 * np.eye(2), (3000, 1, 1)))
-    found = adjust(true, points, observations, CAMERA)
+    found = adjust(true, points, observations, CAMERA, finds_focal=False)
     error = _after_similarity(positions_of(found.poses), positions_of(true))
     assert np.sqrt(np.mean(error**2)) < 0.003, error
     assert found.confirmed[15:].mean() > 0.9
@@ -266,7 +266,7 @@ def observed_through(camera: Camera, noise_px: float = 0.03) -> tuple[np.ndarray
 @pytest.mark.parametrize("k1", [0.0, -0.02, 0.02])
 def test_adjustment_tells_distortion_that_is_not_that_of_the_lens(k1: float) -> None:
     poses, points, observations = observed_through(Camera(MATRIX, np.array([k1, 0, 0, 0])))
-    found = adjust(poses, points, observations, CAMERA)
+    found = adjust(poses, points, observations, CAMERA, finds_focal=False)
     assert found.std_k1 < 0.003
     assert abs(found.missed_k1 - k1) < 3 * found.std_k1 + 0.1 * abs(k1), (found.missed_k1, found.std_k1)
 
@@ -276,7 +276,7 @@ def test_adjustment_finds_the_focal_length() -> None:
     found = adjust(poses, points, observations, Camera.of(1.04 * FOCAL_PX, SHAPE), finds_focal=True)
     assert found.std_focal_px < 0.7
     assert abs(found.focal_px - FOCAL_PX) < 3 * found.std_focal_px
-    given = adjust(poses, points, observations, CAMERA)
+    given = adjust(poses, points, observations, CAMERA, finds_focal=False)
     assert (given.focal_px, given.std_focal_px) == (FOCAL_PX, 0)
 
 

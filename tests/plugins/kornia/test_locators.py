@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from photonpano import InputError, Located, NotLocated, StageContext, StreamInfo
-from photonpano.geometry import apply, corner_displacements, inverse, rescaling, translation
+from photonpano.geometry import corner_displacements, inverse, rescaling, transform_points, translation
 from photonpano.photometry import BinaryResponse
 from photonpano_kornia.hooks import photonpano_locators
 
@@ -22,7 +22,7 @@ import torch
 
 from photonpano_kornia.configs import KorniaRegistratorConfig
 from photonpano_kornia.registrator import RegistratorLocator, unit_square
-from photonpano_kornia.runtime import device_of, images_on, one_thread, seeded
+from photonpano_kornia.runtime import device_of, image_on, one_thread, seeded
 
 SHAPE = (120, 176)
 STILL = np.eye(3)
@@ -114,7 +114,7 @@ def test_unit_square_matches_pixel_centres_of_kornia_warper() -> None:
     coordinates = torch.tensor(np.stack([x, y])[None], dtype=torch.float64)
     to_image = torch.tensor(unit @ homography @ inverse(unit))[None]
     seen = warper(coordinates, to_image)[0].numpy().reshape(2, -1).T
-    np.testing.assert_allclose(seen, apply(homography, np.stack([x.ravel(), y.ravel()], axis=1)), atol=1e-4)
+    np.testing.assert_allclose(seen, transform_points(homography, np.stack([x.ravel(), y.ravel()], axis=1)), atol=1e-4)
 
 
 def test_unit_square_keeps_edges_of_halved_image() -> None:
@@ -169,10 +169,10 @@ def test_device_of_missing_gpu_raises_input_error(monkeypatch: pytest.MonkeyPatc
     )
 
 
-def test_images_on_copies_images() -> None:
+def test_image_on_copies_the_image() -> None:
     image = np.zeros((2, 3), np.float32)
     image.flags.writeable = False
-    tensor = images_on(torch.device("cpu"), image, image > 0)
-    assert tensor.shape == (1, 2, 2, 3)
+    tensor = image_on(torch.device("cpu"), image)
+    assert tensor.shape == (1, 1, 2, 3)
     tensor += 1
     assert not image.any()

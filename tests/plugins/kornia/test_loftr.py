@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import InputError, Located, NotLocated, StreamInfo, discover
-from photonpano.geometry import apply, corner_displacements, from_parameters
+from photonpano.geometry import corner_displacements, from_parameters, transform_points
 
 pytest.importorskip("torch")
 pytest.importorskip("kornia")
@@ -116,7 +116,7 @@ def knows(true: np.ndarray, monkeypatch: pytest.MonkeyPatch, wrong: int = 0) -> 
         assert 0 <= data["image0"].min() <= data["image0"].max() <= 1
         rows, columns = np.mgrid[0 : SHAPE[0] : 8, 0 : SHAPE[1] : 8]
         cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
-        partners = apply(true, cells - 0.5) + 0.5
+        partners = transform_points(true, cells - 0.5) + 0.5
         partners[:wrong] = np.random.default_rng(0).uniform((0, 0), (175, 119), (wrong, 2))
         inside = np.all((partners >= 0) & (partners <= [175, 119]), axis=1)
         points = {"keypoints0": cells[inside], "keypoints1": partners[inside]}

@@ -12,11 +12,10 @@ import pytest
 from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
-from photonpano.geometry import Camera, apply, camera_matrix, corners, rotation_matrices
+from photonpano.geometry import Camera, camera_matrix, corners, positions_of, rotation_matrices, transform_points
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
 from photonpano_simulator.paths import camera_path
-from photonpano_simulator.travel.paths import centres
 from photonpano_simulator.travel.planes import Planes, Scene, trace
 from photonpano_simulator.travel.rendering import View, atlas_of
 from photonpano_simulator.travel.source import TravelSource
@@ -71,7 +70,7 @@ def test_two_views_of_a_plane_differ_by_its_homography(truth) -> None:
     normal = first[:, :3] @ (0, 0, 1)
     distance = 4.0 - (-first[:, :3].T @ first[:, 3])[2]
     homography = K @ (rotation + np.outer(shift, normal) / distance) @ np.linalg.inv(K)
-    expected = apply(homography, corners(SHAPE)) - corners(SHAPE)
+    expected = transform_points(homography, corners(SHAPE)) - corners(SHAPE)
     at = corners(SHAPE).astype(int)
     np.testing.assert_allclose(found.vectors[at[:, 1], at[:, 0]], expected, atol=1e-9)
 
@@ -267,13 +266,13 @@ def test_path_has_its_length_and_tremor(travelling) -> None:
     tremor = {"rms_px": 2.0, "rms_mm": 3.0, "roll_rms_deg": 0.5, "frequencies_hz": (500, 900, 1300)}
     shaken = travelling(path={"kind": "travel", "length_m": 0.4, "centre": (0.1, 0, -0.2), "tremor": tremor})
     shaken = shaken.truth()["camera_from_world"]
-    way = centres(still)
+    way = positions_of(still)
     assert np.linalg.norm(np.diff(way, axis=0), axis=1).sum() == pytest.approx(0.4, rel=1e-3)
     np.testing.assert_allclose((way.min(axis=0) + way.max(axis=0)) / 2, (0.1, 0, -0.2), atol=1e-3)
     np.testing.assert_allclose(
         still[:, :, :3] @ np.swapaxes(still[:, :, :3], 1, 2), np.broadcast_to(np.eye(3), (400, 3, 3)), atol=1e-12
     )
-    assert np.sqrt(((centres(shaken) - way) ** 2).mean(axis=0)) == pytest.approx([0.003] * 3, rel=0.05)
+    assert np.sqrt(((positions_of(shaken) - way) ** 2).mean(axis=0)) == pytest.approx([0.003] * 3, rel=0.05)
     small = shaken[:, :, :3] @ np.swapaxes(still[:, :, :3], 1, 2)
     assert np.sqrt((small[:, 0, 2] ** 2).mean()) == pytest.approx(2 / 40, rel=0.05)
     assert np.sqrt((small[:, 0, 1] ** 2).mean()) == pytest.approx(np.deg2rad(0.5), rel=0.1)
@@ -281,7 +280,7 @@ def test_path_has_its_length_and_tremor(travelling) -> None:
 
 def test_turn_only_has_no_parallax(travelling) -> None:
     made = truth_of(travelling(path={"kind": "turn-only", "degrees": 20}).truth())
-    assert np.ptp(centres(made.camera_from_world), axis=0).max() < 1e-12
+    assert np.ptp(positions_of(made.camera_from_world), axis=0).max() < 1e-12
     first, last = made.camera_from_world[[0, -1], :, :3]
     turn = last @ first.T
     homography = made.camera.matrix @ turn @ np.linalg.inv(made.camera.matrix)
