@@ -47,7 +47,7 @@ class ResponseConfig(Config):
     )
     saturation_photons: float = Field(
         10_000.0,
-        gt=0,
+        ge=1,
         le=1e9,
         description="detected photons per pixel per frame at white_level; scales the flux, and determines the photon noise",
     )

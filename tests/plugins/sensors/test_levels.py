@@ -8,6 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError
+from photonpano.contracts.sources import RESPONSE
 from photonpano.photometry import srgb_to_linear
 from photonpano_sensors.intensity.contributions import FastcamMrawConfig, ResponseConfig
 from photonpano_sensors.intensity.mraw import FastcamMrawSource
@@ -96,6 +97,13 @@ def test_black_and_white_levels_outside_the_bits_are_refused(black: float, white
 def test_curve_and_curve_file_together_are_refused() -> None:
     with pytest.raises(ValidationError, match="curve_file takes the place of the curve srgb; leave out one of them"):
         ResponseConfig(curve="srgb", curve_file="curve.txt")
+
+
+@pytest.mark.parametrize("curve", ["linear", "srgb"])
+def test_response_of_the_fewest_photons_is_one_that_captures_may_have(curve: Any) -> None:
+    RESPONSE.require(levels(saturation_photons=1.0, curve=curve).response)
+    with pytest.raises(ValidationError, match="greater than or equal to 1"):
+        ResponseConfig(saturation_photons=0.2)
 
 
 @pytest.mark.parametrize("curve", ["linear", "srgb"])
