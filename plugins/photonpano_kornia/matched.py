@@ -152,7 +152,7 @@ class LoftrLocator:
             return _motion_of(self._attempts(here, there, initial), shape, self._config, self._seed, {})
 
     def _attempts(self, here: FloatArray, there: FloatArray, initial: Homography | None) -> Iterator[Matches]:
-        """Return the matches near the positions that the current motion predicts, then all."""
+        """Yield the matches near the positions that the current motion predicts, then all."""
         if initial is not None:
             near = np.linalg.norm(transform_points(initial, here) - there, axis=1) <= self._config.search_px
             yield Matches(here[near], there[near], guided=True)

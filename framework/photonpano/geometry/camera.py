@@ -73,9 +73,7 @@ class Camera:
         found = seen
         with np.errstate(all="ignore"):
             for _ in range(_ITERATIONS):
-                (a, b), (_, d) = self._slopes(found)
-                x, y = np.moveaxis(seen - self._distorted(found), -1, 0)
-                step = np.stack([d * x - b * y, a * y - b * x], axis=-1) / (a * d - b * b)[..., None]
+                step = self._ideal_shift(found, seen - self._distorted(found))
                 found = found + step
                 if not (np.abs(step) >= _EXACT).any():
                     break
@@ -99,9 +97,7 @@ class Camera:
         """Return how (..., 2) ideal pixels move if their images in a frame move by a small (..., 2) shift, to first order."""
         if not self.distorts:
             return shift
-        (a, b), (_, d) = self._slopes(self._in_focal_lengths(points))
-        x, y = np.moveaxis(shift, -1, 0)
-        return np.stack([d * x - b * y, a * y - b * x], axis=-1) / (a * d - b * b)[..., None]
+        return self._ideal_shift(self._in_focal_lengths(points), shift)
 
     def directions(self, points: ArrayLike) -> FloatArray:
         """Return the unit vectors in which (..., 2) pixels of a frame look: (..., 3)."""
@@ -137,6 +133,11 @@ class Camera:
             [x * radial + 2 * p1 * x * y + p2 * (square + 2 * x**2), y * radial + p1 * (square + 2 * y**2) + 2 * p2 * x * y],
             axis=-1,
         )
+
+    def _ideal_shift(self, points: FloatArray, shift: FloatArray) -> FloatArray:
+        (a, b), (_, d) = self._slopes(points)
+        x, y = np.moveaxis(shift, -1, 0)
+        return np.stack([d * x - b * y, a * y - b * x], axis=-1) / (a * d - b * b)[..., None]
 
     def _slopes(self, points: FloatArray) -> list[list[FloatArray]]:
         """Return the derivatives of the distorted points by (..., 2) ideal ones: two rows of two arrays (...)."""

@@ -96,7 +96,7 @@ def rescaling(scale: float) -> Homography:
 
 
 def rescaled(homographies: Homography, scale: float) -> Homography:
-    """Return the same motions between images that are both rescaled by `scale`."""
+    """Return the same (..., 3, 3) motions between images that are both rescaled by `scale`."""
     if scale == 1:
         return normalised(homographies)
     return normalised(rescaling(scale) @ homographies @ rescaling(1 / scale))

@@ -221,7 +221,7 @@ def photon_ratio(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool,
 
 @compiled
 def log_likelihood(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool, into: FluxImage) -> None:
-    """Return the log-likelihood of the counts of each cell, but for a constant: see `photon_ratio` for the arguments."""
+    """Write the log-likelihood of the counts of each cell, but for a constant: see `photon_ratio` for the arguments."""
     least = np.float32(1e-9)
     for y in range(lit.shape[0]):
         k, n, m, out = lit[y], seen[y], mean[y], into[y]
