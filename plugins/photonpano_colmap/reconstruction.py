@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from photonpano import CameraGuess, FloatArray
+from photonpano import CameraGuess, FloatArray, OutputError
 from photonpano_colmap.configs import FIRST_CENTRE, SEEDS, ColmapAveragesConfig
 from photonpano_colmap.reversal import Halves, Readings, compared_halves, likelier_reading
 
@@ -58,7 +58,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Find the poses of pictures, (H, W) of 8 bits with masks, 0 where no keypoints may lie, in a temporary folder.
 
-    COLMAP has one thread: with more, it numbers the images in another order each time, and finds other poses.
+    COLMAP has one thread: with more, it numbers the images in another order each time, and finds other poses. Raises an
+    `OutputError` if the disk is full.
     """
     # What it would print as an error, such as that it found no poses, becomes a message of ours.
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
@@ -70,8 +71,9 @@ def reconstruct(
         for part in ("images", "masks", "sparse"):
             (folder / part).mkdir()
         for index, (picture, mask) in enumerate(images):
-            cv2.imwrite(str(pictures / _name(index)), picture)
-            cv2.imwrite(str(folder / "masks" / f"{_name(index)}.png"), mask)
+            for path, pixels in ((pictures / _name(index), picture), (folder / "masks" / f"{_name(index)}.png", mask)):
+                if not cv2.imwrite(str(path), pixels):
+                    raise OutputError(f"cannot write {path} for COLMAP; free some space there, or set TMPDIR to another folder")
         _extract(database, folder, camera, images[0][0].shape, config)
         _match(database, config, seed)
         keypoints, matches = _counts(database, len(images))

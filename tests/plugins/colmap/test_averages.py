@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from photonpano import CameraGuess, CaptureSummary, FrameSpan, LocationError, StageContext, StreamInfo, discover
+from photonpano import CameraGuess, CaptureSummary, FrameSpan, LocationError, OutputError, StageContext, StreamInfo, discover
 from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
 from photonpano.geometry import camera_matrix, positions_of
@@ -23,7 +24,7 @@ from photonpano_colmap.averages import AveragesEstimator, chosen_size, tilt
 from photonpano_colmap.configs import ColmapAveragesConfig
 from photonpano_colmap.pose_noise import pose_noise
 from photonpano_colmap.posing.path import PoseSpline
-from photonpano_colmap.reconstruction import Piece, Reconstruction, _apart
+from photonpano_colmap.reconstruction import Piece, Reconstruction, _apart, reconstruct
 from photonpano_colmap.reversal import Halves, Readings
 
 SIZE = 20
@@ -56,6 +57,17 @@ def test_camera_that_only_turns_is_offered_rotations(monkeypatch: pytest.MonkeyP
         estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))))
     assert "of 300 keypoints in an average (the median) 100 match another average" in str(caught.value)
     assert "motion: {model: rotation}" in str(caught.value)
+
+
+def test_full_disk_ends_the_run_before_colmap_reads_half_of_a_picture() -> None:
+    picture = np.random.default_rng(0).integers(0, 255, SHAPE, np.uint8)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))  # the system cuts files short, as a full disk does
+    try:
+        with pytest.raises(OutputError, match=r"cannot write .* for COLMAP; free some space there, or set TMPDIR"):
+            reconstruct([(picture, picture)], CameraGuess(FOCAL_PX), ColmapAveragesConfig(), 0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_noise_that_hides_the_scene_is_not_taken_for_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
