@@ -274,16 +274,16 @@ def _rotations(displacements: FloatArray, focal: float) -> FloatArray:
 
 def shake_rotations(shake: Shake, n_frames: int, frame_rate_hz: float, focal: float, rng: np.random.Generator) -> FloatArray:
     """Return the rotations of a shaking camera: (T, 3, 3)."""
-    x, y, roll = sums_of_sines(3, shake.frequencies_hz, n_frames, frame_rate_hz, rng)
+    x, y, roll = sums_of_sines(shake.frequencies_hz, n_frames, frame_rate_hz, rng)
     rolls = rotation_matrices(np.outer(np.deg2rad(shake.roll_rms_deg) * roll, (0, 0, 1)))
     return np.asarray(_rotations(shake.rms_px * np.stack([x, y], axis=1), focal) @ rolls)
 
 
 def sums_of_sines(
-    count: int, frequencies_hz: tuple[float, ...], n_frames: int, frame_rate_hz: float, rng: np.random.Generator
+    frequencies_hz: tuple[float, ...], n_frames: int, frame_rate_hz: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Return sums of sines with random phases, whose root mean square is 1: (count, T)."""
-    phases = rng.uniform(0, 2 * np.pi, (count, len(frequencies_hz), 1))
+    """Return three sums of sines with random phases, whose root mean square is 1: (3, T)."""
+    phases = rng.uniform(0, 2 * np.pi, (3, len(frequencies_hz), 1))
     phase = 2 * np.pi * np.asarray(frequencies_hz)[:, None] * np.arange(n_frames) / frame_rate_hz
     # The sum of n sines of amplitude sqrt(2 / n) has the root mean square 1.
     return np.asarray(np.sqrt(2 / len(frequencies_hz)) * np.sin(phase + phases).sum(axis=1))

@@ -48,7 +48,7 @@ def poses_of(config: TravelConfig, middle: FloatArray, seed: int) -> FloatArray:
     if path.tremor is not None:
         tremor, rng = path.tremor, generator(seed, Draw.SHAKE)
         rotations = shake_rotations(tremor, n_frames, config.frame_rate_hz, config.focal_px, rng) @ rotations
-        sines = sums_of_sines(3, tremor.frequencies_hz, n_frames, config.frame_rate_hz, rng).T
+        sines = sums_of_sines(tremor.frequencies_hz, n_frames, config.frame_rate_hz, rng).T
         positions = positions + tremor.rms_mm / 1000 * sines
     return np.concatenate([rotations, -rotations @ positions[:, :, None]], axis=2)
 

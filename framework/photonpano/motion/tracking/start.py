@@ -114,9 +114,7 @@ class StartingMotion:
         )
 
 
-def starting_motion(
-    source: Source, groups: Sequence[Group], context: Context, timeline: Timeline | None = None
-) -> StartingMotion | None:
+def starting_motion(source: Source, groups: Sequence[Group], context: Context) -> StartingMotion | None:
     """Measure the velocity of the image all over a capture, before any motion is known; None if no window has a peak.
 
     The capture is divided into windows of the length of a group, and each of them into short spans of frames. The phase
@@ -136,7 +134,7 @@ def starting_motion(
     velocities, alternatives, rivals = _continuous([each for _, each in known])
     instants, px_per_frame = np.array([instant for instant, _ in known]), max(each.px_per_frame for _, each in known)
     steady = _steady(velocities, px_per_frame)
-    return StartingMotion(instants[steady], velocities[steady], alternatives[steady], rivals[steady], 1.5 * length, timeline)
+    return StartingMotion(instants[steady], velocities[steady], alternatives[steady], rivals[steady], 1.5 * length)
 
 
 def _hypotheses(source: Source, length: int, start: int, offered: Sequence[FloatArray] = ()) -> Hypotheses | None:
