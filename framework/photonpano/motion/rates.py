@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -80,15 +81,16 @@ def read_rates(file: Path) -> Rates:
     """
     try:
         with file.open(encoding="utf-8-sig", newline="") as text:
-            names = [name.strip() for name in next(csv.reader(text), ())]
+            reader = csv.reader(text)
+            names = [name.strip() for name in next(reader, ())]
             time = next((name for name in ("t_s", "time_s") if name in names), "")
             unit = next((unit for unit in ("rad_s", "deg_s") if {f"w{axis}_{unit}" for axis in "xyz"} <= set(names)), "")
             if not (time and unit):
                 raise InputError(f"{file}: the first line must name the columns {_COLUMNS}; it is {','.join(names)!r}")
-            columns = [names.index(name) for name in (time, *(f"w{axis}_{unit}" for axis in "xyz"))]
-            numbers = np.loadtxt(text, delimiter=",", usecols=columns, ndmin=2)
-    except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"{file} cannot be read (its rows of numbers count from 0): {error}") from error
+            columns = {name: names.index(name) for name in (time, *(f"w{axis}_{unit}" for axis in "xyz"))}
+            numbers = np.array([*_samples(reader, columns, file)])
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{file} cannot be read: {error}") from error
     if len(numbers) < _FEWEST or not np.isfinite(numbers).all():
         raise InputError(f"{file} must hold at least {_FEWEST} samples, and no NaN or infinite numbers")
     times_s, rates = numbers[:, 0], numbers[:, 1:]
@@ -99,3 +101,13 @@ def read_rates(file: Path) -> Rates:
         degrees = "; if they are in deg/s, name the columns wx_deg_s, wy_deg_s, wz_deg_s" if unit == "rad_s" else ""
         raise InputError(f"{file} holds rates up to {fastest:.0f} rad/s, more than any usual gyroscope measures{degrees}")
     return Rates(file, times_s, rad_s)
+
+
+def _samples(reader: Any, columns: dict[str, int], file: Path) -> Iterator[list[float]]:
+    """Yield the numbers of each line of a `csv.reader` in some columns."""
+    for row in filter(None, reader):
+        try:
+            yield [float(row[place]) for place in columns.values()]
+        except (ValueError, IndexError):
+            line, named = f"{file}, line {reader.line_num}", ", ".join(columns)
+            raise InputError(f"{line}: expected a number for each of {named}, got {','.join(row)!r}") from None
