@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
-from photonpano.geometry import Camera, likely_rotations, parameters, scaled_ahead, translation, unit_coordinates
+from photonpano.geometry import Camera, likely_rotations, parameters, rescaled, scaled_ahead, translation, unit_coordinates
 from photonpano.locating import (
     ALL_PARAMETERS,
     NOTHING_SEEN,
@@ -23,7 +23,6 @@ from photonpano_direct.alignment import Aligned, Quality, align
 from photonpano_direct.configs import DirectConfig
 from photonpano_direct.majority import JUDGED, masked, part_following, shifts_between
 from photonpano_direct.pyramid import Pyramid, pyramid_of, similarity_under
-from photonpano_direct.small_matrices import rescaled
 
 _EXACT_PX = 0.1  # expected corner error below which coarser layers are not considered
 _COARSE_TOLERANCE = 12  # tolerance of coarser layers, which initialise the finest, relative to `converged_px`

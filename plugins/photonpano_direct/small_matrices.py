@@ -60,15 +60,6 @@ def inverse_homography(matrix: FloatArray) -> FloatArray:
 
 
 @compiled
-def rescaled(homography: FloatArray, scale: float) -> FloatArray:
-    """Return the same motion between images that are both rescaled; `photonpano.geometry.rescaled` for one homography."""
-    offset = 0.5 * scale - 0.5
-    there = np.array([[scale, 0.0, offset], [0.0, scale, offset], [0.0, 0.0, 1.0]])
-    back = np.array([[1 / scale, 0.0, -offset / scale], [0.0, 1 / scale, -offset / scale], [0.0, 0.0, 1.0]])
-    return scaled_to_one(product(product(there, homography), back))
-
-
-@compiled
 def scaled_to_one(homography: FloatArray) -> FloatArray:
     """Return a homography with h33 = 1."""
     result = np.empty((3, 3))

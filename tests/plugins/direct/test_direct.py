@@ -18,6 +18,7 @@ from photonpano.geometry import (
     inverse,
     jacobian,
     patch_centres,
+    rescaled,
     rotation_matrices,
     scaled_ahead,
     transform_points,
@@ -29,7 +30,6 @@ from photonpano_direct.configs import DirectConfig
 from photonpano_direct.locator import DirectLocator
 from photonpano_direct.majority import JUDGED, part_following
 from photonpano_direct.moments import Buffers, Layer, derivative_moments, differentiate, residuals_and_moments
-from photonpano_direct.small_matrices import rescaled
 
 SHAPE = (160, 240)
 STILL = np.eye(3)
