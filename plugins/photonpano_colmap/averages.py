@@ -93,10 +93,9 @@ class AveragesEstimator:
         if size == "auto":
             size, reason = chosen_size(self._context.capture(), n_frames)
             self._context.decide("group_size", size, reason)
-        spans = [FrameSpan(start, start + size) for start in starts_of(n_frames, size, self._config.step)]
-        if problem := too_few_averages(n_frames, len(spans), size):
+        if problem := too_few_averages(n_frames, size, self._config.step):
             raise LocationError(problem)
-        return spans
+        return [FrameSpan(start, start + size) for start in starts_of(n_frames, size, self._config.step)]
 
     def _chosen(self, found: Reconstruction, spans: Sequence[FrameSpan]) -> Piece:
         """Return the piece of the poses to go on with."""

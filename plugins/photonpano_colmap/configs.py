@@ -30,8 +30,9 @@ def counted(averages: int) -> str:
     return "1 average" if averages == 1 else f"{averages} averages"
 
 
-def too_few_averages(n_frames: int, averages: int, size: int) -> str | None:
+def too_few_averages(n_frames: int, size: int, step: int | Literal["auto"]) -> str | None:
     """Return the problem if a capture gives too few averages of some frames."""
+    averages = len(starts_of(n_frames, size, step))
     if averages >= MIN_AVERAGES:
         return None
     return (

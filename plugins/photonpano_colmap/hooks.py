@@ -6,13 +6,7 @@ from collections.abc import Iterator
 
 import photonpano_colmap as plugin
 from photonpano import LocatorContribution, PoseEstimatorContribution, Requirement, StreamInfo, hookimpl
-from photonpano_colmap.configs import (
-    ColmapAveragesConfig,
-    PycolmapTwoViewConfig,
-    StratifiedPoseConfig,
-    starts_of,
-    too_few_averages,
-)
+from photonpano_colmap.configs import ColmapAveragesConfig, PycolmapTwoViewConfig, StratifiedPoseConfig, too_few_averages
 
 _REQUIRES = (Requirement("pycolmap", "photonpano[colmap]"),)
 
@@ -53,6 +47,5 @@ def photonpano_pose_estimators() -> Iterator[PoseEstimatorContribution]:
 def _problems_of_averages(config: ColmapAveragesConfig, stream: StreamInfo) -> list[str]:
     if config.group_size == "auto":
         return []
-    starts = starts_of(stream.n_frames, config.group_size, config.step)
-    problem = too_few_averages(stream.n_frames, len(starts), config.group_size)
+    problem = too_few_averages(stream.n_frames, config.group_size, config.step)
     return [problem] if problem else []

@@ -21,6 +21,7 @@ SHORTEST = {"binary": 4, "intensity": 1}  # frames of the shortest span: sums of
 PEAK_PX = 1.5  # standard deviation of the peak of the phase correlation, in binned pixels
 
 Spectrum = NDArray[np.complexfloating]
+_hann_window = cache(hann_window)
 DARK = 0.2  # sums, and frames, with less than this share of the usual light show nothing
 
 
@@ -43,7 +44,7 @@ def noise_of_difference(source: Source, n_frames: float) -> float:
 
 def spectra_of(images: Sequence[FluxImage] | FluxImage, weight: FluxImage | None = None) -> Spectrum:
     """Return the spectra of images (S, h, w), of weighted mean 0, under a Hann window: (S, h, w // 2 + 1)."""
-    window = _window(images[0].shape)
+    window = _hann_window(images[0].shape)
     if weight is not None:
         window = window * weight
     share = window / max(float(window.sum()), 1e-12)
@@ -72,8 +73,3 @@ def following(moving: FluxImage, fixed: FluxImage, noise: float) -> Follows:
     """
     seen = np.isfinite(moving) & np.isfinite(fixed)
     return follows(np.nan_to_num(moving), np.nan_to_num(fixed), np.where(seen, np.float32(noise), np.float32(np.inf)))
-
-
-@cache
-def _window(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    return hann_window(shape)
