@@ -150,7 +150,7 @@ class _Chunks(BinarySource):
 
 
 def _decoder(array: Location, name: str) -> Any:
-    """Return a function that takes back what a codec did to bytes."""
+    """Return a function that takes back what a codec did to bytes, which contain its settings."""
     if name == "gzip":
         return lambda data: zlib.decompress(data, wbits=31)
     if name == "crc32c":
@@ -159,7 +159,6 @@ def _decoder(array: Location, name: str) -> Any:
     import numcodecs.blosc
     import numcodecs.zstd
 
-    # The compressed data contain the settings of the codec.
     return numcodecs.blosc.Blosc().decode if name == "blosc" else numcodecs.zstd.Zstd().decode
 
 

@@ -44,8 +44,7 @@ def closure_candidates(
     chosen = np.flatnonzero(solution.located & (lengths == length))[:: max(1, round(length / spacing))]
     min_interval = _MIN_SKIP * max([1.0, *graph.skips]) * length
     pairs: list[tuple[int, int]] = []
-    step = max(1, -(-len(chosen) // _MAX_EXPOSURES))
-    for position, moving in list(enumerate(chosen))[::step]:
+    for position, moving in list(enumerate(chosen))[:: max(1, -(-len(chosen) // _MAX_EXPOSURES))]:
         earlier = chosen[:position]
         overlap = _overlaps(solution.homographies[moving], solution.homographies[earlier], frame_shape)
         peaks = _visits(overlap, graph.closure_overlap)

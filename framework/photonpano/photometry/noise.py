@@ -103,8 +103,7 @@ def saturated(flux: FluxImage, weight: FluxImage, response: Response) -> BoolArr
     """
     frames = np.maximum(weight, 1)
     highest = response.mean_count(np.array([np.inf], np.float32))
-    lacking = np.maximum(np.float32(_NEARLY) / frames, np.float32(_ROUNDING) * highest)
-    nearly = response.flux(np.asarray(highest - lacking, np.float32), frames)
+    nearly = response.flux(np.asarray(highest - np.maximum(_NEARLY / frames, _ROUNDING * highest), np.float32), frames)
     return np.asarray((flux >= nearly) & (weight > 0))
 
 
