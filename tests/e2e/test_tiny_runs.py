@@ -75,9 +75,11 @@ def test_bytes_of_results_depend_neither_on_threads_nor_on_where_the_spec_comes_
     assert hashes[1:] == hashes[:-1]
 
 
-@pytest.mark.parametrize("model", ["auto", "rotation"])
-def test_capture_of_one_exposure_has_a_panorama_and_no_camera(run: Callable[..., RunResult], model: str) -> None:
-    record = run("resample.with.group_size=160", f"motion.model={model}").record
+@pytest.mark.parametrize(
+    "changes", [["motion.model=auto"], ["motion.model=rotation"], ["motion.model=rotation", "light=changing"]]
+)
+def test_capture_of_one_exposure_has_a_panorama_and_no_camera(run: Callable[..., RunResult], changes: list[str]) -> None:
+    record = run("resample.with.group_size=160", *changes).record
     assert [(level["groups"], level["camera"]) for level in record["levels"]] == [(1, None)]
     assert record["warnings"][0].startswith("only one exposure was located")
 

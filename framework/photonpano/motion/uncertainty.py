@@ -26,16 +26,18 @@ class Uncertainty:
     """
 
     change_px: float | None  # mean displacement of the corners since the previous level, px of a frame; None at the first level
-    # (5,) expected errors of the focal length, in px, and of k1, k2, p1 and p2, 0 for what is given; None for homographies
+    # (5,) expected errors of the focal length, in px, and of k1, k2, p1 and p2, 0 for what is given; None for
+    # homographies, and for a single exposure
     std_camera: FloatArray | None
 
     def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, timeline: Timeline) -> None:
         """Compare a level with the one before, None at the first; beyond a cut, nothing is known from the other side."""
         turned, before = located.solution.rotations, camera_of_motion(previous)
-        self.std_camera = None if turned is None else located.std_camera
-        if turned is not None and before is not None:
+        # A single exposure tells nothing of its camera.
+        self.std_camera = located.std_camera if len(located.std_camera) else None
+        if self.std_camera is not None and turned is not None and before is not None:
             change = turned.camera.numbers - before.numbers
-            self.std_camera = np.hypot(located.std_camera, _REMAINING_SHARE * change)
+            self.std_camera = np.hypot(self.std_camera, _REMAINING_SHARE * change)
         self._instants = located.instants
         self._std_px = located.std_px
         self._timeline = timeline

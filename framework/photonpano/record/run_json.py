@@ -176,7 +176,7 @@ def failure_records(groups: Sequence[Group], edges: Sequence[Edge]) -> list[Fail
 
 def _camera_record(result: LevelResult) -> CameraRecord | None:
     turns, std = result.located.solution.rotations, result.uncertainty.std_camera
-    if turns is None or std is None or not len(std):  # a single exposure tells nothing of its camera
+    if turns is None or std is None:
         return None
     return {
         "focal_px": turns.camera.focal_px,
