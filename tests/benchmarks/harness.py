@@ -37,7 +37,7 @@ from photonpano.evaluation import (
     white_flux,
 )
 from photonpano.execution.context import Context
-from photonpano.geometry import Canvas, FrameTrajectory, apply, normalised
+from photonpano.geometry import Canvas, FrameTrajectory, normalised, transform_points
 from photonpano.merging.canvas_plan import plan_canvas
 from photonpano.merging.panorama import render
 from photonpano.reading import Closing
@@ -226,7 +226,7 @@ class Compared:
 
 def middles(homographies: NDArray[np.float64], frame_shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return where homographies, (T, 3, 3), put the middle of a frame: (T, 2)."""
-    return apply(homographies, (np.array([frame_shape[::-1]]) - 1) / 2)[:, 0]
+    return transform_points(homographies, (np.array([frame_shape[::-1]]) - 1) / 2)[:, 0]
 
 
 def rendered(source: Source, motion: FrameTrajectory, canvas: Canvas | None = None, tolerance_px: float = 0.125) -> Panorama:

@@ -34,7 +34,7 @@ from photonpano import (
     parse_spec,
 )
 from photonpano.contracts.protocols import KnowsTruth
-from photonpano.geometry import FrameTrajectory, apply, corner_displacements, corners, inverse, normalised
+from photonpano.geometry import FrameTrajectory, corner_displacements, corners, inverse, normalised, transform_points
 from photonpano.plugins.registry import Catalog
 from photonpano_core.configs import PhotonMleConfig
 from photonpano_core.mergers.photon_mle import PhotonMleMerger
@@ -104,7 +104,7 @@ def available(catalog: Catalog, context: StageContext) -> Iterator[tuple[str, Lo
 def nearly(true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return a start whose corners are 2 px off, each in a random direction."""
     angles = rng.uniform(0, 2 * np.pi, 4)
-    wrong = apply(true, corners(SHAPE)) + WRONG_PX * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    wrong = transform_points(true, corners(SHAPE)) + WRONG_PX * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return normalised(cv2.getPerspectiveTransform(corners(SHAPE).astype(np.float32), wrong.astype(np.float32)))
 
 

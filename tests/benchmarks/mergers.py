@@ -32,7 +32,7 @@ import numpy as np
 from harness import Study, chosen, command, groups, least, packed, passing, seen, table, write_tables
 
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext, load_trajectory
-from photonpano.geometry import FrameTrajectory, apply, inverse, translation
+from photonpano.geometry import FrameTrajectory, inverse, transform_points, translation
 from photonpano_core.configs import BurstConfig, LocalFlowConfig, PhotonMleConfig
 from photonpano_core.mergers.burst import BurstMerger
 from photonpano_core.mergers.local_flow import LocalFlowMerger
@@ -181,7 +181,7 @@ def travelled(seed: int, depth_m: float, flux: float = 0.3, kind: str = "planes"
     moves_px = np.zeros(SHAPE)
     for index in range(0, n_frames, EVERY):
         there = (pixels + flow(truth, middle, index).vectors).reshape(-1, 2)
-        along = apply(inverse(homographies[middle]) @ homographies[index], there).reshape(pixels.shape)
+        along = transform_points(inverse(homographies[middle]) @ homographies[index], there).reshape(pixels.shape)
         moves_px = np.maximum(moves_px, np.hypot(*np.moveaxis(along - pixels, -1, 0)))
     group = Group(FrameSpan(0, n_frames), float(middle))
     return Simulated(source, FrameTrajectory(homographies), group, source.sharp_view(middle), moves_px > MOVES_PX)

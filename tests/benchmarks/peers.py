@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import Truth, corner_errors, image_score, load_truth, true_panorama, white_flux
 from photonpano.evaluation.registration import alignment_of
-from photonpano.geometry import Canvas, apply, corners
+from photonpano.geometry import Canvas, corners, transform_points
 from photonpano.photometry import tone_mapped
 
 SHAPE, N_FRAMES = (128, 192), 2000
@@ -119,7 +119,7 @@ def picture_scores(flux: NDArray[np.float32], place: NDArray[np.float64], truth:
     first, second = np.minimum(flux[both], np.quantile(flux[both], 0.999)), np.minimum(true[both], white)
     score = image_score(flux * np.float32((first @ second) / (first @ first)), true, both, white)
     seen = np.zeros(scene.shape, np.uint8)
-    for outline in apply(
+    for outline in transform_points(
         truth.homographies[::10], np.broadcast_to(corners(truth.frame_shape), (len(truth.homographies[::10]), 4, 2))
     ):
         cv2.fillConvexPoly(seen, np.rint(outline).astype(np.int32), (1,))

@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 
 from photonpano.errors import InputError
 from photonpano.evaluation.trajectory import Turn
-from photonpano.geometry import PROJECTIONS, Camera, Canvas, apply, corners, nearest_rotations, normalised, translation
+from photonpano.geometry import (
+    PROJECTIONS,
+    Camera,
+    Canvas,
+    corners,
+    nearest_rotations,
+    normalised,
+    transform_points,
+    translation,
+)
 from photonpano.notebooks import facts
 from photonpano.reading import read_arrays, reading
 from photonpano.text import pixels
@@ -294,8 +303,8 @@ def drawn_path(homographies: FloatArray, frame_shape: tuple[int, int]) -> str:
         return ""
     some = homographies[np.linspace(0, len(homographies) - 1, min(len(homographies), _MAX_POINTS)).round().astype(int)]
     outline = corners(frame_shape)
-    middles = apply(some, np.broadcast_to(outline.mean(axis=0), (len(some), 1, 2)))[:, 0]
-    outlines = apply(some[[0, -1]], np.broadcast_to(outline, (2, *outline.shape)))
+    middles = transform_points(some, np.broadcast_to(outline.mean(axis=0), (len(some), 1, 2)))[:, 0]
+    outlines = transform_points(some[[0, -1]], np.broadcast_to(outline, (2, *outline.shape)))
     points = np.concatenate([middles, outlines.reshape(-1, 2)])
     low, size = points.min(axis=0), np.ptp(points, axis=0)
     if not np.isfinite(points).all() or size.max() > _MAX_SIDE * max(frame_shape):

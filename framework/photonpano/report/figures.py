@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.geometry import PROJECTIONS, apply, corners, nearest_rotations, outline_of
+from photonpano.geometry import PROJECTIONS, corners, nearest_rotations, outline_of, transform_points
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import LevelRecord, PanoramaRecord
@@ -98,7 +98,7 @@ def _path(motion: FrameMotion, instants: NDArray[np.int64]) -> tuple[FloatArray,
     """Return the path of the frame centre from that of the reference frame, (N, 2), and its unit: degrees of a turn."""
     centre = centre_of(motion.frame_shape)
     if motion.camera is None:
-        return apply(motion.homographies[instants], centre)[:, 0] - centre[0], "px"
+        return transform_points(motion.homographies[instants], centre)[:, 0] - centre[0], "px"
     ahead = motion.camera.directions(centre[0])
     rotations = nearest_rotations(motion.camera.rotations(motion.homographies[instants]))
     points = PROJECTIONS["spherical"].points(rotations @ ahead) - PROJECTIONS["spherical"].points(ahead)

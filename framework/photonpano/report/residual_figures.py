@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from photonpano.filtering import SYSTEMATIC_PX
-from photonpano.geometry import Canvas, apply, inverse, rescaling
+from photonpano.geometry import Canvas, inverse, rescaling, transform_points
 from photonpano.merging.light import amplitudes_on
 from photonpano.report.drawing import (
     BAR_IN,
@@ -77,7 +77,7 @@ def chi2_cells(residuals: Residuals, measured: Canvas, onto: FloatArray) -> tupl
     reduced_chi2 = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_chi2))
     rows, columns = reduced_chi2.shape
     edges = [[-0.5, -0.5], [columns * BLOCK_PX - 0.5, rows * BLOCK_PX - 0.5]]
-    (left, top), (right, bottom) = apply(onto @ inverse(measured.transform), edges)
+    (left, top), (right, bottom) = transform_points(onto @ inverse(measured.transform), edges)
     return reduced_chi2, (float(left), float(top), float(right), float(bottom))
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from photonpano.geometry import apply, canvas_of, normalised, rescaling, translation
+from photonpano.geometry import canvas_of, normalised, rescaling, transform_points, translation
 
 FRAME_SHAPE = (60, 90)
 
@@ -48,7 +48,7 @@ def capture(tmp_path: Path, true_motion: np.ndarray) -> SimpleNamespace:
     canvas = canvas_of(estimated, FRAME_SHAPE, 2.0)
     x, y = np.meshgrid(np.arange(canvas.width), np.arange(canvas.height))
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
-    on_canvas = apply(np.linalg.inv(canvas.transform @ gauge), pixels).reshape(*canvas.shape, 2)
+    on_canvas = transform_points(np.linalg.inv(canvas.transform @ gauge), pixels).reshape(*canvas.shape, 2)
     flux = flux_at(on_canvas)
     weight = np.zeros(canvas.shape, dtype=np.float32)
     weight[20:-20, 20:-20] = 50

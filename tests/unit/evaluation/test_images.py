@@ -22,11 +22,11 @@ from photonpano.geometry import (
     Canvas,
     FrameTrajectory,
     align_planes,
-    apply,
     corners,
     from_parameters,
     normalised,
     rescaling,
+    transform_points,
     translation,
 )
 from photonpano.photometry import BinaryResponse, srgb_to_linear
@@ -178,14 +178,17 @@ def test_maximum_likelihood_reaches_exposure_bound(bounds: ModuleType) -> None:
     points = np.stack(np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0])), axis=-1).reshape(-1, 2)
     units = np.array([1 / 30, 1 / 30, 1 / 30, 1 / 30, 1, 1, 1 / 900, 1 / 900])
     derivatives = np.stack(
-        [(-np.expm1(-waves(apply(from_parameters(steps * unit), points))) - p.ravel()) / steps for unit in np.diag(units)],
+        [
+            (-np.expm1(-waves(transform_points(from_parameters(steps * unit), points))) - p.ravel()) / steps
+            for unit in np.diag(units)
+        ],
         axis=-1,
     )
     weights = frames / (p * (1 - p)).ravel()
     counts = rng.binomial(frames, p, (400, *SHAPE)).reshape(400, -1) / frames
     scores = ((counts - p.ravel()) * weights) @ derivatives
     found = np.linalg.solve((derivatives.T * weights) @ derivatives, scores.T).T * units
-    errors = apply(from_parameters(found), corners(SHAPE)) - corners(SHAPE)
+    errors = transform_points(from_parameters(found), corners(SHAPE)) - corners(SHAPE)
     scatter = np.sqrt((errors**2).sum(axis=-1).mean())
     assert bounds.exposure_bound_px(FLUX, RESPONSE, frames) == pytest.approx(scatter, rel=0.1)
 
@@ -266,8 +269,8 @@ def gauges(draw: st.DrawFn) -> np.ndarray:
 @given(gauge=gauges())
 def test_align_planes_finds_any_change_of_plane(gauge, true_motion, frame_shape):
     found = align_planes(normalised(gauge @ true_motion), true_motion, frame_shape)
-    points = apply(true_motion[::40], corners(frame_shape))
-    np.testing.assert_allclose(apply(found @ gauge, points), points, atol=1e-6)
+    points = transform_points(true_motion[::40], corners(frame_shape))
+    np.testing.assert_allclose(transform_points(found @ gauge, points), points, atol=1e-6)
 
 
 @settings(max_examples=25)

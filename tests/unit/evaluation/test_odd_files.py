@@ -14,7 +14,7 @@ import tifffile
 
 from photonpano import PhotonpanoError, evaluate
 from photonpano.evaluation import load_truth
-from photonpano.geometry import apply, corners, normalised
+from photonpano.geometry import corners, normalised, transform_points
 
 OUTCOMES = Path(__file__).with_suffix(".txt")  # what becomes of each: `NAME -> SENTENCE`, or `NAME -> a score`
 N_FRAMES = 120
@@ -235,8 +235,8 @@ def test_run_on_distorted_frames_is_right_where_it_moves_the_corners_as_they_app
     capture.write()
     assert evaluate(capture.folder, capture.truth, oracle=False).trajectory.mean_px > 0.1
     truth = load_truth(capture.truth)
-    expected = apply(capture.true["homographies"], [middle, middle + (corner - middle) / 0.97])
-    np.testing.assert_allclose(apply(truth.homographies, [middle, corner]), expected)
+    expected = transform_points(capture.true["homographies"], [middle, middle + (corner - middle) / 0.97])
+    np.testing.assert_allclose(transform_points(truth.homographies, [middle, corner]), expected)
     capture.trajectory["homographies"] = normalised(capture.gauge @ truth.homographies)
     capture.write()
     assert evaluate(capture.folder, capture.truth, oracle=False).trajectory.max_px < 1e-6

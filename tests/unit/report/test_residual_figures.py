@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from photonpano.geometry import Canvas, apply
+from photonpano.geometry import Canvas, transform_points
 from photonpano.report import residual_figures
 from photonpano.report.pose_page import path_views, scene_views, viewpoints
 from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX
@@ -59,7 +59,7 @@ def test_flicker_of_large_panorama_is_that_of_the_middles_of_its_squares(monkeyp
     light = Light(np.ones(9), np.zeros((2, 9)), np.zeros((2, 3, 3), np.float32), np.eye(3), 0.1, np.ones(9))
     residual_figures.flicker_over_panorama(light, Canvas(500, 1000, np.eye(3)))
     assert asked[0].shape == (100, 200)
-    np.testing.assert_allclose(apply(asked[0].transform, [[2.0, 2.0]]), [[0, 0]], atol=1e-12)
+    np.testing.assert_allclose(transform_points(asked[0].transform, [[2.0, 2.0]]), [[0, 0]], atol=1e-12)
 
 
 def test_spectrum_of_noise_is_one(residuals):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from photonpano.errors import OutputError, PhotonpanoError
 from photonpano.execution.context import Context
 from photonpano.files.atomic import atomic_path
-from photonpano.geometry import Canvas, apply, corners, normalised, rescaling, translation
+from photonpano.geometry import Canvas, corners, normalised, rescaling, transform_points, translation
 from photonpano.merging import accumulate
 from photonpano.merging.accumulate import PhotonSum
 from photonpano.merging.chunks import chunks_of
@@ -126,7 +126,7 @@ class PictureSoFar:
 
     def _box(self, placed: FloatArray, shape: tuple[int, int]) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
         """Return the first (x, y) of the canvas that frames touch, and the one beyond the last."""
-        points = apply(rescaling(self.scale) @ placed, corners(shape)).reshape(-1, 2)
+        points = transform_points(rescaling(self.scale) @ placed, corners(shape)).reshape(-1, 2)
         return np.floor(points.min(axis=0)).astype(int), np.ceil(points.max(axis=0)).astype(int) + 1
 
 
@@ -135,7 +135,7 @@ def _upright(placed: FloatArray, shape: tuple[int, int]) -> bool:
     outline = corners(shape)
     if not (np.isfinite(placed).all() and (outline @ placed[:, 2, :2, None] + placed[:, 2, 2, None, None] > 0).all()):
         return False
-    x, y = np.moveaxis(apply(placed, outline), -1, 0)
+    x, y = np.moveaxis(transform_points(placed, outline), -1, 0)
     areas = 0.5 * np.sum(x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1), axis=1)
     change = areas / ((shape[0] - 1) * (shape[1] - 1))
     return bool(((change > 1 / _MOST_AREA_CHANGE) & (change < _MOST_AREA_CHANGE)).all())
