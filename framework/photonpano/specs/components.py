@@ -11,6 +11,7 @@ from photonpano.execution.interrupts import is_interrupt
 from photonpano.plugins.contributions import KINDS, ExporterContribution, Kind, LocatorContribution, SourceContribution
 from photonpano.plugins.registry import Entry
 from photonpano.specs.plan import Choice
+from photonpano.specs.settings import CHOICE
 from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, given
 from photonpano.text import listed
@@ -18,7 +19,6 @@ from photonpano.text import listed
 # The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks.
 DEFAULT_FALLBACK = "opencv-sift"
 MAX_LISTED = 16  # components in a list, such as fallbacks
-CHOICE = ("use", "with")  # the keys that choose a component
 _AGAIN = "would lose the same pairs again"
 
 

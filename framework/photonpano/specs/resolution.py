@@ -9,12 +9,14 @@ from typing import Any
 from photonpano.errors import SpecError
 from photonpano.plugins.contributions import KINDS
 from photonpano.specs.checks import check_flat_field, check_settings, complaints
-from photonpano.specs.components import CHOICE, ComponentResolver, Stage
+from photonpano.specs.components import ComponentResolver, Stage
 from photonpano.specs.corrections import AUTO, resolved_corrections, written_corrections
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.settings import (
+    CHOICE,
     LEVELS,
     MAX_LEVELS,
+    NOT_SETTINGS,
     PANORAMA_ONLY,
     SECTIONS,
     SETTINGS,
@@ -25,9 +27,6 @@ from photonpano.specs.settings import (
 )
 from photonpano.specs.spec import Spec, validate
 from photonpano.specs.written import Written, given
-
-# The keys of the framework's own sections that choose components.
-NOT_SETTINGS = {"render": CHOICE, "output": ("formats",), "run": ("executor",)}
 
 
 def resolve(spec: Spec) -> Plan:

@@ -254,6 +254,9 @@ SETTINGS: dict[str, type[BaseModel]] = {
     "output": OutputSettings,
     "run": RunSettings,
 }
+# The keys that choose a component; and those of the framework's own sections that do.
+CHOICE = ("use", "with")
+NOT_SETTINGS = {"render": CHOICE, "output": ("formats",), "run": ("executor",)}
 # All sections of a spec, in the order in which they are written.
 SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", "pose", *SETTINGS)
 # The sections that do not apply with `pose`.

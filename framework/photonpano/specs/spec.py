@@ -24,7 +24,7 @@ from photonpano.plugins.registry.description import (
     expectation,
     subschema,
 )
-from photonpano.specs.settings import SECTIONS, SETTINGS
+from photonpano.specs.settings import NOT_SETTINGS, SECTIONS, SETTINGS
 from photonpano.specs.written import Written, given
 from photonpano.text import listed, suggestion
 from photonpano.values import Decision
@@ -145,6 +145,7 @@ def _report(error: ErrorDetails, value: Written, root: Schema, spec: Spec) -> No
         spec.wrong_key(value.at(last), f"required: {expectation(subschema(schema, last, root), root)}")
     elif kind == "extra_forbidden":
         known = [key for option in alternatives(schema, root) for key in option.get("properties", ())]
+        known += NOT_SETTINGS.get(value.place.where, ())
         spec.wrong_key(value.at(last), spec.unknown_key(str(last), value, known))
     elif kind == "union_tag_not_found" and tag_key:
         spec.wrong_key(value.at(tag_key), f"required: {listed(tags, 'or')}")
