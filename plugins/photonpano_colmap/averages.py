@@ -30,7 +30,6 @@ from photonpano import (
 )
 from photonpano.geometry import Camera, camera_matrix, positions_of
 from photonpano.locating import blur_against_noise, stabilised_8_bit
-from photonpano.values import true_spans
 from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, counted, starts_of, too_few_averages
 from photonpano_colmap.pose_noise import PoseNoise, pose_noise
 from photonpano_colmap.posing.merging import lit_counts
@@ -202,11 +201,12 @@ class _Assembly:
         """Return the frames without a pose: those of averages that COLMAP left out, and the rest at the end."""
         others = {int(image): number for number, piece in enumerate(self.found.pieces[1:], 2) for image in piece.images}
         posed, lost = set(self.piece.images.tolist()), []
-        for run in true_spans(~located):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], ~located, [False]]).astype(np.int8))).reshape(-1, 2)
+        for start, stop in edges.tolist():
             inside = [
                 number
                 for number, span in enumerate(self.spans)
-                if number not in posed and span.start < run.stop and span.stop > run.start
+                if number not in posed and span.start < stop and span.stop > start
             ]
             elsewhere = [number for number in inside if number in others]
             if elsewhere:
@@ -216,7 +216,7 @@ class _Assembly:
                 reason = f"COLMAP found no pose for {counted(len(inside))}, with at most {matches} matching keypoints"
             else:
                 reason = "they are fewer than an average"
-            lost.append(LostFrames(run, reason))
+            lost.append(LostFrames(FrameSpan(start, stop), reason))
         return tuple(lost)
 
     def _level(self, noise: PoseNoise) -> dict[str, float | int | str | None]:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from photonpano import BoolArray, FloatArray, FrameSpan, Group, LocationError, Source
 from photonpano.geometry import Camera
-from photonpano.values import true_spans
 from photonpano_colmap.posing.adjustment import Adjusted, Observations, adjust
 from photonpano_colmap.posing.merging import PosedExposure, inverse_depth_of, merge_through_depth
 from photonpano_colmap.posing.patches import Found, find_patches, patches_of, stabilised
@@ -91,9 +90,10 @@ def refine(
 def resample(located: BoolArray, group_size: int) -> tuple[Group, ...]:
     """Return groups side by side, of about this size, that cover the located frames, (T,)."""
     groups = []
-    for run in true_spans(located):
-        number = max(1, round(len(run) / group_size))
-        borders = np.linspace(run.start, run.stop, number + 1).round().astype(int).tolist()
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], located, [False]]).astype(np.int8)))
+    for start, stop in ends.reshape(-1, 2).tolist():
+        number = max(1, round((stop - start) / group_size))
+        borders = np.linspace(start, stop, number + 1).round().astype(int).tolist()
         spans = [FrameSpan(*each) for each in pairwise(borders)]
         groups += [Group(span, span.centre) for span in spans]
     return tuple(groups)
