@@ -18,6 +18,7 @@ from hypothesis import settings
 
 from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.execution import interrupts
+from photonpano.execution.threads import one_thread_inside
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run import RunResult
@@ -234,6 +235,13 @@ def write_video(tmp_path: Path) -> Callable[..., Path]:
         return tmp_path / name
 
     return write
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread_for_each_process() -> Iterator[None]:
+    """Keep OpenCV and BLAS from starting threads: every core has a process with tests already."""
+    with one_thread_inside():
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -16,7 +16,7 @@ import cv2
 import numba
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from photonpano import compiling
 from photonpano.compiling import notify_on_first_compile
@@ -35,7 +35,8 @@ def test_thread_count_auto_is_the_number_of_usable_cores(monkeypatch: pytest.Mon
 def two_threads() -> Iterator[None]:
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
-    yield
+    with threadpool_limits(2):
+        yield
     cv2.setNumThreads(before)
 
 
