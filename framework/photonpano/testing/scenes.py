@@ -36,13 +36,11 @@ class Scene:
         self._waves = 2 * np.pi / periods_px * np.stack([np.cos(directions), np.sin(directions)])
         self._phases = rng.uniform(0, 2 * np.pi, _WAVES)
         self._amplitudes = np.sqrt(periods_px) / np.sqrt(periods_px.sum() / 2)
-        self._flux = flux
+        self._low, self._high = flux
 
     def flux(self, points: ArrayLike) -> FloatArray:
         """Return the flux at points of the plane: (N, 2) to (N,)."""
-        waves = np.sin(np.asarray(points) @ self._waves + self._phases) @ self._amplitudes
-        low, high = self._flux
-        return np.asarray(low + (high - low) / (1 + np.exp(-_CONTRAST * waves)))
+        return self._of(np.sin(np.asarray(points) @ self._waves + self._phases) @ self._amplitudes)
 
     def view(self, homography: Homography, shape: tuple[int, int]) -> FloatArray:
         """Return the view of a camera: (H, W) flux.
@@ -51,8 +49,15 @@ class Scene:
             homography: (3, 3), pixels of the image to points of the plane.
             shape: (height, width) of the image.
         """
-        y, x = np.mgrid[: shape[0], : shape[1]]
-        return self.flux(transform_points(homography, np.stack([x.ravel(), y.ravel()], axis=1))).reshape(shape)
+        if homography[2, :2].any():
+            return self.flux(transform_points(homography, np.indices(shape)[::-1].reshape(2, -1).T)).reshape(shape)
+        # Along an affine map, each wave is the product of one of x and one of y.
+        *steps, phases = (homography[:2] / homography[2, 2]).T @ self._waves
+        x, y = (np.exp(1j * np.outer(np.arange(n), step)) for n, step in zip(shape[::-1], steps, strict=True))
+        return self._of((self._amplitudes * np.exp(1j * (phases + self._phases)) * y @ x.T).imag)
+
+    def _of(self, waves: FloatArray) -> FloatArray:
+        return np.asarray(self._low + (self._high - self._low) / (1 + np.exp(-_CONTRAST * waves)))
 
 
 def textured(shape: tuple[int, int], flux: float = 0.5, contrast: float = 0.8, seed: int = 0) -> FloatArray:

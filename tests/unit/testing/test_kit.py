@@ -24,6 +24,13 @@ def test_scene_view_moved_by_whole_pixels_has_same_values():
     np.testing.assert_allclose(there[2:, :-3], here[:-2, 3:], rtol=1e-9)
 
 
+def test_scene_view_is_the_flux_at_the_points_that_pixels_see():
+    points = {"affine": [[34.2, 10.6], [36.8, 10.2]], "perspective": [[34.2, 10.6], [36.8 / 1.01, 10.2 / 1.01]]}
+    for name, bend in (("affine", 0), ("perspective", 0.01)):
+        seen = Scene().view(np.array([[2.6, 0.4, 33], [-0.4, 1.8, 5.2], [bend, 0, 1]]), SHAPE)
+        np.testing.assert_allclose(seen[3, :2], Scene().flux(points[name]), rtol=1e-9)
+
+
 def test_scene_flux_spans_given_range():
     flux = Scene(flux=(0.2, 0.7)).view(np.eye(3), (200, 200))
     assert 0.2 < flux.min() < 0.25
