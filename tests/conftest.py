@@ -245,6 +245,14 @@ def one_thread_for_each_process() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def files_left_in_memory() -> Iterator[None]:
+    """Do not wait for the disk, as no test of this process looks at files after a loss of power."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", os.fstat)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def streets_drawn_once() -> Iterator[None]:
     """Draw each street once: many tests simulate the same one, and drawing it takes longer than a small run."""
     with pytest.MonkeyPatch.context() as patch:
