@@ -72,14 +72,16 @@ class State:
     def located(self, levels: Sequence[Level], previous: Trajectory | None, corrected: Trajectory | None = None) -> State:
         """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels.
 
-        They correct the start, or the motion that is `corrected`, instead of replacing it.
+        They correct the motion that is `corrected`, instead of replacing it: by default that of the gyroscope, or the start.
         """
         if not levels:
             return self
         before = [each for each in self.results if each.level.number < levels[0].number]
         given = self.plan.graph, self.reference, self.context, self.plan.until_converged, previous, self.timeline, self.model
         known = self.results[-1].located.covered if self.results else None
-        results = estimate_motion(self.source, levels, *given, corrected or self.start, known, self.gyroscope)
+        if corrected is None and self.gyroscope is None:
+            corrected = self.start
+        results = estimate_motion(self.source, levels, *given, corrected, known, self.gyroscope)
         return replace(self, results=(*before, *results), outdated=False)
 
     def relocated(self) -> State:
