@@ -253,10 +253,22 @@ def files_left_in_memory() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def streets_drawn_once() -> Iterator[None]:
+def streets_drawn_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Draw each street once: many tests simulate the same one, and drawing it takes longer than a small run."""
+    own, draw = tmp_path_factory.mktemp("street"), scenes.street
+    folder = (own.parents[1] if "PYTEST_XDIST_WORKER" in os.environ else own.parent) / "streets"  # of all workers
+    folder.mkdir(exist_ok=True)
+
+    @lru_cache(maxsize=16)
+    def street(shape: tuple[int, int], seed: int) -> np.ndarray:
+        file = folder / f"{shape}-{seed}.npy"
+        if not file.exists():
+            np.save(own / file.name, draw(shape, seed))
+            (own / file.name).replace(file)
+        return np.load(file)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("photonpano_simulator.scenes.street", lru_cache(maxsize=16)(scenes.street))
+        patch.setattr("photonpano_simulator.scenes.street", street)
         yield
 
 
