@@ -37,6 +37,7 @@ def spec(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         "source": source,
         "levels": 1,
         "refine": [],
+        "light": "steady",
         "resample": {"with": {"group_size": 100}},
         "corrections": [],
     }
