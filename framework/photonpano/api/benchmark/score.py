@@ -180,7 +180,8 @@ def _scored(
         motion, notes = read_motion(path, expected)
         if path.is_dir():
             panorama: Callable[[], Pictures] | None = partial(load_panorama, path)
-            seconds = seconds or read_record(path)["seconds"]
+            if seconds is None:
+                seconds = read_record(path)["seconds"]
         else:
             motion, adapted = in_true_plane(motion, truth)
             motion, panorama = _panorama(motion, along)
