@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano import InputError, OutputError, PluginError, RunResult, SpecError, parse_spec, run
+from photonpano import InputError, OutputError, PluginError, RunResult, SourceContribution, SpecError, parse_spec, run
 from photonpano.contracts.protocols import Arrived
 from photonpano.report import LiveFigures
 
@@ -260,8 +260,9 @@ def test_source_that_fails_while_frames_arrive_is_named_and_ends_the_run(
             raise ValueError("no luck")
         return Arrived(None)
 
-    contribution: Any = replace(plan.source.contribution, arrived=arrived)  # type: ignore[call-arg]
-    plan = replace(plan, source=replace(plan.source, contribution=contribution))
+    contribution = plan.source.contribution
+    assert isinstance(contribution, SourceContribution)
+    plan = replace(plan, source=replace(plan.source, contribution=replace(contribution, arrived=arrived)))
     with pytest.raises(PluginError, match=r"^source 'packed-npy' of .* failed at the frames so far: ValueError: no luck"):
         run(plan, follow=True, end_after=60)
 
