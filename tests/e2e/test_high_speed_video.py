@@ -60,11 +60,11 @@ def scored(tmp_path: Path, write_video: Callable) -> Callable[..., tuple[Evaluat
 
 
 def test_noisy_compressed_video_is_nearly_as_accurate_as_clean_one(scored: Callable) -> None:
-    """Measured: 0.09 and 0.01 px, 28.2 and 32.5 dB."""
+    """Measured: 0.06 to 0.09 px for five seeds of the noise."""
     noisy, record = scored("noisy.mp4", "libx264", "yuvj420p", crf=23, oracle=True, levels=2)
     clean, _ = scored(light=100, read_noise=0, levels=2)
     assert clean.trajectory.mean_px < 0.1
-    assert noisy.trajectory.mean_px < 0.15
+    assert noisy.trajectory.mean_px < 0.12
     assert noisy.oracle.psnr_db - noisy.panorama.psnr_db < 0.5
     assert clean.panorama.psnr_db - 5 < noisy.panorama.psnr_db < clean.panorama.psnr_db
     (chosen,) = [decision for decision in record["decisions"] if decision["what"] == "group_size"]
