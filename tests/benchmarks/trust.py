@@ -28,6 +28,7 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -169,13 +170,16 @@ def figures_of_run(folder: Path, truth: Truth) -> Result:
     return figures_of(estimated | {"homographies": found.corner_homographies}, truth)
 
 
-def scored(cube: Path, more: Callable[[Path], Result] = lambda _: {}) -> Result:
-    """Run a capture with a source alone, and one thread; return its scores, and more of its folder, or why there are none."""
+def scored(cube: Path, more: Callable[[Path], Result] = lambda _: {}, **sections: Any) -> Result:
+    """Run a capture with a source alone, and one thread; return its scores, and more of its folder, or why there are none.
+
+    The spec may have other `sections`.
+    """
     result: Result = {"exit_code": 0, "message": "", "verdict": None}
     with passing() as study:
         start = time.process_time()
         try:
-            folder = study.run("run", packed(cube, run={"threads": 1}))
+            folder = study.run("run", packed(cube, run={"threads": 1}, **sections))
         except Exception as error:  # a defect of photonpano is a result too
             code, message = (1, str(error)) if isinstance(error, PhotonpanoError) else (None, repr(error))
             return result | {"exit_code": code, "message": message, "cpu_s": time.process_time() - start}

@@ -6,16 +6,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-from photonpano.geometry import corners, from_parameters, generators, inverse, slopes, transform_points
+from photonpano.geometry import corners, from_parameters, generators, inverse, patch_centres, slopes, transform_points
+from photonpano.motion.exposure_noise import ExposureNoise
 from photonpano.robust import cauchy_weights
-from photonpano.values import BoolArray, FloatArray, Located
+from photonpano.values import BoolArray, FloatArray, FrameSpan, Located
 
 MAX_ITERATIONS = 30
 CONVERGED_PX = 1e-3  # largest motion of a corner in the last step
@@ -51,17 +52,6 @@ class Assessment:
     std_camera: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """What a solution leaves of the residuals of a graph."""
-
-    squares: float  # sum of the squared residuals of unit variance
-    unknowns: int
-    shared: int  # those of them that all nodes share
-    left: int  # degrees of freedom of the residuals
-    explained: float = 0.0  # by how much a lens lowers the squared residuals of patches that homographies leave
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
     """A connected graph whose nodes are to be found."""
@@ -70,11 +60,21 @@ class Problem:
     anchor: int  # the node that does not change
     motions: Sequence[Located]  # the motions of the edges, with their information
     frame_shape: tuple[int, int]  # (height, width) of a frame
+    instants: FloatArray  # (N,) of the nodes, in frames, in order
+    spans: Sequence[FrameSpan]  # the frames of each node
 
     @property
     def observed(self) -> FloatArray:
         """The homographies of the edges: (E, 3, 3), pixels of the moving frame to pixels of the fixed one."""
         return np.array([motion.homography for motion in self.motions])
+
+
+class Prior(NamedTuple):
+    """What is known of the unknowns beside the edges: m residuals that are normally distributed."""
+
+    residuals: FloatArray  # (m,) of unit variance
+    slopes: sparse.csr_array  # (m, k N + s) their derivatives
+    log_variances: float = 0.0  # sum of the logarithms of their variances before they were scaled
 
 
 class Adjustment(ABC, Generic[StateT]):
@@ -98,6 +98,8 @@ class Adjustment(ABC, Generic[StateT]):
         self._rows = np.concatenate([self._corners, np.ones((4, 1))], axis=1).T
         self._targets = transform_points(problem.observed, self._corners)
         self._whitening = _whitening(problem.motions, self._rows)
+        self._motions = problem.motions
+        self._noise = ExposureNoise.of(problem.pairs, problem.spans)
 
     @abstractmethod
     def homographies(self, state: StateT) -> FloatArray:
@@ -122,17 +124,27 @@ class Adjustment(ABC, Generic[StateT]):
     def shared_slopes(self, state: StateT) -> FloatArray:
         """Return the derivatives of the corners that each edge maps by the shared unknowns: (E, 8, s)."""
         del state
-        return np.zeros((len(self._moving), 8, 0))
+        return np.zeros((len(self._moving), 8, self._n_shared))
 
     def shared_errors(self, state: StateT) -> FloatArray:
         """Return the derivatives of the corners of each node's frame by the shared unknowns: (N, 8, s)."""
         del state
-        return np.zeros((self._n_nodes, 8, 0))
+        return np.zeros((self._n_nodes, 8, self._n_shared))
 
-    def prior(self, state: StateT) -> tuple[FloatArray, FloatArray]:
-        """Return residuals of unit variance of what is known of the shared unknowns, (s,), and their derivatives, (s, s)."""
+    def prior(self, state: StateT) -> Prior:
+        """Return what is known of the unknowns beside the edges."""
         del state
-        return np.zeros(self._n_shared), np.zeros((self._n_shared, self._n_shared))
+        return Prior(np.zeros(0), sparse.csr_array((0, self._n_node * self._n_nodes + self._n_shared)))
+
+    def learn(self, state: StateT, weights: FloatArray) -> bool:
+        """Estimate the variances of the prior from edges of these weights, (E,), and return whether they changed."""
+        del state, weights
+        return False
+
+    @property
+    def n_hyperparameters(self) -> int:
+        """How many numbers beside those of the nodes were estimated."""
+        return self._n_shared
 
     def std_camera(self, state: StateT, shared: FloatArray) -> FloatArray:
         """Return what `Assessment` holds of a camera, given (s, S) draws of errors of the shared unknowns."""
@@ -147,7 +159,7 @@ class Adjustment(ABC, Generic[StateT]):
     def minimise(self, state: StateT, kept: BoolArray) -> tuple[StateT, FloatArray]:
         """Return the state of least cost, and the norm of the whitened residual of each edge, (E,); outliers are not `kept`."""
         # Equal weights at first: the start fits half of the edges exactly, so that robust weights would reject the others.
-        weights = kept.astype(np.float64)
+        weights = kept * self._noise.weights
         for iteration in range(MAX_ITERATIONS):
             jacobians, residuals = self._linearised(state, weights)
             free, gradient = self._free(state), jacobians.T @ residuals
@@ -157,7 +169,7 @@ class Adjustment(ABC, Generic[StateT]):
             if stepped is None:
                 break
             state, norms = stepped
-            weights = self._robust_weights(norms, kept)
+            weights = self.weights(norms, kept)
             negligible = iteration > 0 and -step @ gradient < NEGLIGIBLE
             if negligible or np.abs(step).max() * self._half < CONVERGED_PX:
                 break
@@ -177,32 +189,52 @@ class Adjustment(ABC, Generic[StateT]):
         """How many numbers are to be found."""
         return self._n_node * (self._n_nodes - 1) + self._n_shared
 
-    def cost(self, state: StateT, norms: FloatArray, kept: BoolArray) -> Cost:
-        """Return what a solution leaves of the edges that are kept, given the (E,) norms of their whitened residuals."""
-        del state
-        squares = float(8 * (norms[kept] ** 2).sum())
-        return Cost(squares, self.unknowns, self._n_shared, 8 * int(kept.sum()) - self.unknowns)
+    def chi2(self, norms: FloatArray, kept: BoolArray) -> float:
+        """Return the mean square of the whitened residuals of the edges that are kept, given their (E,) norms."""
+        return float((norms[kept] ** 2).mean())
+
+    def deviance(self, state: StateT, weights: FloatArray) -> float:
+        """Return minus twice the logarithm of the marginal likelihood of a solution, up to a constant that all models share.
+
+        Unknowns are integrated out around it (Laplace), and each number that was estimated beside them costs the logarithm of how
+        many exposures tell it (Schwarz 1978). `weights` (E,) are the same for all models.
+        """
+        jacobians, residuals = self._linearised(state, weights)
+        free = self._free(state)
+        factors = factorised((jacobians.T @ jacobians)[free][:, free])
+        determinant = float(np.log(np.abs(factors.U.diagonal())).sum())
+        price = self.n_hyperparameters * float(np.log(max(self._n_nodes - 1, 1)))
+        return float(residuals @ residuals) + self.prior(state).log_variances + determinant + price
 
     def assess(self, state: StateT, norms: FloatArray, kept: BoolArray) -> Assessment:
         """Return the information on each node while the others are held, and the expected error of its corners.
 
-        The error is that of solutions drawn from the covariance, each aligned with the best one as an evaluation aligns planes.
-        If residuals exceed what the information of the edges predicts, the covariance is scaled up accordingly.
+        The error is that of solutions for drawn noise of the exposures, each aligned with the best one as an evaluation aligns
+        planes. If residuals exceed what the information of the edges predicts, the noise is scaled up accordingly.
         """
-        misfit = self._residual_scale(norms, kept) / MEDIAN_NORM
-        jacobians, _ = self._linearised(state, self._robust_weights(norms, kept) / misfit**2)
+        weights = self.weights(norms, kept)
+        jacobians, _ = self._linearised(state, weights)
         normal, free = jacobians.T @ jacobians, self._free(state)
-        k = self._n_node
+        k, n_edges = self._n_node, len(weights)
         blocks = np.stack([normal[k * node : k * node + k, k * node : k * node + k].toarray() for node in range(self._n_nodes)])
-        rng, right, changes = np.random.default_rng(0), np.zeros((len(free), SAMPLES)), np.zeros((len(free), SAMPLES))
-        # All draws at once would take more memory than the equations.
-        for first in range(0, jacobians.shape[0], _DRAWN_ROWS):
-            rows = jacobians[first : first + _DRAWN_ROWS]
-            right += rows.T @ rng.normal(size=(rows.shape[0], SAMPLES))
+        rng, changes = np.random.default_rng(0), np.zeros((len(free), SAMPLES))
+        moving, fixed = self._body_slopes(state)
+        errors = np.sqrt(weights)[:, None, None] * self._noise.errors(moving, fixed, SAMPLES, rng)
+        errors *= self._residual_scale(norms, kept) / MEDIAN_NORM
+        right = jacobians[: 8 * n_edges].T @ errors.reshape(8 * n_edges, SAMPLES)
+        below = jacobians[8 * n_edges :]
+        right += below.T @ rng.normal(size=(below.shape[0], SAMPLES))
         changes[free] = _solved(normal[free][:, free], right[free], draws=True)
         changes += self._common_errors(normal, free, int(kept.sum()), rng)
         std_camera = self.std_camera(state, changes[k * self._n_nodes :])
         return Assessment(self.information(state, blocks), self._corner_std_px(state, changes), std_camera)
+
+    def _body_slopes(self, state: StateT) -> tuple[FloatArray, FloatArray]:
+        """Return the derivatives of the whitened residual of each edge by small motions of both its frames: (E, 8, 8) each."""
+        relative, moves = self.relative(state), generators(self._frame_shape)
+        mapped = relative @ self._rows
+        by_moving, by_fixed = relative[:, None] @ (moves @ self._rows), -moves @ mapped[:, None]
+        return self._whitening @ slopes(mapped, by_moving), self._whitening @ slopes(mapped, by_fixed)
 
     def _common_errors(self, normal: sparse.csr_array, free: BoolArray, n_edges: int, rng: np.random.Generator) -> FloatArray:
         """Draw errors of the shared unknowns that all pairs have in common, and how the nodes follow: (k N + s, S).
@@ -241,7 +273,7 @@ class Adjustment(ABC, Generic[StateT]):
             with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
                 changed = self.changed(state, step[:n_nodes].reshape(self._n_nodes, -1), step[n_nodes:])
                 norms = self._norms(changed)
-                if 8 * weights @ norms**2 + float((self.prior(changed)[0] ** 2).sum()) <= cost * (1 + NO_WORSE):
+                if 8 * weights @ norms**2 + float((self.prior(changed).residuals ** 2).sum()) <= cost * (1 + NO_WORSE):
                     return changed, norms
             step = step / 2
         return None
@@ -279,14 +311,28 @@ class Adjustment(ABC, Generic[StateT]):
         scale = float(np.median(norms[kept])) * float(np.sqrt(n_edges / redundancy)) if redundancy > 0 else 0.0
         return max(scale, MEDIAN_NORM)
 
-    def _robust_weights(self, norms: FloatArray, kept: BoolArray) -> FloatArray:
-        """Return the Cauchy weights of the edges, 0 for those that are not kept: (E,)."""
-        scale = self._residual_scale(norms, kept) * CAUCHY
-        return np.asarray(np.where(kept, cauchy_weights(norms, scale), 0.0))
+    def weights(self, norms: FloatArray, kept: BoolArray) -> FloatArray:
+        """Return the weights of the edges, (E,): robust (Cauchy), in units of their residuals; 0 for those that are not kept."""
+        scale = self._residual_scale(norms, kept)
+        robust = cauchy_weights(norms, scale * CAUCHY) * (MEDIAN_NORM / scale) ** 2
+        return np.asarray(np.where(kept, robust, 0.0) * self._noise.weights)
 
     def mapped_corners(self, state: StateT) -> FloatArray:
         """Return where a state expects the corners that each edge maps: (E, 4, 2) px."""
         return transform_points(self.relative(state), self._corners)
+
+    def beside(self, state: StateT) -> FloatArray:
+        """Return where patches of pairs lie beside where they are expected: (E, P, 2) px; meaningless for those that show nothing."""
+        points = patch_centres(self._frame_shape)
+        expected = transform_points(self.relative(state), points) + self.shifted_patches(state)
+        patches = [np.zeros((len(points), 2)) if each.patches is None else each.patches.shifts for each in self._motions]
+        observed = np.array([each.homography for each in self._motions])
+        return np.asarray(transform_points(observed, points) + np.array(patches) - expected)
+
+    def shifted_patches(self, state: StateT) -> FloatArray | float:
+        """Return how far patches lie from where the homographies of a state map them: (E, P, 2) px."""
+        del state
+        return 0.0
 
     def _residuals(self, state: StateT) -> FloatArray:
         return self.mapped_corners(state) - self._targets
@@ -296,7 +342,15 @@ class Adjustment(ABC, Generic[StateT]):
         return np.asarray(np.linalg.norm(whitened, axis=1) / np.sqrt(8))
 
     def _linearised(self, state: StateT, weights: FloatArray) -> tuple[sparse.csr_array, FloatArray]:
-        """Return the weighted derivatives of the residuals, (8 E + s, k N + s), and the weighted residuals, (8 E + s,)."""
+        """Return the weighted derivatives of the residuals, (8 E + m, k N + s), and the weighted residuals: edges, then prior."""
+        jacobians, residuals = self._of_edges(state, weights)
+        prior = self.prior(state)
+        if not len(prior.residuals):
+            return jacobians, residuals
+        return sparse.csr_array(sparse.vstack([jacobians, prior.slopes])), np.concatenate([residuals, prior.residuals])
+
+    def _of_edges(self, state: StateT, weights: FloatArray) -> tuple[sparse.csr_array, FloatArray]:
+        """Return the weighted derivatives of the residuals of the edges, (8 E, k N + s), and these residuals, (8 E,)."""
         relative, moves, k = self.relative(state), self.generators(state), self._n_node
         mapped = relative @ self._rows
         d_moving = relative[:, None] @ (moves @ self._rows)
@@ -308,17 +362,18 @@ class Adjustment(ABC, Generic[StateT]):
         unknowns = (k * np.stack([self._moving, self._fixed], axis=1)[..., None] + np.arange(k)).reshape(n_edges, 1, 2 * k)
         columns = np.broadcast_to(unknowns, entries.shape).astype(np.int32)
         starts = np.arange(0, entries.size + 1, 2 * k, dtype=np.int32)
-        residuals = np.einsum("eij,ej->ei", root, self._residuals(state).reshape(-1, 8))
+        residuals = np.einsum("eij,ej->ei", root, self._residuals(state).reshape(-1, 8)).ravel()
         shape = 8 * n_edges, k * self._n_nodes
         jacobians = sparse.csr_array((entries.ravel(), columns.ravel(), starts), shape=shape)
         if not self._n_shared:
-            return jacobians, residuals.ravel()
-        known, of_known = self.prior(state)
+            return jacobians, residuals
         of_shared = sparse.csr_array((root @ self.shared_slopes(state)).reshape(8 * n_edges, -1))
-        below = sparse.csr_array((len(known), shape[1]))
-        rows = sparse.vstack([sparse.hstack([jacobians, of_shared]), sparse.hstack([below, sparse.csr_array(of_known)])])
-        jacobians = sparse.csr_array(rows)
-        return jacobians, np.concatenate([residuals.ravel(), known])
+        return sparse.csr_array(sparse.hstack([jacobians, of_shared])), residuals
+
+    def _of_shared(self, values: FloatArray) -> sparse.csr_array:
+        """Return (m, s) derivatives by the shared unknowns as those by all: (m, k N + s)."""
+        beside = sparse.csr_array((len(values), self._n_node * self._n_nodes))
+        return sparse.csr_array(sparse.hstack([beside, sparse.csr_array(values)])) if self._n_shared else beside
 
 
 def _solved(normal: sparse.csr_array, right: FloatArray, draws: bool = False) -> FloatArray:
@@ -328,17 +383,18 @@ def _solved(normal: sparse.csr_array, right: FloatArray, draws: bool = False) ->
     `normal` as their covariance, such unknowns get draws as wide as the damping.
     """
     with suppress(RuntimeError), np.errstate(all="ignore"):
-        solution = _factorised(normal).solve(right)
+        solution = factorised(normal).solve(right)
         if np.isfinite(solution).all():
             return np.asarray(solution)
     diagonal = normal.diagonal()
     damping = _DAMPING * np.maximum(diagonal, _DAMPING * diagonal.max(initial=_TINY))
     if draws:
         right = right + np.sqrt(damping)[:, None] * np.random.default_rng(1).normal(size=right.shape)
-    return np.asarray(_factorised(normal + sparse.diags_array(damping)).solve(right))
+    return np.asarray(factorised(normal + sparse.diags_array(damping)).solve(right))
 
 
-def _factorised(normal: sparse.csr_array) -> SuperLU:
+def factorised(normal: sparse.csr_array) -> SuperLU:
+    """Factorise a symmetric system; the ordering keeps the factors sparse. A `RuntimeError` if it is exactly singular."""
     return splu(
         normal.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False}
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from typing import Any, TypeAlias
@@ -20,8 +20,6 @@ from photonpano.motion.pairs import shared_share
 from photonpano.motion.tracking import Place, StartingMotion, Track
 from photonpano.values import Decision, Edge, Homography, Located, NotLocated, VirtualExposure
 
-# Least weight of a pair. Shared photons carry no new information: their noise agrees with the motion known so far.
-MIN_PAIR_WEIGHT = 0.05
 # Most hypotheses of a pair that are used.
 MAX_HYPOTHESES = 100
 
@@ -82,7 +80,6 @@ class ExposureTasks:
     """
 
     exposures: VirtualExposures  # of the level
-    independent: float  # the share of the photons of a typical group that no earlier group contains
 
     def describe(self, indices: Sequence[int], keep: bool) -> tuple[dict[int, Described], tuple[list[Contrast], Notes]]:
         """Merge exposures, and have the first locator describe them; a blank exposure is not described.
@@ -189,7 +186,7 @@ class ExposureTasks:
     def _located_by(
         self, number: int, named: NamedLocator, pair: Pair, known: Descriptions, clock: Stopwatch
     ) -> Located | NotLocated:
-        """Return the motion of a pair as one locator finds it from where it is expected; each photon counts once."""
+        """Return the motion of a pair as one locator finds it from where it is expected."""
         level, shape = self.exposures.level, self.exposures.frame_shape
         starts = not pair.guessed or isinstance(named.component, KeepsHypotheses)
         expected = pair.expected if starts else None
@@ -205,16 +202,7 @@ class ExposureTasks:
             motion = level.in_frame_px(motion)
             if reason := why_implausible(motion.homography, shape) or why_undetermined(motion, shape):
                 return NotLocated(reason, motion.evidence)
-            return self._of_new_photons(pair, motion)
-
-    def _of_new_photons(self, pair: Pair, motion: Located) -> Located:
-        """Return a motion whose information does not count the photons that both exposures share."""
-        if motion.information is None:
             return motion
-        groups = self.exposures.groups
-        new = self.independent * max(1 - shared_share(groups[pair.moving].span, groups[pair.fixed].span), MIN_PAIR_WEIGHT)
-        patches = motion.patches and replace(motion.patches, information=motion.patches.information * new)
-        return replace(motion, information=motion.information * new, patches=patches)
 
     def _features(self, index: int, locator: int, known: Descriptions, clock: Stopwatch) -> Any:
         """Return what a locator makes of an exposure; for a fallback, it is merged again."""

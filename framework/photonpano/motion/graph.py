@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -13,29 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from photonpano.geometry import (
-    Camera,
-    align_planes,
-    corner_displacements,
-    inverse,
-    lenses_apart_px,
-    likely_rotations,
-    normalised,
-    scaled_ahead,
-)
-from photonpano.motion.adjustment import OUTLIER, Adjustment, Assessment, Cost, Problem
+from photonpano.geometry import Camera, corners, inverse, lenses_apart_px, likely_rotations, scaled_ahead
+from photonpano.motion.adjustment import Adjustment, Assessment, Problem
 from photonpano.motion.consensus import agreeing, contradicting, layers, tolerances_px, travelled
-from photonpano.motion.evidence import Evidence, likeliest
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
-from photonpano.motion.pairs import adjacency, component_labels
-from photonpano.motion.planar import PlanarAdjustment, nearest
+from photonpano.motion.pairs import adjacency, component_labels, instants_of
+from photonpano.motion.planar import PlanarAdjustment, Plane, nearest
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
-from photonpano.values import BoolArray, Edge, FloatArray, Located
+from photonpano.values import BoolArray, Edge, FloatArray, FrameSpan, Group, Located
 
-# Share of the patches that contradict a camera that only turns, above which they are told from the background.
+# Share of the patches that contradict the motion, above which they are told from the background.
 _CONTRADICTED = 0.005
 _HELD = 3.0  # expected errors by which k1 may differ from what is given, to be held while the focal length is free
 _FEWEST_NODES = 12  # of which pairs tell what is the background over time
+_LEARNT = 3  # times that the variances of the prior are estimated, each along the motion by those before
 
 
 class GraphOptions(Protocol):
@@ -71,6 +62,14 @@ class Freed(NamedTuple):
     std: float  # expected error of what was found
 
 
+class Rival(NamedTuple):
+    """How well a model of the motion explains the pairs of a level."""
+
+    chi2: float  # mean square of their whitened residuals, in which pairs that share photons have a part of their noise only
+    unknowns: int
+    deviance: float  # minus twice the logarithm of its marginal likelihood, above that of the likeliest model
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphSolution:
     """The homographies of the exposures.
@@ -87,10 +86,12 @@ class GraphSolution:
     residual_px: float  # root mean square residual of the other edges at the corners, 0 for a tree
     # returns how well the L located nodes are determined. It takes about as long as to solve the graph.
     assess: Callable[[], Assessment]
-    model: MotionModel = HOMOGRAPHIES  # of these homographies: the one that "auto" chose
+    model: MotionModel = HOMOGRAPHIES  # of these homographies: the likelier one of "auto"
     rotations: Rotations | None = None  # of the L located nodes, and their camera; None for homographies
-    # returns how well rival models explain the edges, None without rivals; for rotations it takes as long as solving the graph
-    compare: Callable[[], Evidence | None] = lambda: None
+    # how far what homographies do beyond shift and roll moves the ends of a frame over the capture, px; none that are 0
+    walks_px: Mapping[str, float] = field(default_factory=dict)
+    # returns how well rival models explain the edges, by their names; for rotations it takes as long as solving the graph
+    compare: Callable[[], Mapping[str, Rival]] = dict
     # (N, P) how far patches of each node lie from where the motion lets expect them, as mean squares in variances, 1 for noise;
     # 0 where nothing is known, and None where patches do not contradict the motion
     layers: FloatArray | None = None
@@ -108,7 +109,7 @@ def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
 
 
 def solve(
-    n_nodes: int,
+    nodes: Sequence[Group],
     edges: Sequence[Edge],
     anchor: int,
     frame_shape: tuple[int, int],
@@ -119,102 +120,107 @@ def solve(
 
     Robust least squares on the corners that each edge maps, weighted by the edge's information where it has one; Gauss-Newton
     with Cauchy weights, from a tree of edges between near exposures unless a start is given: (N, 3, 3) homographies to any
-    plane. Outliers are dropped, unless the graph would fall apart, and it is solved again.
+    plane. Outliers are dropped, unless the graph would fall apart, and it is solved again. With the model "auto", rotations of
+    one camera are taken if their marginal likelihood is higher than that of homographies.
     """
-    tied = _Tied.of(n_nodes, edges, anchor, frame_shape)
+    tied = _Tied.of(nodes, edges, anchor, frame_shape)
     if not len(tied.motions):
         return tied.alone(model)
-    if model.kind == "auto":
-        tied, fits = _of_background(tied, start, _rivals(tied, start, model))
-        chosen = _chosen(tied, fits)
-        solution = tied.solution(fits[chosen], replace(chosen, chosen=True), lambda: Evidence.of(_costs(fits)))
-        turned = next((fit for model, fit in fits.items() if chosen.is_simple and model.kind == "rotation"), None)
-        return solution if turned is None else replace(solution, assess=partial(_doubting, tied, solution, turned))
-    tied, fits = _of_background(tied, start, {model: _fitted(tied, start, model)})
-    fit = fits[model]
-    solution = tied.solution(fit, model, partial(_compared, tied, start, model, fit))
-    if not (model.chosen and model.is_simple):
-        return solution
-    with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
-        turned = _fitted(tied, start, replace(model, kind="rotation"), [fit])
-        return replace(solution, assess=partial(_doubting, tied, solution, turned))
-    return solution
+    fits = _rivals(tied, start, model)
+    tied, fits = _of_background(tied, start, fits)
+    chosen = _likeliest(fits, frame_shape)
+    return tied.solution(fits[chosen], chosen, partial(_compared, tied, start, fits))
 
 
 def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[MotionModel, _Fit]:
-    """Fit the models of which "auto" chooses; further ones only if simple ones do not explain the pairs."""
+    """Fit a model; for "auto", homographies, and rotations if perspective changes with the shift as for a camera that turns."""
+    if model.kind != "auto":
+        return {model: _fitted(tied, start, model)}
     fits: dict[MotionModel, _Fit] = {}
-    for rivals in model.rivals:
-        for rival in rivals:
-            # No plane holds all frames of a camera that turns far.
-            with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
-                fits[rival] = _fitted(tied, start, rival, list(fits.values()))
-        if fits and _chosen(tied, fits).is_simple:
-            break
+    # No plane holds all frames of a camera that turns far.
+    with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
+        plane = replace(model, kind="homography")
+        fit = _fitted(tied, start, plane)
+        if _in_front(fit.state.homographies, tied.frame_shape):
+            fits[plane] = fit
+            if not fit.adjustment.turns(fit.state, fit.weights):
+                return fits
+    for rotation in model.rotations:
+        if fits:
+            with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
+                fits[rotation] = _fitted(tied, start, rotation, list(fits.values()))
+        else:
+            fits[rotation] = _fitted(tied, start, rotation)
     return fits
+
+
+def _in_front(homographies: FloatArray, frame_shape: tuple[int, int]) -> bool:
+    """Return whether one plane holds all frames."""
+    depths = homographies[:, 2:, :2] @ corners(frame_shape).T + homographies[:, 2:, 2:]
+    return bool((depths > 0).all())
 
 
 def _of_background(
     tied: _Tied, start: FloatArray | None, fits: dict[MotionModel, _Fit]
 ) -> tuple[_Tied, dict[MotionModel, _Fit]]:
-    """Have pairs follow the patches that agree with one camera, if others contradict it: what moves by itself, or is near.
+    """Have pairs follow the patches that agree with one motion, if others contradict it: what moves by itself, or is near.
 
     Returns the pairs by these patches, and all models fitted to them.
     """
-    costs = {model: cost for model, cost in _costs(fits).items() if model.kind == "rotation"}
-    if not costs or len(tied.order) < _FEWEST_NODES:
+    if len(tied.order) < _FEWEST_NODES:
         return tied, fits
-    turning = likeliest(costs)
-    first, fit = fits[turning].adjustment, fits[turning]
-    assert isinstance(first, RotationAdjustment)
-    if not turning.layered and contradicting(tied.motions, first.beside(fit.state)) < _CONTRADICTED:
+    model = _likeliest(fits, tied.frame_shape)
+    first, fit = fits[model].adjustment, fits[model]
+    if not model.layered and contradicting(tied.motions, first.beside(fit.state)) < _CONTRADICTED:
         return tied, fits
     background = tied
     for tolerance_px in tolerances_px(tied.motions):
         motions = agreeing(tied.motions, first.beside(fit.state), tolerance_px, tied.frame_shape)
         background = replace(tied, motions=motions)
-        adjustment = RotationAdjustment(background.problem, turning.seen_by(tied.frame_shape), turning.unknown)
         try:
-            fit = background.fit(adjustment, fit.state)
+            fit = background.fit(background.adjustment(model), fit.state)
         except (ValueError, np.linalg.LinAlgError):
             return tied, fits  # too few patches agree
     found = layers(tied.pairs, tied.motions, first.beside(fit.state), len(tied.located))
-    parallax = travelled(tied.pairs, tied.motions, first.beside(fit.state), found) / fit.state.camera.focal_px
-    background = replace(background, layers=found, parallax=parallax)
-    others = [model for model in fits if model is not turning]
-    return background, {model: _fitted(background, start, model) for model in others} | {turning: fit}
+    background = replace(background, layers=found)
+    if isinstance(fit.state, Rotations):
+        way_px = travelled(tied.pairs, tied.motions, first.beside(fit.state), found)
+        background = replace(background, parallax=way_px / fit.state.camera.focal_px)
+    others = [each for each in fits if each is not model]
+    return background, {each: _fitted(background, start, each) for each in others} | {model: fit}
 
 
-def _chosen(tied: _Tied, fits: Mapping[MotionModel, _Fit]) -> MotionModel:
+def _likeliest(fits: Mapping[MotionModel, _Fit], frame_shape: tuple[int, int]) -> MotionModel:
     """Return the likeliest model; a lens that is not asked for must move pixels enough to matter, and not fold the frame."""
-    costs = _costs(fits)
+    deviances = _deviances(fits)
     if any(model.kind == "rotation" and not model.finds_lens for model in fits):
-        for model in [each for each in fits if each.kind == "rotation" and each.finds_lens]:
+        for model in [each for each in fits if each.finds_lens]:
             camera: Camera = fits[model].state.camera
-            if not lenses_apart_px(camera, Camera(camera.matrix), tied.frame_shape) >= SAME_LENS_PX:
-                del costs[model]
-    return likeliest(costs)
+            if not lenses_apart_px(camera, Camera(camera.matrix), frame_shape) >= SAME_LENS_PX:
+                del deviances[model]
+    return min(deviances, key=deviances.__getitem__)
 
 
-def _doubting(tied: _Tied, solution: GraphSolution, turned: _Fit) -> Assessment:
-    """Assess shifts and rolls as well as pairs can tell them from turns: perspective may be too weak to be worth its price."""
-    assessed = solution.assess()
-    simple, rival = solution.homographies[tied.located], scaled_ahead(turned.adjustment.homographies(turned.state))
-    aligned = align_planes(simple, rival, tied.frame_shape) @ simple
-    apart_px = np.sqrt((corner_displacements(inverse(rival) @ aligned, np.eye(3), tied.frame_shape) ** 2).mean(axis=-1))
-    return replace(assessed, std_px=np.hypot(assessed.std_px, apart_px))
+def _deviances(fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, float]:
+    """Return the deviances of models for the edges with the weights that they have by the model with most unknowns."""
+    if len(fits) == 1:
+        return dict.fromkeys(fits, 0.0)
+    weights = max(fits.values(), key=lambda fit: fit.adjustment.unknowns).weights
+    return {model: fit.adjustment.deviance(fit.state, weights) for model, fit in fits.items()}
 
 
-def _compared(tied: _Tied, start: FloatArray | None, model: MotionModel, fit: _Fit) -> Evidence | None:
-    """Compare rotations with homographies; None for other models, and where no plane holds all frames."""
-    if model.kind != "rotation":
-        return None
-    try:
-        with np.errstate(all="ignore"):
-            free = _fitted(tied, start, HOMOGRAPHIES)
-    except (ValueError, np.linalg.LinAlgError):
-        return None
-    return Evidence.of(_costs({model: fit, HOMOGRAPHIES: free}))
+def _compared(tied: _Tied, start: FloatArray | None, fits: Mapping[MotionModel, _Fit]) -> dict[str, Rival]:
+    """Compare the models that were fitted; rotations alone with homographies, where one plane holds all frames."""
+    fits = dict(fits)
+    if all(model.kind == "rotation" for model in fits):
+        with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
+            fits[HOMOGRAPHIES] = _fitted(tied, start, HOMOGRAPHIES)
+    deviances = _deviances(fits)
+    least = min(deviances.values())
+    return {
+        model.name: Rival(fit.adjustment.chi2(fit.norms, fit.kept), fit.adjustment.unknowns, deviances[model] - least)
+        for model, fit in fits.items()
+    }
 
 
 def _freed(tied: _Tied, model: MotionModel, fit: _Fit) -> Freed | None:
@@ -237,21 +243,14 @@ def _freed(tied: _Tied, model: MotionModel, fit: _Fit) -> Freed | None:
     return Freed(number, given[number], found[number], stds[number]) if away.any() else None
 
 
-def _costs(fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, Cost]:
-    """Return the costs of models for the edges that the one with most unknowns keeps."""
-    richest = max(fits.values(), key=lambda fit: fit.adjustment.unknowns)
-    return {model: fit.adjustment.cost(fit.state, np.minimum(fit.norms, OUTLIER), richest.kept) for model, fit in fits.items()}
-
-
 def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel, fits: Sequence[_Fit] = ()) -> _Fit:
     """Fit a model; rotations through a lens begin with those without, if these are among the `fits`."""
     problem, shape = tied.problem, tied.frame_shape
     given = None if start is None else inverse(start[tied.anchor]) @ start[tied.located]
-    if model.kind != "rotation":
-        planar = model.planar
-        found = nearest(planar, problem.observed if given is None else normalised(given), shape)
-        return tied.fit(PlanarAdjustment(problem, planar), tied.composed(found) if given is None else found)
-    adjustment = RotationAdjustment(problem, model.seen_by(shape), model.unknown)
+    adjustment = tied.adjustment(model)
+    if isinstance(adjustment, PlanarAdjustment):
+        found = nearest(model.planar, problem.observed if given is None else given, shape)
+        return tied.fit(adjustment, Plane(tied.composed(found) if given is None else found))
     state = next((fit.state for fit in fits if isinstance(fit.state, Rotations)), None)
     if state is None:
         camera = model.camera(shape)
@@ -271,6 +270,11 @@ class _Fit:
     norms: FloatArray  # (E,) of the whitened residuals
     kept: BoolArray  # (E,) False for outliers
 
+    @property
+    def weights(self) -> FloatArray:
+        """The weights of the edges: (E,)."""
+        return self.adjustment.weights(self.norms, self.kept)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Tied:
@@ -283,12 +287,15 @@ class _Tied:
     pairs: NDArray[np.integer]  # (E, 2) their nodes
     motions: Sequence[Located]  # their motions
     frame_shape: tuple[int, int]  # (height, width) of a frame
+    instants: FloatArray  # (N,) of all nodes
+    spans: Sequence[FrameSpan]  # their frames
     layers: FloatArray | None = None  # see `GraphSolution`
     parallax: float = 0.0
 
     @classmethod
-    def of(cls, n_nodes: int, edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> _Tied:
+    def of(cls, nodes: Sequence[Group], edges: Sequence[Edge], anchor: int, frame_shape: tuple[int, int]) -> _Tied:
         """Find the edges that are tied to the anchor."""
+        n_nodes = len(nodes)
         located_edges = [(position, edge) for position, edge in enumerate(edges) if isinstance(edge.motion, Located)]
         pairs = _pairs(edges)
         order, parents = _tree(n_nodes, pairs, anchor)
@@ -297,7 +304,8 @@ class _Tied:
         tied = [index for index, (moving, _) in enumerate(pairs) if located[moving]]
         positions = np.array([located_edges[index][0] for index in tied], dtype=int)
         motions = [motion for index in tied if isinstance(motion := located_edges[index][1].motion, Located)]
-        return cls(located, order, parents, positions, pairs[tied], motions, frame_shape)
+        spans = [group.span for group in nodes]
+        return cls(located, order, parents, positions, pairs[tied], motions, frame_shape, instants_of(nodes), spans)
 
     @property
     def anchor(self) -> int:
@@ -312,7 +320,14 @@ class _Tied:
     @property
     def problem(self) -> Problem:
         """The least-squares problem, without nodes that are not tied."""
-        return Problem(self.compact_pairs, int(self.located[: self.anchor].sum()), self.motions, self.frame_shape)
+        anchor, spans = int(self.located[: self.anchor].sum()), [self.spans[node] for node in np.flatnonzero(self.located)]
+        return Problem(self.compact_pairs, anchor, self.motions, self.frame_shape, self.instants[self.located], spans)
+
+    def adjustment(self, model: MotionModel) -> PlanarAdjustment | RotationAdjustment:
+        """Return the least-squares problem of a model."""
+        if model.kind == "rotation":
+            return RotationAdjustment(self.problem, model.seen_by(self.frame_shape), model.unknown)
+        return PlanarAdjustment(self.problem, model.planar)
 
     def composed(self, observed: FloatArray) -> FloatArray:
         """Return the maps of the tied nodes to the anchor, each composed from its parent's along one edge: (L, 3, 3)."""
@@ -329,24 +344,40 @@ class _Tied:
     def fit(self, adjustment: Adjustment[Any], state: Any) -> _Fit:
         """Solve from a start; drop outliers, unless the graph would fall apart, and solve again."""
         kept = np.ones(len(self.motions), dtype=bool)
-        found, norms = adjustment.minimise(state, kept)
+        found, norms = self._minimised(adjustment, state, kept)
         inliers = adjustment.inliers(norms)
         if not inliers.all() and not component_labels(len(self.order), self.compact_pairs[inliers]).any():
             kept = inliers
-            found, norms = adjustment.minimise(found, kept)
+            found, norms = self._minimised(adjustment, found, kept)
         return _Fit(adjustment, found, norms, kept)
 
-    def solution(self, fit: _Fit, model: MotionModel, compare: Callable[[], Evidence | None]) -> GraphSolution:
+    def _minimised(self, adjustment: Adjustment[Any], state: Any, kept: BoolArray) -> tuple[Any, FloatArray]:
+        found, norms = adjustment.minimise(state, kept)
+        for _ in range(_LEARNT):
+            if not adjustment.learn(found, adjustment.weights(norms, kept)):
+                break
+            found, norms = adjustment.minimise(found, kept)
+        return found, norms
+
+    def solution(self, fit: _Fit, model: MotionModel, compare: Callable[[], Mapping[str, Rival]]) -> GraphSolution:
         """Return a fit as the solution of the graph."""
         adjustment, found = fit.adjustment, fit.state
         homographies = np.full((len(self.located), 3, 3), np.nan)
         homographies[self.located] = adjustment.homographies(found)
-        residual_px = float(np.sqrt(np.mean(adjustment.residuals_px(found)[fit.kept] ** 2)))
-        outliers = tuple(int(position) for position in self.positions[~fit.kept])
-        assess = partial(adjustment.assess, found, fit.norms, fit.kept)
-        rotations = found if isinstance(found, Rotations) else None
-        left, freed = (self.layers, self.parallax), partial(_freed, self, model, fit)
-        return GraphSolution(homographies, self.located, outliers, residual_px, assess, model, rotations, compare, *left, freed)
+        return GraphSolution(
+            homographies,
+            self.located,
+            tuple(int(position) for position in self.positions[~fit.kept]),
+            float(np.sqrt(np.mean(adjustment.residuals_px(found)[fit.kept] ** 2))),
+            partial(adjustment.assess, found, fit.norms, fit.kept),
+            model,
+            found if isinstance(found, Rotations) else None,
+            adjustment.walks_px if isinstance(adjustment, PlanarAdjustment) else {},
+            compare,
+            self.layers,
+            self.parallax,
+            partial(_freed, self, model, fit),
+        )
 
     def alone(self, model: MotionModel) -> GraphSolution:
         """Return the solution of a single node."""

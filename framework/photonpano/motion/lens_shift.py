@@ -26,12 +26,10 @@ class LensShift:
     of_homography: FloatArray  # (E, 2 P, 8) derivatives of the patches by a small homography of each pair
     fitted: FloatArray  # (E, 8, 2 P) from shifts of the patches to the homography that explains them best
     to_corners: FloatArray  # (E, 8, 8) from that to the shifts of the corners
-    # standard deviation of the residuals of the patches: below 1 where information leaves out photons that pairs share
-    noise: float = 1.0
 
     @classmethod
-    def of(cls, frame_shape: tuple[int, int], motions: Sequence[Located]) -> LensShift:
-        """Take the patches of pairs; without them, those that both exposures see count alike."""
+    def of(cls, frame_shape: tuple[int, int], motions: Sequence[Located], counts: FloatArray) -> LensShift:
+        """Take the patches of pairs, which count as the (E,) `counts` say; without patches, those that both exposures see do."""
         (height, width), points = frame_shape, patch_centres(frame_shape)
         observed = np.array([motion.homography for motion in motions])
 
@@ -48,7 +46,7 @@ class LensShift:
         for edge, patches in enumerate(motion.patches for motion in motions):
             if patches is not None and (patches.information[:, 0, 0] > 0).sum() >= _FEWEST:
                 shifts[edge], weights[edge] = patches.shifts, patches.information
-                values, vectors = np.linalg.eigh(patches.information)
+                values, vectors = np.linalg.eigh(counts[edge] * patches.information)
                 roots[edge] = np.sqrt(np.maximum(values, 0))[..., None] * np.swapaxes(vectors, -1, -2)
         by_points = slopes_at(points)
         weighted = weights @ by_points.reshape(*seen.shape, 2, 8)
@@ -57,7 +55,7 @@ class LensShift:
         normal += _DAMPING * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(8)
         found = cls(points, shifts, roots, by_points, np.linalg.solve(normal, weighted), slopes_at(corners(frame_shape)))
         noise = robust_std(found.unexplained()[roots.any(axis=(2, 3)).repeat(2)])
-        return replace(found, roots=roots / max(noise, 1.0), noise=min(noise, 1.0))
+        return replace(found, roots=roots / max(noise, 1.0))
 
     def of_patches(self, relative: FloatArray, camera: Camera, assumed: Camera) -> FloatArray:
         """Return how patches are shifted by undistorting with the wrong lens: (E, 2 P) px, NaN if that folds the frame.

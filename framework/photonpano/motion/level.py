@@ -14,9 +14,11 @@ from photonpano.contracts.loop import EXPOSURE, Asked
 from photonpano.contracts.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler, Source, Trajectory
 from photonpano.contracts.rules import attributing
 from photonpano.execution.threads import Stopwatch
-from photonpano.geometry import Camera, rescaled
+from photonpano.geometry import Camera, inverse, rescaled, scaled_ahead
 from photonpano.motion.timeline import Timeline
 from photonpano.values import Decision, DecisionValue, FloatArray, FrameSpan, Group, Located, VirtualExposure
+
+_SAMPLED = 8  # instants of a group at which its motion is looked at
 
 # In pixels of frames, as in the motion graph and in trajectories.
 FrameHomography = NewType("FrameHomography", FloatArray)
@@ -137,6 +139,21 @@ class VirtualExposures:
     def is_foreseen(self, index: int) -> bool:
         """Return whether the motion of an exposure, given by its index, is known so far and not extrapolated."""
         return self.known is None or self.known.start <= self.groups[index].reference < self.known.stop
+
+    def off_centre(self, motion: Trajectory) -> FloatArray:
+        """Return how exposures merged along another motion are displaced by that: (N, 3, 3), frame pixels to pixels as merged.
+
+        It is the mean over the frames of each group, to first order.
+        """
+        shares = (np.arange(_SAMPLED) + 0.5) / _SAMPLED
+        instants = np.array([[g.span.start + share * len(g.span) - 0.5 for share in shares] + [g.reference] for g in self.groups])
+        along, shape = self.previous or self.start, (len(instants), _SAMPLED + 1, 3, 3)
+        true = motion.at(instants.ravel()).reshape(shape)
+        back = inverse(true[:, :-1]) @ true[:, -1:]
+        if along is not None:
+            assumed = along.at(instants.ravel()).reshape(shape)
+            back = inverse(assumed[:, -1:]) @ assumed[:, :-1] @ back
+        return np.asarray(scaled_ahead(back).mean(axis=1))
 
     def merged(self, index: int, clock: Stopwatch | None = None) -> VirtualExposure:
         """Merge a group, given by its index, along the motion known so far; a second call merges it again.

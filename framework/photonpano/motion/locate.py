@@ -16,9 +16,8 @@ from photonpano.execution.threads import thread_pool
 from photonpano.geometry import corner_displacements, inverse
 from photonpano.motion.closures import MIN_SIMILARITY, closure_candidates, exposure_similarity
 from photonpano.motion.diagnosis import require_tied, solving
-from photonpano.motion.evidence import Evidence
 from photonpano.motion.exposure_tasks import Pair
-from photonpano.motion.graph import GraphOptions, GraphSolution, components, solve
+from photonpano.motion.graph import GraphOptions, GraphSolution, Rival, components, solve
 from photonpano.motion.gyroscope import Gyroscope
 from photonpano.motion.level import FrameHomography, VirtualExposures
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
@@ -47,7 +46,7 @@ class LocatedLevel:
     std_px: FloatArray  # (N,) expected error of the corners of each located exposure; NaN for a single one
     frame_shape: tuple[int, int]  # (height, width) of a frame
     std_camera: FloatArray  # (5,) expected errors of the camera, see `Assessment`
-    evidence: Evidence | None  # how well rival models of the motion explain the pairs; None where none are compared
+    rivals: Mapping[str, Rival]  # how well models of the motion explain the pairs, by their names
     ambiguity: Ambiguity | None = None  # pairs that fit the scene at more than one place; None where there are none
 
     @property
@@ -123,7 +122,7 @@ def locate(
                 "a failure is NotLocated"
             )
         with exposures.clock("locate"), solving(level.number):
-            edges = _checked_fallbacks(edges, level.locators[0].name, len(groups), shape, registrar.to_plane, model)
+            edges = _checked_fallbacks(edges, level.locators[0].name, groups, shape, registrar.to_plane, model)
         if by_hand:
             starts = [_started(each, registrar.to_plane) for each in by_hand]
             kept = context.checkpoints.log(f"level-{level.number}-ties", groups, [each.expected for each in starts])
@@ -139,8 +138,8 @@ def locate(
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
             to_plane = registrar.to_plane
-            solution = solve(len(groups), edges, anchor, shape, to_plane, model)
-            evidence = solution.compare()
+            solution = solve(groups, edges, anchor, shape, to_plane, model)
+            rivals = solution.compare()
             candidates = [pair for pair in closure_candidates(groups, solution, shape, graph) if pair not in excluded]
             between = [inverse(solution.homographies[fixed]) @ solution.homographies[moving] for moving, fixed in candidates]
         revisits = context.checkpoints.log(f"level-{level.number}-revisits", groups, candidates, solution.homographies)
@@ -152,10 +151,10 @@ def locate(
     with exposures.clock("locate"), solving(level.number):
         if closures:
             alone, model = solution, solution.model
-            solution = solve(len(groups), edges + closures, anchor, shape, to_plane, model)
+            solution = solve(groups, edges + closures, anchor, shape, to_plane, model)
             fair = _not_outvoting(closures, edges, alone, solution)
             if fair != closures:
-                closures, solution = fair, solve(len(groups), edges + fair, anchor, shape, to_plane, model)
+                closures, solution = fair, solve(groups, edges + fair, anchor, shape, to_plane, model)
         assessed = solution.assess()
     return LocatedLevel(
         groups,
@@ -166,7 +165,7 @@ def locate(
         assessed.std_px,
         shape,
         assessed.std_camera,
-        evidence,
+        rivals,
         _ambiguity(level.number, registrar.alternatives_px, edges),
     )
 
@@ -195,7 +194,7 @@ def _alike_across_cuts(exposures: VirtualExposures, edge: Edge) -> Edge:
 def _checked_fallbacks(
     edges: Sequence[Edge],
     first_locator: str,
-    n_groups: int,
+    groups: Sequence[Group],
     frame_shape: tuple[int, int],
     start: FloatArray | None,
     model: MotionModel,
@@ -209,13 +208,13 @@ def _checked_fallbacks(
     others = [edge for edge in edges if isinstance(edge.motion, Located) and edge.locator != first_locator]
     if not firsts or not others:
         return tuple(edges)
-    parts = components(n_groups, firsts)
+    parts = components(len(groups), firsts)
     tied = {(edge.moving, edge.fixed) for edge in others if parts[edge.moving] == parts[edge.fixed]}
     contradicting: dict[tuple[int, int], float] = {}
     for part in {int(parts[moving]) for moving, _ in tied}:
         of_part = [edge for edge in firsts if parts[edge.moving] == part]
         anchor = of_part[len(of_part) // 2].moving
-        homographies = solve(n_groups, of_part, anchor, frame_shape, start, model).homographies
+        homographies = solve(groups, of_part, anchor, frame_shape, start, model).homographies
         for edge in others:
             if (edge.moving, edge.fixed) in tied and parts[edge.moving] == part and isinstance(edge.motion, Located):
                 between = inverse(homographies[edge.fixed]) @ homographies[edge.moving]

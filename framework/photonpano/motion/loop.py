@@ -25,6 +25,7 @@ from photonpano.motion.tracking import starting_motion
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.values import FloatArray, FrameSpan, Group
 
+_CENTRED = 2  # times that knots are moved to the instants of their exposures
 _SHRINKS = 0.75  # change of the motion by a level, over that by the level before, from which on it no longer converges
 
 
@@ -110,7 +111,7 @@ def estimate_motion(
             start = start and replace(start, timeline=timeline)
         exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start, known)
         located = locate(exposures, graph, context, model, start, gyroscope)
-        trajectory = interpolate(level, located, timeline, reference, clock, corrected)
+        trajectory = interpolate(exposures, located, timeline, reference, corrected)
         require_agreement(ties_of(graph.tie, seen), groups, located.solution.located, trajectory)
         uncertainty = Uncertainty(located, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
@@ -136,14 +137,12 @@ def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]
 
 
 def interpolate(
-    level: Level,
-    located: LocatedLevel,
-    timeline: Timeline,
-    reference: int,
-    clock: Stopwatch,
-    refined: Trajectory | None = None,
+    exposures: VirtualExposures, located: LocatedLevel, timeline: Timeline, reference: int, refined: Trajectory | None = None
 ) -> Trajectory:
     """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate"), between cuts.
+
+    An exposure shows the mean of its frames, which lies elsewhere than its instant if the motion within it was not what it was
+    merged along. How far is known as soon as the motion is, so that the knots are moved there, and the motion is fitted again.
 
     A `refined` motion is not replaced: what is interpolated is how far the exposures merged along it are from it.
 
@@ -151,10 +150,28 @@ def interpolate(
         LocationError: the interpolator failed because exposures reach the horizon of the plane.
         PluginError: the interpolator failed, or its trajectory has nothing to do with these instants.
     """
-    turns, shape = located.solution.rotations, located.frame_shape
+    measured = Knots.of(located)
+    with exposures.clock("interpolate"), exposures.level.attributing("interpolator"):
+        trajectory = _through(measured, exposures, located, timeline, reference, refined)
+        for _ in range(_CENTRED):
+            knots = measured.moved(exposures.off_centre(trajectory)[located.solution.located])
+            trajectory = _through(knots, exposures, located, timeline, reference, refined)
+    return trajectory
+
+
+def _through(
+    knots: Knots,
+    exposures: VirtualExposures,
+    located: LocatedLevel,
+    timeline: Timeline,
+    reference: int,
+    refined: Trajectory | None,
+) -> Trajectory:
+    """Interpolate knots, between cuts."""
+    level, turns, shape = exposures.level, located.solution.rotations, located.frame_shape
     camera = None if turns is None else turns.camera
     known = None if refined is None else RefinedMotion(refined, len(timeline.taken), camera, shape)
-    homographies, information, rotations = Knots.of(located) if known is None else known.corrections(located)
+    instants, homographies, information, rotations = knots if known is None else known.corrections(knots)
 
     def kept(found: Trajectory, knots: slice, times: FloatArray, homographies: FloatArray) -> Trajectory:
         free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
@@ -173,11 +190,10 @@ def interpolate(
             raise
         return kept(found, knots, times, homographies[knots])
 
-    with clock("interpolate"), level.attributing("interpolator"):
-        free = timeline.fit(fitted, located.instants)
-        if known is not None:
-            free = known.corrected(free)
-        return ReferencedTrajectory(free, reference) if camera is None else RotationTrajectory(free, camera, reference)
+    free = timeline.fit(fitted, instants)
+    if known is not None:
+        free = known.corrected(free)
+    return ReferencedTrajectory(free, reference) if camera is None else RotationTrajectory(free, camera, reference)
 
 
 def _summary(result: LevelResult) -> str:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from photonpano.geometry import Camera, camera_matrix
-from photonpano.motion.planar import PLANAR_NAMES, PlanarName
+from photonpano.motion.planar import PlanarName
 
 ModelName = Literal["auto", "translation", "euclidean", "similarity", "affine", "homography", "rotation"]
 # Initial focal length, in longer sides of a frame.
@@ -28,7 +28,6 @@ class MotionModel:
     # k1, k2, p1, p2 of its lens; None for those that are to be found
     distortion: tuple[float | None, float | None, float | None, float | None] = (0.0, 0.0, 0.0, 0.0)
     known: Camera | None = None  # the camera that the level before has found
-    chosen: bool = False  # whether "auto" chose it: errors then contain how well pairs tell it from others
     layered: bool = False  # whether frames are known to show more than a background that follows the camera
 
     @property
@@ -42,11 +41,6 @@ class MotionModel:
         return f"{self.kind} with a lens" if self.finds_lens else self.kind
 
     @property
-    def is_simple(self) -> bool:
-        """Whether nothing but shift and roll moves the image."""
-        return self.kind in ("translation", "euclidean")
-
-    @property
     def planar(self) -> PlanarName:
         """The group of its homographies; any but those of a rotation have one."""
         if self.kind == "rotation" or self.kind == "auto":
@@ -54,15 +48,12 @@ class MotionModel:
         return self.kind
 
     @property
-    def rivals(self) -> tuple[tuple[MotionModel, ...], ...]:
-        """The models of which "auto" chooses: those to compare first, and further ones if these do not explain the pairs."""
-        planar = {name: replace(self, kind=name) for name in PLANAR_NAMES}
+    def rotations(self) -> tuple[MotionModel, ...]:
+        """The rotations that "auto" compares with homographies: without a lens, and with one unless that is known or asked for."""
         rotation = replace(self, kind="rotation")
-        if any(self.distortion) and self.focal_px is None:
-            return (rotation,), ()  # a lens that is given is in units of its focal length
-        lenses = () if any(self.distortion) or self.finds_lens else (replace(rotation, distortion=_LENS),)
-        first = planar["translation"], planar["euclidean"], planar["homography"], rotation
-        return first, (planar["similarity"], planar["affine"], *lenses)
+        if any(self.distortion) or self.finds_lens:
+            return (rotation,)
+        return rotation, replace(rotation, distortion=_LENS)
 
     @property
     def finds_lens(self) -> bool:

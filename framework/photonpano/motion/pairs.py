@@ -69,16 +69,6 @@ def shared_share(first: FrameSpan, second: FrameSpan) -> float:
     return max(0, common) / min(len(first), len(second))
 
 
-def independent_share(groups: Sequence[Group]) -> float:
-    """Return the share of the photons of a typical group that no earlier group contains: 1 unless groups overlap.
-
-    Pairs of overlapping groups repeat the same photons and their noise, so that each carries less information of its own.
-    """
-    if len(groups) < 2:
-        return 1.0
-    return min(1.0, float(np.median(np.diff(instants_of(groups))) / np.median(lengths_of(groups))))
-
-
 def adjacency(n_nodes: int, pairs: NDArray[np.integer], weights: FloatArray | None = None) -> sparse.csr_array:
     """Return the adjacency matrix of a graph: the (P,) weights of its (P, 2) pairs, or 1, at their rows and columns."""
     given = np.ones(len(pairs)) if weights is None else weights

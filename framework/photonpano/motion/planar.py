@@ -1,27 +1,48 @@
-"""The planar models of motion, groups of homographies from translations to all of them, and the motion graph of one."""
+"""The motion graph of homographies: what they have beyond shift and roll is a random walk, as wide as the capture shows.
+
+A homography has eight numbers; most cameras move by fewer. From each exposure to the next one in time, all motions shift and roll
+the image as they like. What else they do (zoom, two shears, two perspectives) is normally distributed, with a variance that grows
+with the time between both and is estimated from the pairs. Where nothing zooms, the variance goes to zero, and with it the number.
+A camera that turns changes perspective in proportion to the shift, by -1 / f^2: this coupling is estimated, too, and the walk is
+what lies beyond it.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy import sparse
 
-from photonpano.geometry import corners, generators, normalised, parameters, transform_points
-from photonpano.motion.adjustment import Adjustment, Problem
+from photonpano.geometry import corners, generators, inverse, parameters, scaled_ahead, transform_points, unit_coordinates
+from photonpano.motion.adjustment import Adjustment, Prior, Problem, factorised
 from photonpano.values import FloatArray, Homography
 
 PlanarName = Literal["translation", "euclidean", "similarity", "affine", "homography"]
 
 # The small motions of each model, by what they change of p1..p8 in unit coordinates.
+_SHIFTS, _ROLL, _ZOOM = ({4: 1.0}, {5: 1.0}), {1: 1.0, 2: -1.0}, {0: 1.0, 3: 1.0}
+_SHEARS, _PERSPECTIVES = ({0: 1.0, 3: -1.0}, {1: 1.0, 2: 1.0}), ({6: 1.0}, {7: 1.0})
 _MOVED: dict[PlanarName, tuple[dict[int, float], ...]] = {
-    "translation": ({4: 1}, {5: 1}),
-    "euclidean": ({4: 1}, {5: 1}, {1: 1, 2: -1}),
-    "similarity": ({4: 1}, {5: 1}, {1: 1, 2: -1}, {0: 1, 3: 1}),
-    "affine": tuple({index: 1.0} for index in range(6)),
-    "homography": tuple({index: 1.0} for index in range(8)),
+    "translation": _SHIFTS,
+    "euclidean": (*_SHIFTS, _ROLL),
+    "similarity": (*_SHIFTS, _ROLL, _ZOOM),
+    "affine": (*_SHIFTS, _ROLL, _ZOOM, *_SHEARS),
+    "homography": (*_SHIFTS, _ROLL, _ZOOM, *_SHEARS, *_PERSPECTIVES),
 }
 PLANAR_NAMES: tuple[PlanarName, ...] = tuple(_MOVED)
-_TERMS = 12  # of the exponential series, which is exact for steps of a frame
+_FREE = 3  # the first of these motions have no prior
+_WALKS = ("zoom", "shear of the axes", "shear of the diagonals", "perspective along x", "perspective along y")
+_PERSPECTIVE = slice(3, 5)  # of the walks
+_TERMS = 12  # of the exponential and the logarithmic series
+_HALVINGS = 2  # of a logarithm, by square roots, before its series
+_ROOTS = 8  # Newton steps of a square root
+# Standard deviations of a walk over the whole capture, in units of half a frame: at first; where the capture is too short to tell;
+# and below which it is none (a thousandth of a pixel).
+_FIRST, _ASSUMED, _NONE = 0.01, 0.02, 4e-6
+_FEWEST_STEPS = 6  # that tell how wide the walks are
+_ROUNDS, _MOST, _SETTLED = 20, 30.0, 0.05  # rounds of the estimate, most change of a variance in one, least that counts
+_DRAWS = 24  # by which the variances' degrees of freedom are estimated
 
 
 def basis_of(model: PlanarName) -> FloatArray:
@@ -40,7 +61,29 @@ def moved(homographies: FloatArray, steps: FloatArray, basis: FloatArray, frame_
     for order in range(1, _TERMS + 1):
         term = term @ change / order
         total = total + term
-    return normalised(homographies @ total)
+    return scaled_ahead(homographies @ total)
+
+
+def logarithms(motions: Homography, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return the small motions, in p1..p8 of unit coordinates, of which (N, 3, 3) homographies are the exponentials: (N, 8)."""
+    root: FloatArray = motions / np.cbrt(np.linalg.det(motions))[:, None, None]
+    for _ in range(_HALVINGS):
+        other = np.broadcast_to(np.eye(3), root.shape)
+        for _ in range(_ROOTS):  # Denman and Beavers 1976
+            root, other = (root + np.linalg.inv(other)) / 2, (other + np.linalg.inv(root)) / 2
+    away = root - np.eye(3)
+    term, total = away, away
+    for order in range(2, _TERMS + 1):
+        term = -term @ away
+        total = total + term / order
+    return _coordinates(total * 2**_HALVINGS, frame_shape)
+
+
+def _coordinates(changes: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return the p1..p8, in unit coordinates, of small changes of pixels: (..., 3, 3) to (..., 8)."""
+    unit = unit_coordinates(frame_shape)
+    changes = unit @ changes @ np.linalg.inv(unit)
+    return parameters(changes + (1 - changes[..., 2:, 2:]) * np.eye(3))
 
 
 def nearest(model: PlanarName, homographies: Homography, frame_shape: tuple[int, int]) -> Homography:
@@ -69,41 +112,159 @@ def nearest(model: PlanarName, homographies: Homography, frame_shape: tuple[int,
     return found
 
 
-class PlanarAdjustment(Adjustment[FloatArray]):
-    """The least-squares problem of a graph of homographies of a planar model; its state is these, (N, 3, 3) with h33 = 1.
+class Plane(NamedTuple):
+    """The homographies of the exposures of a graph."""
 
-    The unknowns of a node are those of a small motion of its own frame, in coordinates of about unit size.
+    homographies: FloatArray  # (N, 3, 3) to the anchor's frame
+    coupling: float = 0.0  # perspective that a shift brings along, in unit coordinates: -(s / f)^2 for a camera that turns
+
+
+class PlanarAdjustment(Adjustment[Plane]):
+    """The least-squares problem of a graph of homographies.
+
+    The unknowns of a node are those of a small motion of its own frame, in coordinates of about unit size. All share the
+    coupling of perspective to shift, where the model has both.
+
+    Attributes:
+        variances: (w,) of the walks of the model, in squares of unit coordinates per frame; 0 for none.
     """
 
-    def __init__(self, problem: Problem, model: PlanarName) -> None:
-        """Set up the problem."""
-        super().__init__(problem)
+    def __init__(self, problem: Problem, model: PlanarName, variances: FloatArray | None = None) -> None:
+        """Set up the problem; variances that are given are not estimated."""
         self._basis = basis_of(model)
+        self._n_walks = max(self._basis.shape[1] - _FREE, 0)
+        super().__init__(problem, n_shared=int(model == "homography"))
+        # Nodes are in order of time; those of one instant make no step.
+        self._times = np.maximum(np.diff(problem.instants), 1.0)
+        self._duration = max(float(self._times.sum()), 1.0)
+        self._learns = variances is None
+        self.variances = np.full(self._n_walks, _FIRST**2 / self._duration) if variances is None else variances
 
     @property
     def _n_node(self) -> int:
         return int(self._basis.shape[1])
 
-    def homographies(self, state: FloatArray) -> FloatArray:
-        """Return the state."""
-        return state
+    @property
+    def walks_px(self) -> dict[str, float]:
+        """How far each walk moves the ends of a frame over the capture, in px: a standard deviation; none that are 0."""
+        ends_px = np.sqrt(self.variances * self._duration) * self._half
+        known = self.variances > _NONE**2 / self._duration
+        return {name: float(px) for name, px, there in zip(_WALKS, ends_px, known, strict=False) if there}
 
-    def changed(self, state: FloatArray, nodes: FloatArray, shared: FloatArray) -> FloatArray:
-        """Return the homographies after a step; nothing is shared."""
-        del shared
-        return moved(state, nodes, self._basis, self._frame_shape)
+    @property
+    def n_hyperparameters(self) -> int:
+        """How many variances, and couplings, were estimated."""
+        return len(self.walks_px) + self._n_shared
 
-    def anchored(self, state: FloatArray) -> FloatArray:
+    def homographies(self, state: Plane) -> FloatArray:
+        """Return those of the state."""
+        return state.homographies
+
+    def changed(self, state: Plane, nodes: FloatArray, shared: FloatArray) -> Plane:
+        """Return the homographies after a step."""
+        return Plane(moved(state.homographies, nodes, self._basis, self._frame_shape), state.coupling + float(shared.sum()))
+
+    def anchored(self, state: Plane) -> Plane:
         """Return the homographies, of which the anchor's is the identity."""
-        state[self._anchor] = np.eye(3)
+        state.homographies[self._anchor] = np.eye(3)
         return state
 
-    def generators(self, state: FloatArray) -> FloatArray:
+    def generators(self, state: Plane) -> FloatArray:
         """Return those of the model in unit coordinates: (k, 3, 3)."""
         del state
         return np.asarray(np.einsum("pk,pij->kij", self._basis, generators(self._frame_shape)))
 
-    def information(self, state: FloatArray, blocks: FloatArray) -> FloatArray:
+    def prior(self, state: Plane) -> Prior:
+        """Return the steps of the walks from each node to the next, and what is known of the coupling: about that of f = s."""
+        steps, slopes = self._steps(state)
+        variances = self._times[:, None] * np.maximum(self.variances, _NONE**2 / self._duration)
+        coupling = np.full(self._n_shared, state.coupling)
+        rows = sparse.vstack([slopes, self._of_shared(np.ones((self._n_shared, 1)))])
+        stds = np.concatenate([np.sqrt(variances).ravel(), np.ones(self._n_shared)])
+        residuals = np.concatenate([steps.ravel(), coupling]) / stds
+        return Prior(residuals, sparse.csr_array(sparse.diags_array(1 / stds) @ rows), float(2 * np.log(stds).sum()))
+
+    def learn(self, state: Plane, weights: FloatArray) -> bool:
+        """Estimate the variances of the walks from pairs of these weights, (E,); return whether they changed.
+
+        Variance components of least squares (Foerstner 1979; MacKay 1992): the squares of what is estimated of the steps, over the
+        number of them that the pairs determine. The maximum of the marginal likelihood is where this changes nothing.
+        """
+        if not (self._learns and self._n_walks):
+            return False
+        if len(self._times) < _FEWEST_STEPS:
+            self.variances = np.full(self._n_walks, _ASSUMED**2 / self._duration)
+            return True
+        before, free, rng = self.variances, self._free(state), np.random.default_rng(0)
+        jacobians, residuals = self._of_edges(state, weights)
+        steps, slopes = self._steps(state)
+        of_walk = [sparse.csr_array(slopes[walk :: self._n_walks][:, free]) for walk in range(self._n_walks)]
+        jacobians, roots = jacobians[:, free], 1 / np.sqrt(self._times)
+        known = self._of_shared(np.ones((self._n_shared, 1)))[:, free]
+        normal = jacobians.T @ jacobians + known.T @ known
+        right = np.column_stack([jacobians.T @ residuals, jacobians.T @ rng.normal(size=(jacobians.shape[0], _DRAWS))])
+        right[:, 0] += known.T @ np.full(self._n_shared, state.coupling)
+        right[:, 1:] += known.T @ rng.normal(size=(self._n_shared, _DRAWS))
+        terms = []
+        for walk, rows in enumerate(of_walk):
+            scaled = sparse.csr_array(sparse.diags_array(roots) @ rows)
+            drawn = np.column_stack([steps[:, walk] * roots, rng.normal(size=(len(roots), _DRAWS))])
+            terms.append((scaled, sparse.csr_array(scaled.T @ scaled), scaled.T @ drawn))
+        least = _NONE**2 / self._duration
+        for _ in range(_ROUNDS):
+            whole, sides = normal, right
+            for variance, (_, square, side) in zip(self.variances, terms, strict=True):
+                whole = whole + square / variance
+                sides = sides + side / np.concatenate([[variance], np.full(_DRAWS, np.sqrt(variance))])
+            changes = factorised(whole).solve(sides)
+            found = np.empty(self._n_walks)
+            for walk, (scaled, *_) in enumerate(terms):
+                moves = scaled @ changes
+                left = steps[:, walk] * roots - moves[:, 0]
+                undetermined = (moves[:, 1:] ** 2).sum() / _DRAWS / self.variances[walk]
+                determined = max(len(roots) - undetermined, 1e-3 * len(roots))
+                found[walk] = (left @ left) / determined
+            found = np.maximum(np.clip(found, self.variances / _MOST, self.variances * _MOST), least)
+            settled = np.abs(np.log(found / self.variances)).max() < _SETTLED
+            self.variances = found
+            if settled:
+                break
+        return bool(np.abs(np.log(self.variances / before)).max() > _SETTLED)
+
+    def turns(self, state: Plane, weights: FloatArray) -> bool:
+        """Return whether perspective changes with the shift as for a camera that turns, by more than noise (Schwarz 1978)."""
+        if not self._n_shared or state.coupling >= 0:
+            return False
+        jacobians, _ = self._linearised(state, weights)
+        free = self._free(state)
+        last = np.zeros(int(free.sum()))
+        last[-1] = 1
+        variance = float(factorised((jacobians.T @ jacobians)[free][:, free]).solve(last)[-1])
+        return state.coupling**2 > variance * np.log(max(self._n_nodes - 1, 2))
+
+    def _steps(self, state: Plane) -> tuple[FloatArray, sparse.csr_array]:
+        """Return the steps of the walks beyond the coupling, (N - 1, w), and their derivatives, ((N - 1) w, k N + s)."""
+        n_steps, k, w = len(self._times), self._n_node, self._n_walks
+        if not w:
+            return np.zeros((n_steps, 0)), sparse.csr_array((0, k * self._n_nodes + self._n_shared))
+        relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
+        motions = logarithms(relative, self._frame_shape)
+        back = np.linalg.pinv(self._basis)[_FREE:]  # from p1..p8 to the walks
+        earlier = _coordinates(inverse(relative)[:, None] @ generators(self._frame_shape) @ relative[:, None], self._frame_shape)
+        by_nodes = np.stack([-back @ np.swapaxes(earlier, 1, 2), np.broadcast_to(back, (n_steps, w, 8))], axis=2) @ self._basis
+        steps = motions @ back.T
+        if self._n_shared:
+            steps[:, _PERSPECTIVE] -= state.coupling * motions[:, 4:6]
+        rows = np.repeat(np.arange(n_steps * w), 2 * k)
+        columns = np.broadcast_to((k * np.arange(n_steps))[:, None, None] + np.arange(2 * k), (n_steps, w, 2 * k)).ravel()
+        slopes = sparse.csr_array((by_nodes.ravel(), (rows, columns)), shape=(n_steps * w, k * self._n_nodes))
+        if not self._n_shared:
+            return steps, slopes
+        by_coupling = np.zeros((n_steps, w))
+        by_coupling[:, _PERSPECTIVE] = -motions[:, 4:6]
+        return steps, sparse.csr_array(sparse.hstack([slopes, sparse.csr_array(by_coupling.reshape(-1, 1))]))
+
+    def information(self, state: Plane, blocks: FloatArray) -> FloatArray:
         """Convert (N, k, k) information on changes of nodes to that on p1..p8 of their homographies.
 
         What the model does not move is as sure as all that it does together.
@@ -111,8 +272,8 @@ class PlanarAdjustment(Adjustment[FloatArray]):
         back = np.linalg.pinv(self._basis)
         fixed = np.eye(8) - self._basis @ back
         blocks = back.T @ blocks @ back + np.trace(blocks, axis1=1, axis2=2)[:, None, None] * fixed
-        changed = state[:, None] @ generators(self._frame_shape)
-        slopes = changed - state[:, None] * changed[..., 2:, 2:]
+        changed = state.homographies[:, None] @ generators(self._frame_shape)
+        slopes = changed - state.homographies[:, None] * changed[..., 2:, 2:]
         to_parameters = parameters(np.eye(3) + slopes).transpose(0, 2, 1)
         to_change = np.linalg.inv(to_parameters)
         return np.asarray(to_change.transpose(0, 2, 1) @ blocks @ to_change)

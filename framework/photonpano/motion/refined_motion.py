@@ -27,6 +27,7 @@ from photonpano.values import FloatArray
 class Knots(NamedTuple):
     """What an interpolator passes at the instants of N located exposures."""
 
+    instants: FloatArray  # (N,)
     homographies: FloatArray  # (N, 3, 3)
     information: FloatArray | None  # see `LocatedLevel`
     rotations: Rotations | None  # of a camera that turns; None for homographies
@@ -34,7 +35,15 @@ class Knots(NamedTuple):
     @classmethod
     def of(cls, located: LocatedLevel) -> Knots:
         """Return the motions of the exposures themselves."""
-        return cls(located.homographies, located.information, located.solution.rotations)
+        return cls(located.instants, located.homographies, located.information, located.solution.rotations)
+
+    def moved(self, homographies: FloatArray) -> Knots:
+        """Return the knots after a small motion of each frame: (N, 3, 3)."""
+        found, rotations = scaled_ahead(self.homographies @ homographies), self.rotations
+        if rotations is not None:
+            turned = rotations.rotations @ nearest_rotations(rotations.camera.rotations(homographies))
+            found, rotations = rotations.camera.homographies(turned), Rotations(turned, rotations.camera)
+        return self._replace(homographies=found, rotations=rotations)
 
 
 class RefinedMotion:
@@ -54,21 +63,21 @@ class RefinedMotion:
             known = camera.homographies(turned)
         self._known = FrameTrajectory(known)
 
-    def corrections(self, located: LocatedLevel) -> Knots:
+    def corrections(self, knots: Knots) -> Knots:
         """Return the small motions of the frames after which the known motion is that of the exposures."""
-        homographies, information, rotations = Knots.of(located)
-        known, middle = self._known.at(located.instants), len(homographies) // 2
+        instants, homographies, information, rotations = knots
+        known, middle = self._known.at(instants), len(homographies) // 2
         back = inverse(known) @ known[middle] @ inverse(homographies[middle])
         found = scaled_ahead(back @ homographies)
         if rotations is not None:
-            return Knots(found, information, Rotations(nearest_rotations(rotations.camera.rotations(found)), rotations.camera))
+            return Knots(instants, found, information, Rotations(nearest_rotations(rotations.camera.rotations(found)), rotations.camera))
         if information is not None:
             # The derivatives of p1..p8 of what was found by those of the homographies.
             changes = (back[:, None] @ (from_parameters(np.eye(8)) - np.eye(3))) / (back @ homographies)[:, None, 2:, 2:]
             slopes = parameters(np.eye(3) + changes - found[:, None] * changes[..., 2:, 2:])
             to_corrections = np.linalg.inv(np.swapaxes(slopes, -1, -2))
             information = np.swapaxes(to_corrections, -1, -2) @ information @ to_corrections
-        return Knots(found, information, None)
+        return Knots(instants, found, information, None)
 
     def corrected(self, corrections: Trajectory) -> Trajectory:
         """Return the known motion, each frame of which is corrected."""

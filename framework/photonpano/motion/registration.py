@@ -16,7 +16,7 @@ from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.diagnosis import Contrast
 from photonpano.motion.exposure_tasks import Descriptions, ExposureTasks, Notes, Pair
 from photonpano.motion.level import FrameHomography, VirtualExposures
-from photonpano.motion.pairs import independent_share, instants_of
+from photonpano.motion.pairs import instants_of
 from photonpano.motion.tracking import Place, StartingMotion
 from photonpano.values import Decision, Edge, Located, NotLocated
 
@@ -60,7 +60,7 @@ class Registrar:
         self._excluded = excluded
         self._executor, self._exposures, self._clock, self._log = context.executor, exposures, exposures.clock, log
         self._at_once = context.executor.at_once(len(exposures.groups))
-        tasks = ExposureTasks(exposures, independent_share(exposures.groups))
+        tasks = ExposureTasks(exposures)
         self._tasks = context.executor.share(tasks)
         # One call for all exposures: a trajectory takes about as long for one instant as for a thousand.
         self.to_plane = None if exposures.previous is None else exposures.previous.at(instants_of(exposures.groups))

@@ -17,9 +17,9 @@ from photonpano.geometry import (
     slopes,
     transform_points,
 )
-from photonpano.motion.adjustment import Adjustment, Cost, Problem
+from photonpano.motion.adjustment import Adjustment, Prior, Problem
 from photonpano.motion.lens_shift import LensShift
-from photonpano.values import BoolArray, FloatArray
+from photonpano.values import FloatArray
 
 _FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # tried first, in sides of a frame
 # Prior of the focal length, in sides of a frame, and the standard deviation of its logarithm.
@@ -31,10 +31,6 @@ _MOST_TRIED = 400  # edges by which the first focal length is chosen
 _UNIQUE_TURN = 2.0
 _MOST_ZOOM = 10.0  # of one step
 _POWERS = np.array([2, 4, 1, 1])  # of the focal length, with which k1, k2, p1 and p2 grow if the lens bends pixels alike
-# Share of what patches show that counts, since pairs have photons in common: where there was no lens, one seemed to explain up
-# to 84 squares of patches that were independent, and weak lenses 103 and more (4,000 frames of photographs).
-_INDEPENDENT = 0.5
-_TINY = 1e-30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,14 +69,13 @@ class RotationAdjustment(Adjustment[Rotations]):
         """
         super().__init__(problem, n_shared=len(unknown))
         self._assumed, self._unknown = assumed, unknown
-        self._motions, self._observed = problem.motions, problem.observed
         # What was computed of the current state, and of states near it.
         self._near: tuple[Rotations, list[Rotations]] | None = None
         self._shifts: dict[Rotations, FloatArray] = {}
 
     @cached_property
     def _lens(self) -> LensShift:
-        return LensShift.of(self._frame_shape, self._motions)
+        return LensShift.of(self._frame_shape, self._motions, self._noise.weights)
 
     def homographies(self, state: Rotations) -> FloatArray:
         """Return K R K^-1, of determinant 1: (N, 3, 3)."""
@@ -137,6 +132,10 @@ class RotationAdjustment(Adjustment[Rotations]):
             self._shifts = {key: shift for key, shift in self._shifts.items() if key is state}
         return self._near[1]
 
+    def shifted_patches(self, state: Rotations) -> FloatArray:
+        """Return how the lens shifts patches: see `Adjustment`."""
+        return self._shift(state).reshape(self._lens.shifts.shape)
+
     def _bends(self, state: Rotations) -> bool:
         return state.camera.distorts or self._assumed.distorts
 
@@ -149,35 +148,30 @@ class RotationAdjustment(Adjustment[Rotations]):
     def _unexplained(self, state: Rotations) -> FloatArray:
         return self._lens.unexplained(self._shift(state) if self._bends(state) else None)
 
-    def beside(self, state: Rotations) -> FloatArray:
-        """Return where patches lie beside where they are expected: (E, P, 2) px; meaningless for those that show nothing."""
-        lens = self._lens
-        expected = transform_points(self.relative(state), lens.points) + self._shift(state).reshape(lens.shifts.shape)
-        return np.asarray(transform_points(self._observed, lens.points) + lens.shifts - expected)
-
     @property
     def _finds_lens(self) -> bool:
         return any(index > 0 for index in self._unknown)
 
-    def cost(self, state: Rotations, norms: FloatArray, kept: BoolArray) -> Cost:
-        """Return what a solution leaves; a lens also explains why patches lie beside homographies."""
-        cost = super().cost(state, norms, kept)
-        if not self._finds_lens:
-            return cost
-        before, after = (float((each**2).sum()) for each in (self._lens.unexplained(), self._unexplained(state)))
-        return replace(cost, explained=_INDEPENDENT * (before - after) / max(self._lens.noise, _TINY) ** 2)
+    def deviance(self, state: Rotations, weights: FloatArray) -> float:
+        """Compare with other models: see `Adjustment`. A lens also explains why patches lie beside homographies.
 
-    def prior(self, state: Rotations) -> tuple[FloatArray, FloatArray]:
+        A unit of roll is an angle here, and one of the shift of a corner there.
+        """
+        before = float((self._lens.unexplained() ** 2).sum()) if self._finds_lens else 0.0
+        units = 2 * (self._n_nodes - 1) * float(np.log(state.camera.focal_px / self._half))
+        return super().deviance(state, weights) - before + units
+
+    def prior(self, state: Rotations) -> Prior:
         """Return what is known before: a focal length of some sides of a frame, a small distortion, and where patches lie."""
         units = self._units(state.camera)
         away = [_away(state.camera, index, 2 * self._half) for index in self._unknown]
         stds = np.where(np.array(self._unknown) == 0, _PRIOR_STD, _PRIOR_DISTORTION * units)
         known, of_known = np.asarray(away / stds), np.diag(units / stds)
-        if not self._finds_lens:
-            return known, of_known
-        left = self._unexplained(state)
-        of_left = np.stack([(self._unexplained(each) - left) / _STEP for each in self._nearby(state)], axis=-1)
-        return np.concatenate([known, left]), np.concatenate([of_known, of_left])
+        if self._finds_lens:
+            left = self._unexplained(state)
+            of_left = np.stack([(self._unexplained(each) - left) / _STEP for each in self._nearby(state)], axis=-1)
+            known, of_known = np.concatenate([known, left]), np.concatenate([of_known, of_left])
+        return Prior(known, self._of_shared(of_known))
 
     def _units(self, camera: Camera) -> FloatArray:
         """Return the change of each unknown that moves the ends of a frame by about half its side."""

@@ -163,8 +163,11 @@ def _gyroscope(plan: Plan, source: Source, timeline: Timeline, journal: list[Dec
 def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:
     """Return which model `auto` took at the last level, for the record."""
     located = results[-1].located
-    if plan.motion.model != "auto" or located.evidence is None:
+    if plan.motion.model != "auto":
         return []
-    rivals = [f"{name} {rival.chi2:.3g} ({rival.unknowns:,})" for name, rival in located.evidence.rivals.items()]
-    reason = "reduced chi-square of the pairs, and the number of unknowns: " + ", ".join(rivals)
+    rivals = [f"{name} {rival.deviance:,.0f} ({rival.unknowns:,})" for name, rival in located.rivals.items()]
+    walks = [f"{name} {px:.2g} px" for name, px in located.solution.walks_px.items()]
+    reason = f"beyond shift and roll, the ends of a frame move by {listed(walks) or 'nothing'} over the capture"
+    if len(rivals) > 1:
+        reason += f"; deviances of the models, and their unknowns: {', '.join(rivals)}"
     return [Decision("motion_model", located.solution.model.name, reason)]

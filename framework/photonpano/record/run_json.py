@@ -36,6 +36,7 @@ from photonpano.record.schema import (
     PosesRecord,
     RefinementRecord,
     RescuedRecord,
+    RivalRecord,
     RunRecord,
     VerdictRecord,
 )
@@ -154,9 +155,8 @@ def level_record(result: LevelResult) -> LevelRecord:
         "std_px": mean_px if np.isfinite(mean_px) else None,
         "residual_px": located.solution.residual_px,
         "camera": _camera_record(result),
-        "evidence": None
-        if located.evidence is None
-        else {name: _fields(each) for name, each in located.evidence.rivals.items()},
+        "rivals": {name: RivalRecord(**rival._asdict()) for name, rival in located.rivals.items()},
+        "walks_px": dict(located.solution.walks_px),
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
     }
 

@@ -70,13 +70,13 @@ class CameraRecord(TypedDict):
 class RivalRecord(TypedDict):
     """How well a model of the motion explains the pairs of a level.
 
-    `chi2` is their reduced chi-square, 1 where residuals are photon noise; `gain` is by how much each unknown that homographies
-    have more lowers the sum of the squares, in units of what these leave.
+    `chi2` is the mean square of their residuals, in units of photon noise; `deviance` is minus twice the logarithm of its
+    marginal likelihood, above that of the likeliest model.
     """
 
     chi2: float
     unknowns: int
-    gain: float
+    deviance: float
 
 
 class LevelRecord(TypedDict):
@@ -85,8 +85,9 @@ class LevelRecord(TypedDict):
     `groups` and `located` count virtual exposures, `pairs` and `failures` pairs of them; `located_by` counts located pairs by
     locator. `revisits` are loop closures. `contradictions` are located pairs that were dropped as outliers. `change_px` is the
     mean distance by which the level moved the corners of the frames, None at the first level; `std_px` is the expected corner
-    error, None where a single exposure was located. `camera` is that of a level whose camera turns, and `evidence` how well it
-    explains the pairs; None where homographies were fitted. `seconds` has an entry for each stage.
+    error, None where a single exposure was located. `camera` is that of a level whose camera turns, None where homographies were
+    fitted; `walks_px` is how far what these do beyond shift and roll moves the ends of a frame over the capture, and `rivals`
+    how well models explain the pairs. `seconds` has an entry for each stage.
     """
 
     level: int
@@ -104,7 +105,8 @@ class LevelRecord(TypedDict):
     std_px: float | None
     residual_px: float
     camera: CameraRecord | None
-    evidence: Mapping[str, RivalRecord] | None
+    rivals: Mapping[str, RivalRecord]
+    walks_px: Mapping[str, float]
     seconds: Mapping[str, float]
 
 

@@ -42,7 +42,8 @@ def _one_direction(run: TestedRun) -> Found | None:
         return None
     middle = corners(located.frame_shape).mean(axis=0)[None]
     # Where nothing but shift and roll moves the image, the other parameters are known.
-    free = slice(4, 6) if located.solution.model.is_simple else slice(0, 8)
+    solution = located.solution
+    free = slice(0, 8) if solution.walks_px or solution.rotations is not None else slice(4, 6)
     slopes = np.array([jacobian(pair.homography, middle)[0][:, free] for pair in informed])
     information = np.array([pair.information for pair in informed])[:, free, free]
     covariances = slopes @ np.linalg.pinv(information) @ slopes.transpose(0, 2, 1)
@@ -98,14 +99,14 @@ def _no_turn(run: TestedRun) -> Found | None:
     if not run.levels or run.levels[-1].located.solution.rotations is None:
         return None
     located = run.levels[-1].located
-    evidence, name = located.evidence, located.solution.model.name
-    if evidence is None or not {name, "homography"} <= evidence.rivals.keys():
+    rivals, name = located.rivals, located.solution.model.name
+    if not {name, "homography"} <= rivals.keys():
         return None
-    residual, free = np.sqrt([evidence.rivals[each].chi2 for each in (name, "homography")]).tolist()
+    residual, free = np.sqrt([rivals[each].chi2 for each in (name, "homography")]).tolist()
     where = f"residuals in units of their noise; those of any homographies are {free:.2g}"
     camera = run.explained.motion.camera
     what_to_do = "" if camera is not None and camera.distorts else f"write motion: {{model: homography}}, or {FIND_LENS}"
-    return Found(residual, where, not evidence.suffices(name), what_to_do=what_to_do)
+    return Found(residual, where, rivals[name].deviance > 0, what_to_do=what_to_do)
 
 
 @MOTION_TESTS.doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")

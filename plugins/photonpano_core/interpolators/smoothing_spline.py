@@ -79,8 +79,7 @@ class SmoothingSplineInterpolator:
             values = np.maximum(values, _MIN_INFORMATION * values.max())
             covariances = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
         paths = transform_points(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
-        # Without perspective, twists are rounding errors, which tell nothing of the noise.
-        noise = 1.0 if np.ptp(paths[:, _QUIET], axis=0).max() < _STILL_PX else None
+        noise = None if information is None else 1.0
         moved = _smoothed_modes(instants, paths, covariances, _QUIET, noise) @ _TO_MODES
         return _from_corners(self._corners, moved.reshape(-1, 4, 2))
 
