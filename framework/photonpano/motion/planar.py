@@ -37,9 +37,9 @@ _PERSPECTIVE = slice(3, 5)  # of the walks
 _TERMS = 12  # of the exponential and the logarithmic series
 _HALVINGS = 2  # of a logarithm, by square roots, before its series
 _ROOTS = 8  # Newton steps of a square root
-# Standard deviations of a walk over the whole capture, in units of half a frame: at first; where the capture is too short to tell;
-# and below which it is none (a thousandth of a pixel).
-_FIRST, _ASSUMED, _NONE = 0.01, 0.02, 4e-6
+# Standard deviations of a walk over the whole capture, in units of half a frame: at first, when robust weights must not blame pairs
+# for what the walk hinders; where the capture is too short to tell; and below which it is none (a thousandth of a pixel).
+_FIRST, _ASSUMED, _NONE = 1.0, 0.02, 4e-6
 _FEWEST_STEPS = 6  # that tell how wide the walks are
 _ROUNDS, _MOST, _SETTLED = 20, 30.0, 0.05  # rounds of the estimate, most change of a variance in one, least that counts
 _DRAWS = 24  # by which the variances' degrees of freedom are estimated
