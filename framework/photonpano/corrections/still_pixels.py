@@ -81,7 +81,7 @@ class Still:
     """What stands still in the frame."""
 
     mask: BoolArray  # (H, W) bool, the pixels to mask
-    share: float  # share of the frame that stands still, of the parts that show motion or rest; 0 if no part does
+    share: float  # share of the frame that stands still, of the parts that show motion or rest; 0 if none moves
     why: str  # a clause on the masked pixels
 
 
@@ -105,7 +105,7 @@ def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike:
     n_standing, n_moving = int(standing.sum()), int((moving & ~standing).sum())
     share = n_standing / max(n_standing + n_moving, 1)
     if moving.mean() < _LEAST_MOVING:
-        return Still(np.zeros_like(usable), share, "are masked: nothing in the frame moves")
+        return Still(np.zeros_like(usable), 0.0, "are masked: nothing in the frame moves")
     if share > _HALF:
         why = f"are masked: {share:.0%} of the frame stands still, so that it is open which part is the scene"
         return Still(np.zeros_like(usable), share, why)

@@ -143,7 +143,7 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
         fit = _fitted(tied, start, plane)
         if _in_front(fit.state.homographies, tied.frame_shape):
             fits[plane] = fit
-            if not fit.adjustment.turns(fit.state, fit.weights):
+            if not fit.adjustment.turns(fit.state):
                 return fits
     for rotation in model.rotations:
         if fits:

@@ -126,19 +126,18 @@ class PlanarAdjustment(Adjustment[Plane]):
     coupling of perspective to shift, where the model has both.
 
     Attributes:
-        variances: (w,) of the walks of the model, in squares of unit coordinates per frame; 0 for none.
+        variances: of the prior, in squares of unit coordinates: of each walk per frame, (w,), and then of the coupling.
     """
 
-    def __init__(self, problem: Problem, model: PlanarName, variances: FloatArray | None = None) -> None:
-        """Set up the problem; variances that are given are not estimated."""
+    def __init__(self, problem: Problem, model: PlanarName) -> None:
+        """Set up the problem."""
         self._basis = basis_of(model)
         self._n_walks = max(self._basis.shape[1] - _FREE, 0)
         super().__init__(problem, n_shared=int(model == "homography"))
         # Nodes are in order of time; those of one instant make no step.
         self._times = np.maximum(np.diff(problem.instants), 1.0)
-        self._duration = max(float(self._times.sum()), 1.0)
-        self._learns = variances is None
-        self.variances = np.full(self._n_walks, _FIRST**2 / self._duration) if variances is None else variances
+        self._durations = np.array([max(float(self._times.sum()), 1.0)] * self._n_walks + [1.0] * self._n_shared)
+        self.variances = _FIRST**2 / self._durations
 
     @property
     def _n_node(self) -> int:
@@ -147,14 +146,13 @@ class PlanarAdjustment(Adjustment[Plane]):
     @property
     def walks_px(self) -> dict[str, float]:
         """How far each walk moves the ends of a frame over the capture, in px: a standard deviation; none that are 0."""
-        ends_px = np.sqrt(self.variances * self._duration) * self._half
-        known = self.variances > _NONE**2 / self._duration
-        return {name: float(px) for name, px, there in zip(_WALKS, ends_px, known, strict=False) if there}
+        ends_px = np.sqrt(self.variances * self._durations) * self._half
+        return {name: float(px) for name, px in zip(_WALKS, ends_px[: self._n_walks], strict=False) if px > _NONE * self._half}
 
     @property
     def n_hyperparameters(self) -> int:
-        """How many variances, and couplings, were estimated."""
-        return len(self.walks_px) + self._n_shared
+        """How many variances were estimated."""
+        return int((self.variances > _NONE**2 / self._durations).sum())
 
     def homographies(self, state: Plane) -> FloatArray:
         """Return those of the state."""
@@ -175,94 +173,90 @@ class PlanarAdjustment(Adjustment[Plane]):
         return np.asarray(np.einsum("pk,pij->kij", self._basis, generators(self._frame_shape)))
 
     def prior(self, state: Plane) -> Prior:
-        """Return the steps of the walks from each node to the next, and what is known of the coupling: about that of f = s."""
-        steps, slopes = self._steps(state)
-        variances = self._times[:, None] * np.maximum(self.variances, _NONE**2 / self._duration)
-        coupling = np.full(self._n_shared, state.coupling)
-        rows = sparse.vstack([slopes, self._of_shared(np.ones((self._n_shared, 1)))])
-        stds = np.concatenate([np.sqrt(variances).ravel(), np.ones(self._n_shared)])
-        residuals = np.concatenate([steps.ravel(), coupling]) / stds
-        return Prior(residuals, sparse.csr_array(sparse.diags_array(1 / stds) @ rows), float(2 * np.log(stds).sum()))
+        """Return the steps of the walks from each node to the next, and the coupling."""
+        if not (parts := self._components(state)):
+            return super().prior(state)
+        stds = np.concatenate([np.full(len(part.residuals), std) for part, std in zip(parts, np.sqrt(self.variances), strict=True)])
+        residuals = np.concatenate([part.residuals for part in parts]) / stds
+        rows = sparse.csr_array(sparse.diags_array(1 / stds) @ sparse.vstack([part.slopes for part in parts]))
+        times = self._n_walks * float(np.log(self._times).sum())
+        return Prior(residuals, rows, float(2 * np.log(stds).sum()) + times)
 
     def learn(self, state: Plane, weights: FloatArray) -> bool:
-        """Estimate the variances of the walks from pairs of these weights, (E,); return whether they changed.
+        """Estimate the variances of the prior from pairs of these weights, (E,); return whether they changed.
 
         Variance components of least squares (Foerstner 1979; MacKay 1992): the squares of what is estimated of the steps, over the
         number of them that the pairs determine. The maximum of the marginal likelihood is where this changes nothing.
         """
-        if not (self._learns and self._n_walks):
+        if not self._n_walks:
             return False
         if len(self._times) < _FEWEST_STEPS:
-            self.variances = np.full(self._n_walks, _ASSUMED**2 / self._duration)
+            self.variances = _ASSUMED**2 / self._durations
             return True
         before, free, rng = self.variances, self._free(state), np.random.default_rng(0)
         jacobians, residuals = self._of_edges(state, weights)
-        steps, slopes = self._steps(state)
-        of_walk = [sparse.csr_array(slopes[walk :: self._n_walks][:, free]) for walk in range(self._n_walks)]
-        jacobians, roots = jacobians[:, free], 1 / np.sqrt(self._times)
-        known = self._of_shared(np.ones((self._n_shared, 1)))[:, free]
-        normal = jacobians.T @ jacobians + known.T @ known
-        right = np.column_stack([jacobians.T @ residuals, jacobians.T @ rng.normal(size=(jacobians.shape[0], _DRAWS))])
-        right[:, 0] += known.T @ np.full(self._n_shared, state.coupling)
-        right[:, 1:] += known.T @ rng.normal(size=(self._n_shared, _DRAWS))
-        terms = []
-        for walk, rows in enumerate(of_walk):
-            scaled = sparse.csr_array(sparse.diags_array(roots) @ rows)
-            drawn = np.column_stack([steps[:, walk] * roots, rng.normal(size=(len(roots), _DRAWS))])
-            terms.append((scaled, sparse.csr_array(scaled.T @ scaled), scaled.T @ drawn))
-        least = _NONE**2 / self._duration
+        jacobians = jacobians[:, free]
+        # Columns: what is estimated, draws of its error, and the last shared unknown alone, whose variance is exact.
+        drawn = jacobians.T @ rng.normal(size=(jacobians.shape[0], _DRAWS))
+        normal, right = jacobians.T @ jacobians, np.column_stack([jacobians.T @ residuals, drawn])
+        parts = [Prior(part.residuals, sparse.csr_array(part.slopes[:, free])) for part in self._components(state)]
+        squares = [sparse.csr_array(part.slopes.T @ part.slopes) for part in parts]
+        sides = [
+            part.slopes.T @ np.column_stack([part.residuals, rng.normal(size=(len(part.residuals), _DRAWS))]) for part in parts
+        ]
+        alone = np.zeros((right.shape[0], 1))
+        alone[-1] = self._n_shared
         for _ in range(_ROUNDS):
-            whole, sides = normal, right
-            for variance, (_, square, side) in zip(self.variances, terms, strict=True):
-                whole = whole + square / variance
-                sides = sides + side / np.concatenate([[variance], np.full(_DRAWS, np.sqrt(variance))])
-            changes = factorised(whole).solve(sides)
-            found = np.empty(self._n_walks)
-            for walk, (scaled, *_) in enumerate(terms):
-                moves = scaled @ changes
-                left = steps[:, walk] * roots - moves[:, 0]
-                undetermined = (moves[:, 1:] ** 2).sum() / _DRAWS / self.variances[walk]
-                determined = max(len(roots) - undetermined, 1e-3 * len(roots))
-                found[walk] = (left @ left) / determined
-            found = np.maximum(np.clip(found, self.variances / _MOST, self.variances * _MOST), least)
+            whole = normal + sum(square / variance for square, variance in zip(squares, self.variances, strict=True))
+            scales = np.ones((len(parts), _DRAWS + 1)) / np.sqrt(self.variances)[:, None]
+            scales[:, 0] **= 2
+            given = right + sum(side * scale for side, scale in zip(sides, scales, strict=True))
+            changes = factorised(whole).solve(np.column_stack([given, alone]))
+            found = np.empty(len(parts))
+            for index, (part, variance) in enumerate(zip(parts, self.variances, strict=True)):
+                moves, number = part.slopes @ changes, len(part.residuals)
+                left = part.residuals - moves[:, 0]
+                unsure = (moves[:, 1:-1] ** 2).sum() / _DRAWS if index < self._n_walks else changes[-1, -1]
+                found[index] = (left @ left) / max(number - unsure / variance, 1e-3 * number)
+            found = np.clip(found, self.variances / _MOST, self.variances * _MOST)
+            found = np.maximum(found, _NONE**2 / self._durations)
             settled = np.abs(np.log(found / self.variances)).max() < _SETTLED
             self.variances = found
             if settled:
                 break
         return bool(np.abs(np.log(self.variances / before)).max() > _SETTLED)
 
-    def turns(self, state: Plane, weights: FloatArray) -> bool:
-        """Return whether perspective changes with the shift as for a camera that turns, by more than noise (Schwarz 1978)."""
-        if not self._n_shared or state.coupling >= 0:
-            return False
-        jacobians, _ = self._linearised(state, weights)
-        free = self._free(state)
-        last = np.zeros(int(free.sum()))
-        last[-1] = 1
-        variance = float(factorised((jacobians.T @ jacobians)[free][:, free]).solve(last)[-1])
-        return state.coupling**2 > variance * np.log(max(self._n_nodes - 1, 2))
+    def turns(self, state: Plane) -> bool:
+        """Return whether perspective changes with the shift as for a camera that turns."""
+        return bool(self._n_shared and state.coupling < 0 and self.variances[-1] > _NONE**2)
 
-    def _steps(self, state: Plane) -> tuple[FloatArray, sparse.csr_array]:
-        """Return the steps of the walks beyond the coupling, (N - 1, w), and their derivatives, ((N - 1) w, k N + s)."""
+    def _components(self, state: Plane) -> list[Prior]:
+        """Return the steps of each walk beyond the coupling, over the roots of their times; and the coupling."""
         n_steps, k, w = len(self._times), self._n_node, self._n_walks
         if not w:
-            return np.zeros((n_steps, 0)), sparse.csr_array((0, k * self._n_nodes + self._n_shared))
+            return []
         relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
         motions = logarithms(relative, self._frame_shape)
         back = np.linalg.pinv(self._basis)[_FREE:]  # from p1..p8 to the walks
         earlier = _coordinates(inverse(relative)[:, None] @ generators(self._frame_shape) @ relative[:, None], self._frame_shape)
         by_nodes = np.stack([-back @ np.swapaxes(earlier, 1, 2), np.broadcast_to(back, (n_steps, w, 8))], axis=2) @ self._basis
-        steps = motions @ back.T
-        if self._n_shared:
-            steps[:, _PERSPECTIVE] -= state.coupling * motions[:, 4:6]
-        rows = np.repeat(np.arange(n_steps * w), 2 * k)
-        columns = np.broadcast_to((k * np.arange(n_steps))[:, None, None] + np.arange(2 * k), (n_steps, w, 2 * k)).ravel()
-        slopes = sparse.csr_array((by_nodes.ravel(), (rows, columns)), shape=(n_steps * w, k * self._n_nodes))
-        if not self._n_shared:
-            return steps, slopes
+        steps, roots = motions @ back.T, 1 / np.sqrt(self._times)
         by_coupling = np.zeros((n_steps, w))
-        by_coupling[:, _PERSPECTIVE] = -motions[:, 4:6]
-        return steps, sparse.csr_array(sparse.hstack([slopes, sparse.csr_array(by_coupling.reshape(-1, 1))]))
+        if self._n_shared:
+            by_coupling[:, _PERSPECTIVE] = -motions[:, 4:6]
+            steps += state.coupling * by_coupling
+        rows = np.repeat(np.arange(n_steps), 2 * k)
+        columns = (k * np.arange(n_steps)[:, None] + np.arange(2 * k)).ravel()
+        parts = []
+        for walk in range(w):
+            entries = (by_nodes[:, walk].reshape(n_steps, 2 * k) * roots[:, None]).ravel()
+            slopes = sparse.csr_array((entries, (rows, columns)), shape=(n_steps, k * self._n_nodes))
+            if self._n_shared:
+                slopes = sparse.csr_array(sparse.hstack([slopes, sparse.csr_array((by_coupling[:, [walk]] * roots[:, None]))]))
+            parts.append(Prior(steps[:, walk] * roots, slopes))
+        if self._n_shared:
+            parts.append(Prior(np.array([state.coupling]), self._of_shared(np.ones((1, 1)))))
+        return parts
 
     def information(self, state: Plane, blocks: FloatArray) -> FloatArray:
         """Convert (N, k, k) information on changes of nodes to that on p1..p8 of their homographies.

@@ -22,6 +22,7 @@ _SCALES = np.logspace(-10, 10, 41)
 _NOISES = np.logspace(-16, 0, 129)
 _TINY = 1e-200  # floor on the noise variance, for knots that lie on a parabola exactly
 _MIN_INFORMATION = 1e-8  # floor on the information eigenvalues of a knot, relative to the largest
+_MAX_INFORMATION = 0.01**-2  # ceiling on them, 1 / px^2: better known numbers of a knot only spoil the equations by rounding errors
 # Orthonormal map from the corners' coordinates to modes in px: shift, twist, stretch, shear.
 _TO_MODES = np.kron(hadamard(4) / 2, np.eye(2))
 # the twists, which a shaking camera hardly excites: it changes perspective less than shift, roll and scale
@@ -76,7 +77,7 @@ class SmoothingSplineInterpolator:
             derivatives = [jacobian(homography, self._corners).reshape(8, 8) for homography in homographies]
             back = np.linalg.inv(_TO_MODES @ derivatives)
             values, vectors = np.linalg.eigh(back.transpose(0, 2, 1) @ information @ back)
-            values = np.maximum(values, _MIN_INFORMATION * values.max())
+            values = np.clip(values, _MIN_INFORMATION * values.max(), _MAX_INFORMATION)
             covariances = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
         paths = transform_points(homographies, self._corners).reshape(-1, 8) @ _TO_MODES.T
         noise = None if information is None else 1.0

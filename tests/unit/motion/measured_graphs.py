@@ -1,11 +1,13 @@
 """Motion graphs whose pairs are measured with known errors."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from photonpano import Located
+from photonpano import FrameSpan, Group, Located
 from photonpano.geometry import (
+    align_planes,
     corner_displacements,
     corners,
     from_parameters,
@@ -13,12 +15,21 @@ from photonpano.geometry import (
     jacobian,
     normalised,
     parameters,
+    transform_points,
     translation,
 )
 from photonpano.values import Edge
 
 SHAPE = (254, 496)
 NOISE_PX = 0.1
+TO_CORNERS = jacobian(np.eye(3), corners(SHAPE)).reshape(8, 8)
+"""The shifts of the corners of a frame by p1..p8 of a small motion."""
+
+
+def groups_of(n_nodes: int, length: int = 10, step: int = 10) -> list[Group]:
+    """Return groups of `length` frames, each begun `step` frames after the one before."""
+    spans = [FrameSpan(step * node, step * node + length) for node in range(n_nodes)]
+    return [Group(span, span.centre) for span in spans]
 
 
 def true_motion(n_nodes: int, seed: int = 0) -> np.ndarray:
@@ -27,27 +38,76 @@ def true_motion(n_nodes: int, seed: int = 0) -> np.ndarray:
     return from_parameters(np.cumsum(steps, axis=0))
 
 
-def edge(true: np.ndarray, moving: int, fixed: int, rng: np.random.Generator | None = None, std_px: float = NOISE_PX) -> Edge:
-    """Measure a pair; with a generator, corners have errors of `std_px` along each axis, as the information predicts."""
-    homography = normalised(inverse(true[fixed]) @ true[moving])
-    to_corners = jacobian(homography, corners(SHAPE)).reshape(8, 8)
-    information = to_corners.T @ to_corners / std_px**2
-    if rng is not None:
-        change = np.linalg.solve(to_corners, rng.normal(scale=std_px, size=8))
-        homography = from_parameters(parameters(homography) + change)
-    return Edge(moving, fixed, Located(homography, information))
+def noise_of(groups: Sequence[Group], rng: np.random.Generator, std_px: np.ndarray | float = NOISE_PX) -> np.ndarray:
+    """Draw where exposures show the corners of their frames: (N, 8) px.
+
+    A pair of exposures alike errs by `std_px` along each axis, half of the variance by either. Exposures share the noise of the
+    frames that they share.
+    """
+    frames = rng.normal(size=(max(group.span.stop for group in groups), 8))
+    drawn = np.array([frames[each.span.start : each.span.stop].sum(axis=0) / np.sqrt(len(each.span)) for each in groups])
+    return drawn * np.broadcast_to(std_px, len(groups))[:, None] / np.sqrt(2)
+
+
+def shifted(corners_px: np.ndarray) -> np.ndarray:
+    """Return the small motions of frames that move their corners by (..., 8) px."""
+    return from_parameters(np.linalg.solve(TO_CORNERS, corners_px[..., None])[..., 0])
+
+
+def edge(
+    true: np.ndarray,
+    moving: int,
+    fixed: int,
+    noise: np.ndarray | None = None,
+    std_px: np.ndarray | float = NOISE_PX,
+    own: tuple[np.random.Generator, float] | None = None,
+) -> Edge:
+    """Measure a pair with its information, exactly or with the (N, 8) noise of the exposures.
+
+    Args:
+        true: the motion of the exposures.
+        moving: one of them.
+        fixed: the other one.
+        noise: see `noise_of`.
+        std_px: that of the noise, for all exposures or for each.
+        own: a generator, and the standard deviation of the error that the pair adds at the corners by itself.
+    """
+    exact = normalised(inverse(true[fixed]) @ true[moving])
+    stds = np.broadcast_to(std_px, len(true)) / np.sqrt(2)
+    changes = from_parameters(np.eye(8)) - np.eye(3)
+    covariance = np.zeros((8, 8))
+    for moved, std in ((exact @ changes, stds[moving]), (-changes @ exact, stds[fixed])):
+        slopes = parameters(np.eye(3) + moved - exact * moved[:, 2:, 2:]).T @ np.linalg.inv(TO_CORNERS)
+        covariance += slopes @ slopes.T * std**2
+    found = exact if noise is None else normalised(inverse(shifted(noise[fixed])) @ exact @ shifted(noise[moving]))
+    if own is not None:
+        rng, own_px = own
+        back = np.linalg.inv(jacobian(exact, corners(SHAPE)).reshape(8, 8))
+        covariance = back @ back.T * own_px**2 + (0 if noise is None else covariance)
+        found = from_parameters(parameters(found) + back @ rng.normal(scale=own_px, size=8))
+    return Edge(moving, fixed, Located(found, np.linalg.inv(covariance)))
+
+
+def pairs(n_nodes: int, skips: Sequence[int]) -> list[tuple[int, int]]:
+    return [(moving, moving - skip) for moving in range(n_nodes) for skip in skips if skip <= moving]
 
 
 def measured(
-    true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator | None = None, std_px: float = NOISE_PX
+    true: np.ndarray, skips: Sequence[int], noise: np.ndarray | None = None, std_px: np.ndarray | float = NOISE_PX
 ) -> list[Edge]:
-    return [edge(true, moving, moving - skip, rng, std_px) for moving in range(len(true)) for skip in skips if skip <= moving]
+    """Measure pairs, exactly or with the (N, 8) noise of their exposures."""
+    return [edge(true, *pair, noise, std_px) for pair in pairs(len(true), skips)]
 
 
-def graph(n_nodes: int, skips: tuple[int, ...] = (1, 2, 4)) -> tuple[np.ndarray, list[Edge]]:
-    """Return a true motion, and its pairs measured with noise."""
+def apart(true: np.ndarray, skips: Sequence[int], rng: np.random.Generator, std_px: float = NOISE_PX) -> list[Edge]:
+    """Measure pairs each of which errs by itself."""
+    return [edge(true, *pair, own=(rng, std_px)) for pair in pairs(len(true), skips)]
+
+
+def graph(n_nodes: int, skips: Sequence[int] = (1, 2, 4)) -> tuple[np.ndarray, list[Edge]]:
+    """Return a true motion, and pairs each of which errs by itself."""
     true = true_motion(n_nodes)
-    return true, measured(true, skips, np.random.default_rng(0))
+    return true, apart(true, skips, np.random.default_rng(0))
 
 
 def confident(edges: list[Edge], times: float) -> list[Edge]:
@@ -58,6 +118,13 @@ def confident(edges: list[Edge], times: float) -> list[Edge]:
 def error_px(homographies: np.ndarray, true: np.ndarray, anchor: int) -> float:
     moved = inverse(normalised(inverse(true[anchor]) @ true)) @ homographies
     return float(corner_displacements(moved, np.eye(3), SHAPE).mean())
+
+
+def squared_errors(homographies: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return the mean square distance of the corners from where they should be, after the best alignment of planes: (N,)."""
+    frame = corners(SHAPE)
+    missed = transform_points(np.linalg.inv(true) @ align_planes(homographies, true, SHAPE) @ homographies, frame) - frame
+    return np.sum(missed**2, axis=-1).mean(axis=-1)
 
 
 def moved(wrong: Edge, x_px: float, y_px: float) -> Edge:

@@ -22,10 +22,12 @@ from photonpano.values import Edge
 from .measured_graphs import (
     NOISE_PX,
     SHAPE,
+    apart,
     confident,
     edge,
     error_px,
     graph,
+    groups_of,
     measured,
     moved,
     true_motion,
@@ -39,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("anchor", [0, 15, 29])
 def test_solve_is_exact_without_noise(skips: tuple[int, ...], anchor: int) -> None:
     true = true_motion(30)
-    solution = solve(30, measured(true, skips), anchor, SHAPE)
+    solution = solve(groups_of(30), measured(true, skips), anchor, SHAPE)
     assert error_px(solution.homographies, true, anchor) < 1e-9
     assert solution.located.all()
     assert solution.outliers == ()
@@ -53,7 +55,7 @@ def test_residual_is_that_of_the_measurements_and_no_edge_is_an_outlier(n: int, 
     The spanning tree that the solution starts from contains one pair in two; errors are `times` what information predicts.
     """
     _, edges = graph(n, (1, 2))
-    solution = solve(n, confident(edges, times), n // 2, SHAPE)
+    solution = solve(groups_of(n), confident(edges, times), n // 2, SHAPE)
     assert solution.residual_px == pytest.approx(NOISE_PX * np.sqrt(2) * np.sqrt(1 - (n - 1) / len(edges)), rel=rel)
     if times > 1:
         assert solution.outliers == ()
@@ -64,7 +66,7 @@ def test_residual_is_that_of_the_measurements_and_no_edge_is_an_outlier(n: int, 
 def test_solve_accepts_pairs_in_either_direction_and_twice() -> None:
     true = true_motion(4)
     edges = [edge(true, 1, 0), edge(true, 1, 2), edge(true, 2, 1), edge(true, 2, 3), edge(true, 0, 3), edge(true, 1, 0)]
-    assert error_px(solve(4, edges, 0, SHAPE).homographies, true, 0) < 1e-9
+    assert error_px(solve(groups_of(4), edges, 0, SHAPE).homographies, true, 0) < 1e-9
 
 
 def test_solve_error_falls_with_more_edges_than_a_chain() -> None:
@@ -73,7 +75,7 @@ def test_solve_error_falls_with_more_edges_than_a_chain() -> None:
     for seed in range(2):
         true, rng = true_motion(120, seed), np.random.default_rng(seed)
         for skips, found in errors.items():
-            found.append(error_px(solve(120, measured(true, skips, rng), 60, SHAPE).homographies, true, 60))
+            found.append(error_px(solve(groups_of(120), apart(true, skips, rng), 60, SHAPE).homographies, true, 60))
     chain, neighbours, closures = (float(np.mean(found)) for found in errors.values())
     assert chain > 0.5
     assert neighbours < 0.35 * chain
@@ -84,9 +86,9 @@ def test_solve_error_falls_with_more_edges_than_a_chain() -> None:
 def test_solve_weights_edges_by_information_or_residual(weighted_by: str) -> None:
     """Every second measurement of a pair is twenty times as noisy."""
     true, rng = true_motion(40), np.random.default_rng(0)
-    good = measured(true, (1, 2), rng)
-    noisy = [edge(true, each.moving, each.fixed, rng, 20 * NOISE_PX) for each in good]
-    best = error_px(solve(40, good, 20, SHAPE).homographies, true, 20)
+    good = apart(true, (1, 2), rng)
+    noisy = [edge(true, each.moving, each.fixed, own=(rng, 20 * NOISE_PX)) for each in good]
+    best = error_px(solve(groups_of(40), good, 20, SHAPE).homographies, true, 20)
     edges = good + noisy
     if weighted_by == "residual_px":
         stds = np.repeat([NOISE_PX, 20 * NOISE_PX], len(good))
@@ -94,17 +96,17 @@ def test_solve_weights_edges_by_information_or_residual(weighted_by: str) -> Non
             Edge(each.moving, each.fixed, replace(each.motion, residual_px=std_px))
             for each, std_px in zip(without_information(edges), stds, strict=True)
         ]
-    weighted = error_px(solve(40, edges, 20, SHAPE).homographies, true, 20)
-    unweighted = error_px(solve(40, without_information(good + noisy), 20, SHAPE).homographies, true, 20)
+    weighted = error_px(solve(groups_of(40), edges, 20, SHAPE).homographies, true, 20)
+    unweighted = error_px(solve(groups_of(40), without_information(good + noisy), 20, SHAPE).homographies, true, 20)
     assert weighted < 1.2 * best
     assert unweighted > 1.5 * weighted
 
 
 def test_solve_drops_one_gross_outlier_at_any_edge() -> None:
     true, edges = graph(9)
-    clean = error_px(solve(9, edges, 4, SHAPE).homographies, true, 4)
+    clean = error_px(solve(groups_of(9), edges, 4, SHAPE).homographies, true, 4)
     for index, each in enumerate(edges):
-        solution = solve(9, [*edges[:index], moved(each, 40, -30), *edges[index + 1 :]], 4, SHAPE)
+        solution = solve(groups_of(9), [*edges[:index], moved(each, 40, -30), *edges[index + 1 :]], 4, SHAPE)
         assert solution.outliers == (index,)
         assert error_px(solution.homographies, true, 4) < 1.5 * clean
 
@@ -115,8 +117,8 @@ def test_solve_with_outliers_equals_solve_without_them() -> None:
     failure = Edge(5, 3, NotLocated("nothing to see"))
     edges[:0], edges[20:20] = [failure], [failure]
     wrong = {7: moved(edges[7], 3, 0), 30: moved(edges[30], 40, -30), 31: moved(edges[31], 0, 500)}
-    solution = solve(20, [wrong.get(index, each) for index, each in enumerate(edges)], 10, SHAPE)
-    without = solve(20, [each for index, each in enumerate(edges) if index not in wrong], 10, SHAPE)
+    solution = solve(groups_of(20), [wrong.get(index, each) for index, each in enumerate(edges)], 10, SHAPE)
+    without = solve(groups_of(20), [each for index, each in enumerate(edges) if index not in wrong], 10, SHAPE)
     assert solution.outliers == tuple(wrong)
     assert without.outliers == ()
     assert corner_displacements(solution.homographies, without.homographies, SHAPE).max() < 1e-3
@@ -133,7 +135,7 @@ def test_solve_keeps_outliers_if_graph_disconnects_without_them() -> None:
     """The last exposure has two pairs that are 40 px apart: either may be right, and the expected error includes both."""
     still = np.broadcast_to(np.eye(3), (21, 3, 3))
     edges = [*measured(still[:20], (1, 2)), moved(edge(still, 20, 19), 20, 0), moved(edge(still, 20, 19), -20, 0)]
-    solution = solve(21, without_information(edges), 10, SHAPE)
+    solution = solve(groups_of(21), without_information(edges), 10, SHAPE)
     assert solution.located.all()
     assert solution.outliers == ()
     assert error_px(solution.homographies, still, 10) < 1e-6
@@ -146,8 +148,8 @@ def test_solve_keeps_outliers_if_graph_disconnects_without_them() -> None:
 def test_solve_of_a_long_capture_does_not_depend_on_its_start(skips: tuple[int, ...], n: int) -> None:
     """Errors of 8 px a pair, as of blurred exposures: along skips of 8, paths to neighbours drift apart by far more."""
     true = true_motion(n)
-    edges = measured(true, skips, np.random.default_rng(0), 8.0)
-    found, expected = (solve(n, edges, n // 2, SHAPE, start) for start in (None, true))
+    edges = apart(true, skips, np.random.default_rng(0), 8.0)
+    found, expected = (solve(groups_of(n), edges, n // 2, SHAPE, start) for start in (None, true))
     assert found.residual_px == pytest.approx(expected.residual_px, rel=0.01)
     neighbours = inverse(found.homographies[:-1]) @ found.homographies[1:]
     assert corner_displacements(neighbours, inverse(true[:-1]) @ true[1:], SHAPE).mean() < 8
@@ -156,7 +158,7 @@ def test_solve_of_a_long_capture_does_not_depend_on_its_start(skips: tuple[int, 
 def test_solve_leaves_nodes_not_tied_to_the_anchor_unknown() -> None:
     true = true_motion(7)
     edges = [edge(true, 1, 0), edge(true, 2, 1), edge(true, 2, 0), Edge(3, 2, NotLocated("lost")), edge(true, 5, 4)]
-    solution = solve(7, edges, 1, SHAPE)
+    solution = solve(groups_of(7), edges, 1, SHAPE)
     np.testing.assert_array_equal(solution.located, [True, True, True, False, False, False, False])
     assert error_px(solution.homographies[:3], true[:3], 1) < 1e-9
     assert np.isnan(solution.homographies[3:]).all()
@@ -164,7 +166,7 @@ def test_solve_leaves_nodes_not_tied_to_the_anchor_unknown() -> None:
     assert (assessed.information.shape, assessed.std_px.shape) == ((3, 8, 8), (3,))
     assert np.isfinite(assessed.information).all()
     assert np.isfinite(assessed.std_px).all()
-    alone = solve(3, [], 2, SHAPE)
+    alone = solve(groups_of(3), [], 2, SHAPE)
     np.testing.assert_array_equal(alone.located, [False, False, True])
     np.testing.assert_array_equal(alone.homographies[2], np.eye(3))
     assert np.isnan(alone.homographies[:2]).all()
@@ -177,9 +179,9 @@ def test_solve_does_not_depend_on_the_unit_of_length() -> None:
     halved = [
         Edge(each.moving, each.fixed, replace(each.motion, homography=rescaled(each.motion.homography, 0.5))) for each in edges
     ]
-    whole = solve(20, edges, 10, SHAPE)
+    whole = solve(groups_of(20), edges, 10, SHAPE)
     # Rescaling keeps pixel edges in place, so that corner pixels are not quite the same points: to 1/1000 px it is one motion.
-    half = solve(20, halved, 10, (SHAPE[0] // 2, SHAPE[1] // 2))
+    half = solve(groups_of(20), halved, 10, (SHAPE[0] // 2, SHAPE[1] // 2))
     moved = inverse(whole.homographies) @ rescaled(half.homographies, 2)
     assert corner_displacements(moved, np.eye(3), SHAPE).max() < 1e-3
 
@@ -207,14 +209,14 @@ def test_solve_of_a_large_graph_takes_few_steps_with_sparse_factors(
 
     monkeypatch.setattr(adjustment, "splu", counting)
     true, rng = true_motion(300), np.random.default_rng(0)
-    edges = measured(true, (1, 2, 4), rng)
+    edges = apart(true, (1, 2, 4), rng)
     ends = np.sort(rng.choice(300, (closures, 2)))
     edges += [
         Edge(int(late), int(early), Located(normalised(inverse(true[early]) @ true[late])))
         for early, late in ends
         if late - early > 4
     ]
-    solve(300, edges, 150, SHAPE)
+    solve(groups_of(300), edges, 150, SHAPE)
     assert len(filled) <= 12
     assert max(filled) < 300 * 8**2 * most
 
@@ -240,7 +242,7 @@ def test_solve_is_finite_for_any_information() -> None:
     """Nearly singular systems are damped: nothing raises, and what is not determined is uncertain."""
     for seed in range(15):
         n_nodes, edges = any_edges(seed)
-        solution = solve(n_nodes, edges, 0, SHAPE)
+        solution = solve(groups_of(n_nodes), edges, 0, SHAPE)
         assessed = solution.assess()
         for each in (solution.homographies[solution.located], assessed.information, assessed.std_px):
             assert np.isfinite(each).all(), f"seed {seed}"
@@ -261,6 +263,6 @@ def test_singular_system_leaves_undetermined_unknowns_and_calls_them_uncertain()
 def test_start_of_the_graph_follows_exact_edges_in_both_directions() -> None:
     """Edges lead from each exposure to an earlier one, and the anchor is in the middle."""
     true, anchor = true_motion(9), 4
-    tied = _Tied.of(len(true), measured(true, (1,)), anchor, SHAPE)
+    tied = _Tied.of(groups_of(len(true)), measured(true, (1,)), anchor, SHAPE)
     start = normalised(tied.composed(tied.problem.observed))
     assert error_px(start, true, anchor) < 1e-6
