@@ -29,6 +29,7 @@ from .homographies import from_parameters as from_parameters
 from .homographies import generators as generators
 from .homographies import inverse as inverse
 from .homographies import jacobian as jacobian
+from .homographies import moving_corners as moving_corners
 from .homographies import normalised as normalised
 from .homographies import parameters as parameters
 from .homographies import patch_centres as patch_centres

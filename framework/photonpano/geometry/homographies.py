@@ -231,6 +231,19 @@ def slopes(mapped: FloatArray, changes: FloatArray) -> FloatArray:
     return np.asarray(np.moveaxis(d, -3, -1).swapaxes(-3, -2).reshape(*d.shape[:-3], -1, d.shape[-3]))
 
 
+def moving_corners(displacements: FloatArray, shape: tuple[int, int]) -> Homography:
+    """Return the homographies that move the corners of an image by small displacements, to first order.
+
+    Args:
+        displacements: (N, 8), x and y of each corner, in pixels.
+        shape: (height, width) of the image.
+    """
+    here = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
+    of_corners = slopes(here, generators(shape) @ here)
+    steps = np.linalg.solve(of_corners, displacements.T).T
+    return normalised(np.eye(3) + np.einsum("np,pij->nij", steps, generators(shape)))
+
+
 class FrameTrajectory:
     """A trajectory given at every frame: linear between frames, constant beyond the first and last.
 

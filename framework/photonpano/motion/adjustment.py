@@ -46,10 +46,15 @@ class Assessment:
     # (N, k, k) inverse covariances of the motion of each node while the others are held: of p1..p8 of its homography, or of a
     # rotation vector in its own frame. NaN for a single node.
     information: FloatArray
-    std_px: FloatArray  # (N,) expected error of the corners of each node, after the best alignment of the planes
+    errors_px: FloatArray  # (N, 8, S) errors of the corners of each node that were drawn, after the best alignment of the planes
     # (5,) expected errors of the camera that all nodes share: of its focal length in px, and of k1, k2, p1 and p2. They are 0
     # for what is given; () without a camera.
     std_camera: FloatArray
+
+    @property
+    def std_px(self) -> FloatArray:
+        """The expected error of the corners of each node: (N,)."""
+        return np.asarray(np.sqrt((self.errors_px**2).mean(axis=(1, 2)) * 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -225,9 +230,9 @@ class Adjustment(ABC, Generic[StateT]):
         below = jacobians[8 * n_edges :]
         right += below.T @ rng.normal(size=(below.shape[0], SAMPLES))
         changes[free] = _solved(normal[free][:, free], right[free], draws=True)
-        changes += self._common_errors(normal, free, int(kept.sum()), rng)
+        changes += self._common_errors(normal, free, float(weights.sum()), rng)
         std_camera = self.std_camera(state, changes[k * self._n_nodes :])
-        return Assessment(self.information(state, blocks), self._corner_std_px(state, changes), std_camera)
+        return Assessment(self.information(state, blocks), self._corner_errors_px(state, changes), std_camera)
 
     def _body_slopes(self, state: StateT) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives of the whitened residual of each edge by small motions of both its frames: (E, 8, 8) each."""
@@ -236,10 +241,10 @@ class Adjustment(ABC, Generic[StateT]):
         by_moving, by_fixed = relative[:, None] @ (moves @ self._rows), -moves @ mapped[:, None]
         return self._whitening @ slopes(mapped, by_moving), self._whitening @ slopes(mapped, by_fixed)
 
-    def _common_errors(self, normal: sparse.csr_array, free: BoolArray, n_edges: int, rng: np.random.Generator) -> FloatArray:
+    def _common_errors(self, normal: sparse.csr_array, free: BoolArray, n_pairs: float, rng: np.random.Generator) -> FloatArray:
         """Draw errors of the shared unknowns that all pairs have in common, and how the nodes follow: (k N + s, S).
 
-        Pairs average out their noise, but not what interpolation does to all of them alike.
+        Pairs, `n_pairs` by their weights, average out their noise, but not what interpolation does to all of them alike.
         """
         shared = np.arange(len(free))[len(free) - self._n_shared :]
         drawn = np.zeros((len(free), SAMPLES))
@@ -252,7 +257,7 @@ class Adjustment(ABC, Generic[StateT]):
         noise_px = np.median(
             np.sqrt(np.trace(np.linalg.pinv(self._whitening @ self._whitening.transpose(0, 2, 1)), axis1=1, axis2=2) / 8)
         )
-        times = np.sqrt(8 * n_edges) * _COMMON_PX / max(float(noise_px), _COMMON_PX)
+        times = np.sqrt(8 * n_pairs) * _COMMON_PX / max(float(noise_px), _COMMON_PX)
         values, vectors = np.linalg.eigh(covariances[shared])
         back = (vectors / np.sqrt(np.maximum(values, _TINY))) @ rng.normal(size=(len(shared), SAMPLES))
         return np.asarray(times * covariances @ back)
@@ -284,8 +289,8 @@ class Adjustment(ABC, Generic[StateT]):
         nodes = np.repeat(np.arange(self._n_nodes) != self._anchor, self._n_node)
         return np.concatenate([nodes, np.ones(self._n_shared, dtype=bool)])
 
-    def _corner_std_px(self, state: StateT, changes: FloatArray) -> FloatArray:
-        """Return the rms displacement of corners by (k N + s, S) changes, after the best alignment of planes: (N,)."""
+    def _corner_errors_px(self, state: StateT, changes: FloatArray) -> FloatArray:
+        """Return the displacements of corners by (k N + s, S) changes, after the best alignment of planes: (N, 8, S)."""
         homographies, k = self.homographies(state), self._n_node
         here = np.broadcast_to(self._rows, (self._n_nodes, 3, 4))
         to_corners = slopes(here, np.broadcast_to(self.generators(state) @ self._rows, (self._n_nodes, k, 3, 4)))
@@ -300,7 +305,7 @@ class Adjustment(ABC, Generic[StateT]):
         scale = np.linalg.norm(of_plane, axis=0)
         best = np.linalg.lstsq(of_plane / scale, errors, rcond=None)[0]
         remaining = errors - of_plane / scale @ best
-        return np.asarray(np.sqrt((remaining**2).reshape(self._n_nodes, -1).sum(axis=1) / (4 * remaining.shape[1])))
+        return np.asarray(remaining.reshape(self._n_nodes, 8, -1))
 
     def _residual_scale(self, norms: FloatArray, kept: BoolArray) -> float:
         """Return the robust scale of the whitened residuals: at least that of unit variance, which the information predicts."""

@@ -43,11 +43,16 @@ class LocatedLevel:
     # (N, 8, 8) inverse covariances of p1..p8 of each located exposure while the others are held, or (N, 3, 3) of its rotation
     # vector for a camera that only turns; None for a single exposure
     information: FloatArray | None
-    std_px: FloatArray  # (N,) expected error of the corners of each located exposure; NaN for a single one
+    errors_px: FloatArray  # (N, 8, S) errors of the corners of each located exposure that were drawn; NaN for a single one
     frame_shape: tuple[int, int]  # (height, width) of a frame
     std_camera: FloatArray  # (5,) expected errors of the camera, see `Assessment`
     rivals: Mapping[str, Rival]  # how well models of the motion explain the pairs, by their names
     ambiguity: Ambiguity | None = None  # pairs that fit the scene at more than one place; None where there are none
+
+    @property
+    def std_px(self) -> FloatArray:
+        """The expected error of the corners of each located exposure, (N,); NaN for a single one."""
+        return np.asarray(np.sqrt((self.errors_px**2).mean(axis=(1, 2)) * 2))
 
     @property
     def instants(self) -> FloatArray:
@@ -161,8 +166,8 @@ def locate(
         edges + closures,
         closures,
         solution,
-        assessed.information if len(assessed.std_px) > 1 else None,
-        assessed.std_px,
+        assessed.information if len(assessed.errors_px) > 1 else None,
+        assessed.errors_px,
         shape,
         assessed.std_camera,
         rivals,

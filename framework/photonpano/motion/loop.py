@@ -6,11 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
 from photonpano.capture import capture_of, seen_through
 from photonpano.contracts.loop import KNOTS, AttributedTrajectory, knot_errors, require_groups
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
+from photonpano.geometry import align_planes, corners, inverse, moving_corners, transform_points
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
 from photonpano.motion.gyroscope import Gyroscope
@@ -25,6 +29,9 @@ from photonpano.motion.tracking import starting_motion
 from photonpano.motion.uncertainty import Uncertainty
 from photonpano.values import FloatArray, FrameSpan, Group
 
+_DRAWS = 4  # errors of knots by which it is found how much of them an interpolator leaves
+_FEWEST_KNOTS = 8  # that an interpolator smooths
+_AROUND, _LEAST_LEFT = 9, 0.05  # knots over which that is averaged, and least share of the variance that is left
 _CENTRED = 2  # times that knots are moved to the instants of their exposures
 _SHRINKS = 0.75  # change of the motion by a level, over that by the level before, from which on it no longer converges
 
@@ -111,9 +118,9 @@ def estimate_motion(
             start = start and replace(start, timeline=timeline)
         exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start, known)
         located = locate(exposures, graph, context, model, start, gyroscope)
-        trajectory = interpolate(exposures, located, timeline, reference, corrected)
+        trajectory, std_px = interpolate(exposures, located, timeline, reference, corrected)
         require_agreement(ties_of(graph.tie, seen), groups, located.solution.located, trajectory)
-        uncertainty = Uncertainty(located, trajectory, previous, timeline)
+        uncertainty = Uncertainty(located, std_px, trajectory, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
         context.progress.note(_summary(results[-1]))
         context.on_level(results[-1])
@@ -138,8 +145,10 @@ def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]
 
 def interpolate(
     exposures: VirtualExposures, located: LocatedLevel, timeline: Timeline, reference: int, refined: Trajectory | None = None
-) -> Trajectory:
+) -> tuple[Trajectory, FloatArray]:
     """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate"), between cuts.
+
+    Return also its expected errors at these instants, (N,): an interpolator that smooths leaves a part of those of the exposures.
 
     An exposure shows the mean of its frames, which lies elsewhere than its instant if the motion within it was not what it was
     merged along. How far is known as soon as the motion is, so that the knots are moved there, and the motion is fitted again.
@@ -156,7 +165,20 @@ def interpolate(
         for _ in range(_CENTRED):
             knots = measured.moved(exposures.off_centre(trajectory)[located.solution.located])
             trajectory = _through(knots, exposures, located, timeline, reference, refined)
-    return trajectory
+        std_px = located.std_px
+        if len(std_px) < _FEWEST_KNOTS:
+            return trajectory, std_px
+        products = np.zeros((2, len(std_px)))
+        for errors in np.moveaxis(located.errors_px, -1, 0)[:_DRAWS]:
+            moved = knots.moved(moving_corners(errors, located.frame_shape))
+            answer = _through(moved, exposures, located, timeline, reference, refined).at(located.instants)
+            known = trajectory.at(located.instants)
+            answer = inverse(known) @ align_planes(answer, known, located.frame_shape) @ answer
+            here = corners(located.frame_shape)
+            products += (errors**2).sum(axis=1), ((transform_points(answer, here) - here).reshape(-1, 8) * errors).sum(axis=1)
+    # The covariance of what is smoothed with the errors of what it is made of is its variance (a Gaussian smoother).
+    before, after = uniform_filter1d(products, _AROUND, axis=1, mode="nearest")
+    return trajectory, std_px * np.sqrt(np.clip(after / np.maximum(before, np.finfo(float).tiny), _LEAST_LEFT, 1))
 
 
 def _through(

@@ -30,8 +30,18 @@ class Uncertainty:
     # homographies, and for a single exposure
     std_camera: FloatArray | None
 
-    def __init__(self, located: LocatedLevel, trajectory: Trajectory, previous: Trajectory | None, timeline: Timeline) -> None:
-        """Compare a level with the one before, None at the first; beyond a cut, nothing is known from the other side."""
+    def __init__(
+        self,
+        located: LocatedLevel,
+        std_px: FloatArray,
+        trajectory: Trajectory,
+        previous: Trajectory | None,
+        timeline: Timeline,
+    ) -> None:
+        """Compare a level with the one before, None at the first; beyond a cut, nothing is known from the other side.
+
+        `std_px` (N,) are the expected errors at the located instants, due to photon noise.
+        """
         turned, before = located.solution.rotations, camera_of_motion(previous)
         # A single exposure tells nothing of its camera.
         self.std_camera = located.std_camera if len(located.std_camera) else None
@@ -39,7 +49,7 @@ class Uncertainty:
             change = turned.camera.numbers - before.numbers
             self.std_camera = np.hypot(self.std_camera, _REMAINING_SHARE * change)
         self._instants = located.instants
-        self._std_px = located.std_px
+        self._std_px = std_px
         self._timeline = timeline
         shown = np.flatnonzero(timeline.shown)
         self._frames = shown[np.unique(np.linspace(0, len(shown) - 1, _COMPARED).round().astype(int))].astype(np.float64)
