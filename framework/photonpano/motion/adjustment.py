@@ -46,7 +46,7 @@ class Assessment:
     # (N, k, k) inverse covariances of the motion of each node while the others are held: of p1..p8 of its homography, or of a
     # rotation vector in its own frame. NaN for a single node.
     information: FloatArray
-    errors_px: FloatArray  # (N, 8, S) errors of the corners of each node that were drawn, after the best alignment of the planes
+    errors_px: FloatArray  # (N, 8, S) drawn errors of the corners of each node, after the best alignment of the planes
     # (5,) expected errors of the camera that all nodes share: of its focal length in px, and of k1, k2, p1 and p2. They are 0
     # for what is given; () without a camera.
     std_camera: FloatArray
@@ -201,8 +201,8 @@ class Adjustment(ABC, Generic[StateT]):
     def deviance(self, state: StateT, weights: FloatArray) -> float:
         """Return minus twice the logarithm of the marginal likelihood of a solution, up to a constant that all models share.
 
-        Unknowns are integrated out around it (Laplace), and each number that was estimated beside them costs the logarithm of how
-        many exposures tell it (Schwarz 1978). `weights` (E,) are the same for all models.
+        Unknowns are integrated out around it (Laplace), and each number that was estimated beside them costs the logarithm of
+        the number of exposures (Schwarz 1978). `weights` (E,) are the same for all models.
         """
         jacobians, residuals = self._linearised(state, weights)
         free = self._free(state)
@@ -317,7 +317,7 @@ class Adjustment(ABC, Generic[StateT]):
         return max(scale, MEDIAN_NORM)
 
     def weights(self, norms: FloatArray, kept: BoolArray) -> FloatArray:
-        """Return the weights of the edges, (E,): robust (Cauchy), in units of their residuals; 0 for those that are not kept."""
+        """Return the weights of the edges, (E,): robust (Cauchy), in units of their residuals; 0 if they are not kept."""
         scale = self._residual_scale(norms, kept)
         robust = cauchy_weights(norms, scale * CAUCHY) * (MEDIAN_NORM / scale) ** 2
         return np.asarray(np.where(kept, robust, 0.0) * self._noise.weights)
@@ -327,7 +327,7 @@ class Adjustment(ABC, Generic[StateT]):
         return transform_points(self.relative(state), self._corners)
 
     def beside(self, state: StateT) -> FloatArray:
-        """Return where patches of pairs lie beside where they are expected: (E, P, 2) px; meaningless for those that show nothing."""
+        """Return where patches lie beside where they are expected: (E, P, 2) px; meaningless for those that show nothing."""
         points = patch_centres(self._frame_shape)
         expected = transform_points(self.relative(state), points) + self.shifted_patches(state)
         patches = [np.zeros((len(points), 2)) if each.patches is None else each.patches.shifts for each in self._motions]
@@ -347,7 +347,7 @@ class Adjustment(ABC, Generic[StateT]):
         return np.asarray(np.linalg.norm(whitened, axis=1) / np.sqrt(8))
 
     def _linearised(self, state: StateT, weights: FloatArray) -> tuple[sparse.csr_array, FloatArray]:
-        """Return the weighted derivatives of the residuals, (8 E + m, k N + s), and the weighted residuals: edges, then prior."""
+        """Return the derivatives of the weighted residuals, (8 E + m, k N + s), and these: of edges, then of the prior."""
         jacobians, residuals = self._of_edges(state, weights)
         prior = self.prior(state)
         if not len(prior.residuals):

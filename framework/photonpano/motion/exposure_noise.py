@@ -20,12 +20,12 @@ _MOST_PAIRS = 16  # of an exposure that are compared
 class ExposureNoise:
     """How the exposures of a graph share the noise of their photons.
 
-    A pair errs by the noise of its two exposures, and by what it adds because it sees only the part of the scene that both show.
+    A pair errs by the noise of its two exposures, and by what it adds since it sees only the part of the scene that both show.
     """
 
     pairs: NDArray[np.integer]  # (E, 2) the moving and the fixed exposure of each pair
-    # (N, C) shares of N exposures in the noise of C spans of frames, between whose ends no exposure begins or ends; their squares
-    # add up to 1
+    # (N, C) shares of N exposures in the noise of C spans of frames, between whose ends no exposure begins or ends; their
+    # squares add up to 1
     shares: FloatArray
     # (E,) weights with which pairs count the photons of each exposure once, however many of them it is in, and however many
     # exposures hold its frames
@@ -66,8 +66,8 @@ class ExposureNoise:
     def _roots(self, moving: FloatArray, fixed: FloatArray) -> FloatArray:
         """Return roots of the covariances of the noise of the exposures: (N, 8, 8).
 
-        Half of the variance of a pair comes from each exposure. An exposure knows its motion at least as well as any of its pairs
-        shows it, in each direction.
+        Half of the variance of a pair comes from each exposure. An exposure knows its motion at least as well as any of its
+        pairs shows it, in each direction.
         """
         nodes = np.concatenate([self.pairs[:, 0], self.pairs[:, 1]])
         slopes = np.concatenate([moving, fixed])

@@ -143,7 +143,7 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
         fit = _fitted(tied, start, plane)
         if _in_front(fit.state.homographies, tied.frame_shape):
             fits[plane] = fit
-            if not fit.adjustment.turns(fit.state):
+            if isinstance(fit.adjustment, PlanarAdjustment) and not fit.adjustment.turns(fit.state):
                 return fits
     for rotation in model.rotations:
         if fits:
@@ -320,7 +320,8 @@ class _Tied:
     @property
     def problem(self) -> Problem:
         """The least-squares problem, without nodes that are not tied."""
-        anchor, spans = int(self.located[: self.anchor].sum()), [self.spans[node] for node in np.flatnonzero(self.located)]
+        anchor = int(self.located[: self.anchor].sum())
+        spans = [span for span, located in zip(self.spans, self.located, strict=True) if located]
         return Problem(self.compact_pairs, anchor, self.motions, self.frame_shape, self.instants[self.located], spans)
 
     def adjustment(self, model: MotionModel) -> PlanarAdjustment | RotationAdjustment:

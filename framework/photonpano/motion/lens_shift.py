@@ -29,7 +29,7 @@ class LensShift:
 
     @classmethod
     def of(cls, frame_shape: tuple[int, int], motions: Sequence[Located], counts: FloatArray) -> LensShift:
-        """Take the patches of pairs, which count as the (E,) `counts` say; without patches, those that both exposures see do."""
+        """Take the patches of pairs, with the weights `counts`, (E,); without patches, those that both exposures see."""
         (height, width), points = frame_shape, patch_centres(frame_shape)
         observed = np.array([motion.homography for motion in motions])
 

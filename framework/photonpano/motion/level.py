@@ -146,7 +146,8 @@ class VirtualExposures:
         It is the mean over the frames of each group, to first order.
         """
         shares = (np.arange(_SAMPLED) + 0.5) / _SAMPLED
-        instants = np.array([[g.span.start + share * len(g.span) - 0.5 for share in shares] + [g.reference] for g in self.groups])
+        inside = [[*(each.span.start + shares * len(each.span) - 0.5), each.reference] for each in self.groups]
+        instants = np.array(inside)
         along, shape = self.previous or self.start, (len(instants), _SAMPLED + 1, 3, 3)
         true = motion.at(instants.ravel()).reshape(shape)
         back = inverse(true[:, :-1]) @ true[:, -1:]

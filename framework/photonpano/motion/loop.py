@@ -148,7 +148,7 @@ def interpolate(
 ) -> tuple[Trajectory, FloatArray]:
     """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate"), between cuts.
 
-    Return also its expected errors at these instants, (N,): an interpolator that smooths leaves a part of those of the exposures.
+    Return also its expected errors at these instants, (N,): an interpolator that smooths leaves a part of those of exposures.
 
     An exposure shows the mean of its frames, which lies elsewhere than its instant if the motion within it was not what it was
     merged along. How far is known as soon as the motion is, so that the knots are moved there, and the motion is fitted again.
@@ -168,13 +168,11 @@ def interpolate(
         std_px = located.std_px
         if len(std_px) < _FEWEST_KNOTS:
             return trajectory, std_px
-        products = np.zeros((2, len(std_px)))
+        products, here, known = np.zeros((2, len(std_px))), corners(located.frame_shape), trajectory.at(located.instants)
         for errors in np.moveaxis(located.errors_px, -1, 0)[:_DRAWS]:
             moved = knots.moved(moving_corners(errors, located.frame_shape))
             answer = _through(moved, exposures, located, timeline, reference, refined).at(located.instants)
-            known = trajectory.at(located.instants)
             answer = inverse(known) @ align_planes(answer, known, located.frame_shape) @ answer
-            here = corners(located.frame_shape)
             products += (errors**2).sum(axis=1), ((transform_points(answer, here) - here).reshape(-1, 8) * errors).sum(axis=1)
     # The covariance of what is smoothed with the errors of what it is made of is its variance (a Gaussian smoother).
     before, after = uniform_filter1d(products, _AROUND, axis=1, mode="nearest")

@@ -49,7 +49,7 @@ class MotionModel:
 
     @property
     def rotations(self) -> tuple[MotionModel, ...]:
-        """The rotations that "auto" compares with homographies: without a lens, and with one unless that is known or asked for."""
+        """The rotations that "auto" compares with homographies: without a lens, and with one unless that is known."""
         rotation = replace(self, kind="rotation")
         if any(self.distortion) or self.finds_lens:
             return (rotation,)

@@ -1,10 +1,10 @@
-"""The motion graph of homographies: what they have beyond shift and roll is a random walk, as wide as the capture shows.
+"""The motion graph of homographies: what they do beyond shift and roll is a random walk, as wide as the capture shows.
 
-A homography has eight numbers; most cameras move by fewer. From each exposure to the next one in time, all motions shift and roll
-the image as they like. What else they do (zoom, two shears, two perspectives) is normally distributed, with a variance that grows
-with the time between both and is estimated from the pairs. Where nothing zooms, the variance goes to zero, and with it the number.
-A camera that turns changes perspective in proportion to the shift, by -1 / f^2: this coupling is estimated, too, and the walk is
-what lies beyond it.
+A homography has eight numbers; most cameras move by fewer. From each exposure to the next one in time, the image shifts and
+rolls by any amount. Its zoom, two shears and two perspectives are normally distributed, with variances that grow with the time
+between both exposures, and that are estimated from the pairs. Where nothing zooms, the variance of the zoom goes to zero, and
+with it the zoom. A camera that turns changes perspective in proportion to the shift, by -1 / f^2: this coupling is estimated,
+too, and the walk is what perspective does beyond it.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _PERSPECTIVE = slice(3, 5)  # of the walks
 _TERMS = 12  # of the exponential and the logarithmic series
 _HALVINGS = 2  # of a logarithm, by square roots, before its series
 _ROOTS = 8  # Newton steps of a square root
-# Standard deviations of a walk over the whole capture, in units of half a frame: at first, when robust weights must not blame pairs
-# for what the walk hinders; where the capture is too short to tell; and below which it is none (a thousandth of a pixel).
+# Standard deviations of a walk over the whole capture, in units of half a frame: at first, when robust weights must not blame
+# pairs for a motion that the prior hinders; where the capture is too short to tell; and below which it is none (1e-3 px).
 _FIRST, _ASSUMED, _NONE = 1.0, 0.02, 4e-6
 _FEWEST_STEPS = 6  # that tell how wide the walks are
 _ROUNDS, _MOST, _SETTLED = 20, 30.0, 0.05  # rounds of the estimate, most change of a variance in one, least that counts
@@ -176,7 +176,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         """Return the steps of the walks from each node to the next, and the coupling."""
         if not (parts := self._components(state)):
             return super().prior(state)
-        stds = np.concatenate([np.full(len(part.residuals), std) for part, std in zip(parts, np.sqrt(self.variances), strict=True)])
+        stds = np.repeat(np.sqrt(self.variances), [len(part.residuals) for part in parts])
         residuals = np.concatenate([part.residuals for part in parts]) / stds
         rows = sparse.csr_array(sparse.diags_array(1 / stds) @ sparse.vstack([part.slopes for part in parts]))
         times = self._n_walks * float(np.log(self._times).sum())
@@ -185,8 +185,8 @@ class PlanarAdjustment(Adjustment[Plane]):
     def learn(self, state: Plane, weights: FloatArray) -> bool:
         """Estimate the variances of the prior from pairs of these weights, (E,); return whether they changed.
 
-        Variance components of least squares (Foerstner 1979; MacKay 1992): the squares of what is estimated of the steps, over the
-        number of them that the pairs determine. The maximum of the marginal likelihood is where this changes nothing.
+        Variance components of least squares (Foerstner 1979; MacKay 1992): the sum of the squared steps, over the number of
+        them that the pairs determine. The marginal likelihood is largest where this changes nothing.
         """
         if not self._n_walks:
             return False
@@ -238,7 +238,8 @@ class PlanarAdjustment(Adjustment[Plane]):
         relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
         motions = logarithms(relative, self._frame_shape)
         back = np.linalg.pinv(self._basis)[_FREE:]  # from p1..p8 to the walks
-        earlier = _coordinates(inverse(relative)[:, None] @ generators(self._frame_shape) @ relative[:, None], self._frame_shape)
+        moves = generators(self._frame_shape)
+        earlier = _coordinates(inverse(relative)[:, None] @ moves @ relative[:, None], self._frame_shape)
         by_nodes = np.stack([-back @ np.swapaxes(earlier, 1, 2), np.broadcast_to(back, (n_steps, w, 8))], axis=2) @ self._basis
         steps, roots = motions @ back.T, 1 / np.sqrt(self._times)
         by_coupling = np.zeros((n_steps, w))
@@ -252,7 +253,7 @@ class PlanarAdjustment(Adjustment[Plane]):
             entries = (by_nodes[:, walk].reshape(n_steps, 2 * k) * roots[:, None]).ravel()
             slopes = sparse.csr_array((entries, (rows, columns)), shape=(n_steps, k * self._n_nodes))
             if self._n_shared:
-                slopes = sparse.csr_array(sparse.hstack([slopes, sparse.csr_array((by_coupling[:, [walk]] * roots[:, None]))]))
+                slopes = sparse.csr_array(sparse.hstack([slopes, sparse.csr_array(by_coupling[:, [walk]] * roots[:, None])]))
             parts.append(Prior(steps[:, walk] * roots, slopes))
         if self._n_shared:
             parts.append(Prior(np.array([state.coupling]), self._of_shared(np.ones((1, 1)))))

@@ -70,7 +70,8 @@ class RefinedMotion:
         back = inverse(known) @ known[middle] @ inverse(homographies[middle])
         found = scaled_ahead(back @ homographies)
         if rotations is not None:
-            return Knots(instants, found, information, Rotations(nearest_rotations(rotations.camera.rotations(found)), rotations.camera))
+            turned = nearest_rotations(rotations.camera.rotations(found))
+            return Knots(instants, found, information, Rotations(turned, rotations.camera))
         if information is not None:
             # The derivatives of p1..p8 of what was found by those of the homographies.
             changes = (back[:, None] @ (from_parameters(np.eye(8)) - np.eye(3))) / (back @ homographies)[:, None, 2:, 2:]

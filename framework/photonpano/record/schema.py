@@ -85,9 +85,9 @@ class LevelRecord(TypedDict):
     `groups` and `located` count virtual exposures, `pairs` and `failures` pairs of them; `located_by` counts located pairs by
     locator. `revisits` are loop closures. `contradictions` are located pairs that were dropped as outliers. `change_px` is the
     mean distance by which the level moved the corners of the frames, None at the first level; `std_px` is the expected corner
-    error, None where a single exposure was located. `camera` is that of a level whose camera turns, None where homographies were
-    fitted; `walks_px` is how far what these do beyond shift and roll moves the ends of a frame over the capture, and `rivals`
-    how well models explain the pairs. `seconds` has an entry for each stage.
+    error, None where a single exposure was located. `camera` is that of a level whose camera turns, None where homographies
+    were fitted; `walks_px` is how far zoom, shears and perspectives of these move the ends of a frame over the capture, and
+    `rivals` how well models explain the pairs. `seconds` has an entry for each stage.
     """
 
     level: int

@@ -22,12 +22,11 @@ _SCALES = np.logspace(-10, 10, 41)
 _NOISES = np.logspace(-16, 0, 129)
 _TINY = 1e-200  # floor on the noise variance, for knots that lie on a parabola exactly
 _MIN_INFORMATION = 1e-8  # floor on the information eigenvalues of a knot, relative to the largest
-_MAX_INFORMATION = 0.01**-2  # ceiling on them, 1 / px^2: better known numbers of a knot only spoil the equations by rounding errors
+_MAX_INFORMATION = 0.01**-2  # ceiling on them, in 1 / px^2: numbers that are known better spoil the equations by rounding
 # Orthonormal map from the corners' coordinates to modes in px: shift, twist, stretch, shear.
 _TO_MODES = np.kron(hadamard(4) / 2, np.eye(2))
 # the twists, which a shaking camera hardly excites: it changes perspective less than shift, roll and scale
 _QUIET = [2, 3]
-_STILL_PX = 1e-6  # range of a mode that does not move
 
 
 class SmoothingSplineInterpolator:
@@ -37,10 +36,10 @@ class SmoothingSplineInterpolator:
 
         sum of (y - f)' W (y - f)  +  sum over modes of (integral of the square of the third derivative of f) / scale,
 
-    where y are the modes of the motion of the frame's corners, in px. Each mode has its own scale. The scales, and a factor on
-    the covariances W^-1, are estimated by restricted maximum likelihood with white noise as the jerk. The factor is estimated
-    from the twists alone: in the other modes, motion that is too fast for the knots looks like noise. It is 1 for motions
-    without perspective, which have no twists.
+    where y are the modes of the motion of the frame's corners, in px. Each mode has its own scale, which is estimated by
+    restricted maximum likelihood with white noise as the jerk. Covariances W^-1 that are given are trusted. Without them, corners
+    have equal variances, which are estimated from the twists alone: in the other modes, motion that is too fast for the knots
+    looks like noise.
     """
 
     def __init__(self, config: InterpolatorConfig, frame_shape: tuple[int, int]) -> None:
