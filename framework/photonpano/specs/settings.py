@@ -92,8 +92,8 @@ class MotionSettings(Config):
         "auto",
         description="translation, euclidean (shift and roll), similarity (and zoom), affine or homography are for flat scenes, "
         "from the fewest numbers a frame to the most; rotation is for a camera that only turns, by any angle, about one focal "
-        "length; auto takes the one that explains the pairs of exposures at the price of its unknowns, with a lens if they "
-        "show one",
+        "length; auto takes homographies that do no more than the capture shows, or rotations where these are likelier, with a "
+        "lens if pairs show one",
     )
     start: Literal["none", "constant-velocity"] = Field(
         "none",
