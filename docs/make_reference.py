@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from photonpano import discover
 from photonpano.api.cli.app import app, commands
 from photonpano.api.cli.verbosity import PARAMETERS
 from photonpano.corrections import CORRECTIONS
-from photonpano.plugins import hookspecs
 from photonpano.plugins.registry import KINDS
 from photonpano.plugins.registry.description import config_rows
 from photonpano.specs.resolution import SETTINGS
@@ -60,8 +58,6 @@ def generated(what: str) -> str:
             return config_table(CORRECTIONS[name[0]])
         case "command":
             return command(name)
-        case "hook":
-            return hook(name[0])
         case "components":
             return components()
         case "functions":
@@ -144,12 +140,6 @@ def attributes(name: str) -> str:
 def first_sentence(documented: object) -> str:
     """Return the first paragraph of a docstring in one line."""
     return " ".join((inspect.getdoc(documented) or "").partition("\n\n")[0].split())
-
-
-def hook(name: str) -> str:
-    """Return the example of a hook, from its docstring."""
-    docstring = inspect.getdoc(getattr(hookspecs, name)) or ""
-    return textwrap.dedent(docstring.partition("Example:\n")[2]).strip()
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -112,7 +112,7 @@ LISTED: dict[str, tuple[tuple[str, ...], list[str]]] = {
     ),
     "commands": (("cli.md",), generated(*(f"command {name}" for name in commands()))),
     "functions": (("python.md",), [f"| `{name}(" for name in FUNCTIONS if name != "discover"]),
-    "hooks": (("plugins.md",), [*(f"`{name}`\n" for name in HOOKS), *generated(*(f"hook {name}" for name in HOOKS))]),
+    "hooks": (("plugins.md",), [f"\n## `{name}`\n" for name in HOOKS]),
 }
 
 

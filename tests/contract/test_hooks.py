@@ -1,4 +1,4 @@
-"""The examples in the docstrings of the hooks, which plugin authors copy, work."""
+"""The examples of the hooks on the page of the reference, which plugin authors copy, work."""
 
 from __future__ import annotations
 
@@ -20,6 +20,10 @@ from photonpano.testing import ExporterConformance, RefinerConformance, Renderer
 from photonpano.testing.conformance import Conformance
 
 pytestmark = pytest.mark.usefixtures("without_report")
+
+PAGE = "docs/reference/plugins.md"
+TEXT = (Path(__file__).parents[2] / PAGE).read_text(encoding="utf-8")
+SECTIONS = re.findall(r"^## `(photonpano_\w+)`\n(.*?)(?=^## |\Z)", TEXT, re.MULTILINE | re.DOTALL)
 
 HOOKS = {name: hook for name, hook in vars(hookspecs).items() if name.startswith("photonpano_")}
 KINDS = {
@@ -50,11 +54,10 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 
 
 def example_of(hook: str) -> types.ModuleType:
-    """Make a plugin of the example in the docstring of a hook."""
-    docstring = inspect.cleandoc(inspect.getdoc(HOOKS[hook]) or "")
-    (code,) = re.findall(r"```python\n(.*?)```", docstring, re.DOTALL)
+    """Make a plugin of the example in the section of a hook."""
+    (code,) = re.findall(r"^```python\n(.*?)^```$", dict(SECTIONS)[hook], re.MULTILINE | re.DOTALL)
     module = types.ModuleType(f"example_of_{hook}")
-    exec(compile(inspect.cleandoc(code), module.__name__, "exec"), vars(module))
+    exec(compile(code, module.__name__, "exec"), vars(module))
     return module
 
 
@@ -62,6 +65,17 @@ def test_every_hook_is_tested_here() -> None:
     assert set(HOOKS) == {*KINDS, *OBSERVED}
     assert {hook: kind for hook, (kind, _) in KINDS.items()} == {kind.hook: kind.name for kind in registry.KINDS.values()}
     assert set(OBSERVED) == set(OBSERVATION_HOOKS)
+
+
+def test_page_has_one_section_for_every_hook() -> None:
+    assert [name for name, _ in SECTIONS] == list(HOOKS)
+
+
+@pytest.mark.parametrize("hook", HOOKS)
+def test_docstring_is_short_and_points_to_section(hook: str) -> None:
+    docstring = inspect.getdoc(HOOKS[hook]) or ""
+    assert f"`{PAGE}#{hook}`" in docstring
+    assert len(docstring.splitlines()) <= 5
 
 
 @pytest.mark.parametrize("hook", KINDS)
@@ -73,9 +87,9 @@ def test_component_hook_has_no_arguments_and_complete_example(hook: str) -> None
 
 @pytest.mark.parametrize("hook", OBSERVED)
 def test_observation_hook_has_documented_arguments_and_complete_example(hook: str, capsys: pytest.CaptureFixture[str]) -> None:
-    docstring = inspect.getdoc(HOOKS[hook]) or ""
     arguments = list(inspect.signature(HOOKS[hook]).parameters)
-    assert re.findall(r"^    (\w+): ", docstring.partition("Args:\n")[2].partition("Example:")[0], re.MULTILINE) == arguments
+    table = dict(SECTIONS)[hook].partition("| Argument | |\n")[2].partition("\n\n")[0]
+    assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == arguments
     observation = observation_of(example_of(hook))
     assert set(ARGUMENTS[hook]) | {"directory"} == set(arguments)
     getattr(observation, hook)(directory=Path("runs/scan"), **ARGUMENTS[hook])

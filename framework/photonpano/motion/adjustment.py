@@ -194,6 +194,11 @@ class Adjustment(ABC, Generic[StateT]):
         """How many numbers are to be found."""
         return self._n_node * (self._n_nodes - 1) + self._n_shared
 
+    @property
+    def price(self) -> float:
+        """By how much a shared number must lower the deviance: the logarithm of what was measured (Schwarz 1978)."""
+        return float(np.log(8 * len(self._moving)))
+
     def chi2(self, norms: FloatArray, kept: BoolArray) -> float:
         """Return the mean square of the whitened residuals of the edges that are kept, given their (E,) norms."""
         return float((norms[kept] ** 2).mean())
@@ -201,15 +206,15 @@ class Adjustment(ABC, Generic[StateT]):
     def deviance(self, state: StateT, weights: FloatArray) -> float:
         """Return minus twice the logarithm of the marginal likelihood of a solution, up to a constant that all models share.
 
-        Unknowns are integrated out around it (Laplace), and each number that was estimated beside them costs the logarithm of
-        the number of exposures (Schwarz 1978). `weights` (E,) are the same for all models.
+        Unknowns are integrated out around it (Laplace), and each number that was estimated beside them has its price. `weights`
+        (E,) are the same for all models.
         """
         jacobians, residuals = self._linearised(state, weights)
         free = self._free(state)
         factors = factorised((jacobians.T @ jacobians)[free][:, free])
         determinant = float(np.log(np.abs(factors.U.diagonal())).sum())
-        price = self.n_hyperparameters * float(np.log(max(self._n_nodes - 1, 1)))
-        return float(residuals @ residuals) + self.prior(state).log_variances + determinant + price
+        known = self.prior(state).log_variances + self.n_hyperparameters * self.price
+        return float(residuals @ residuals) + determinant + known
 
     def assess(self, state: StateT, norms: FloatArray, kept: BoolArray) -> Assessment:
         """Return the information on each node while the others are held, and the expected error of its corners.

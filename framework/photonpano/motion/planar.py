@@ -38,10 +38,10 @@ _TERMS = 12  # of the exponential and the logarithmic series
 _HALVINGS = 2  # of a logarithm, by square roots, before its series
 _ROOTS = 8  # Newton steps of a square root
 # Standard deviations of a walk over the whole capture, in units of half a frame: at first, when robust weights must not blame
-# pairs for a motion that the prior hinders; where the capture is too short to tell; and below which it is none (1e-3 px).
-_FIRST, _ASSUMED, _NONE = 1.0, 0.02, 4e-6
-_FEWEST_STEPS = 6  # that tell how wide the walks are
-_ROUNDS, _MOST, _SETTLED = 20, 30.0, 0.05  # rounds of the estimate, most change of a variance in one, least that counts
+# pairs for a motion that the prior hinders; where the capture is too short to tell; and below which it is none (0.005 px).
+_FIRST, _ASSUMED, _NONE = 1.0, 0.02, 2e-5
+_FEWEST_STEPS = 3  # that tell how wide the walks are
+_ROUNDS, _MOST, _SETTLED = 12, 6.0, 0.1  # rounds; most change of the logarithm of a variance in one, and least that counts
 _DRAWS = 24  # by which the variances' degrees of freedom are estimated
 
 
@@ -138,6 +138,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         self._times = np.maximum(np.diff(problem.instants), 1.0)
         self._durations = np.array([max(float(self._times.sum()), 1.0)] * self._n_walks + [1.0] * self._n_shared)
         self.variances = _FIRST**2 / self._durations
+        self._of_coupling = np.inf  # variance of the estimated coupling
 
     @property
     def _n_node(self) -> int:
@@ -191,7 +192,10 @@ class PlanarAdjustment(Adjustment[Plane]):
         if not self._n_walks:
             return False
         if len(self._times) < _FEWEST_STEPS:
-            self.variances = _ASSUMED**2 / self._durations
+            assumed = np.where(np.arange(len(self._durations)) < self._n_walks, _ASSUMED, _NONE)
+            changed = assumed**2 / self._durations != self.variances
+            self.variances = assumed**2 / self._durations
+            return bool(changed.any())
             return True
         before, free, rng = self.variances, self._free(state), np.random.default_rng(0)
         jacobians, residuals = self._of_edges(state, weights)
@@ -205,7 +209,7 @@ class PlanarAdjustment(Adjustment[Plane]):
             part.slopes.T @ np.column_stack([part.residuals, rng.normal(size=(len(part.residuals), _DRAWS))]) for part in parts
         ]
         alone = np.zeros((right.shape[0], 1))
-        alone[-1] = self._n_shared
+        alone[-1], last = self._n_shared, np.zeros(len(parts))
         for _ in range(_ROUNDS):
             whole = normal + sum(square / variance for square, variance in zip(squares, self.variances, strict=True))
             scales = np.ones((len(parts), _DRAWS + 1)) / np.sqrt(self.variances)[:, None]
@@ -218,17 +222,19 @@ class PlanarAdjustment(Adjustment[Plane]):
                 left = part.residuals - moves[:, 0]
                 unsure = (moves[:, 1:-1] ** 2).sum() / _DRAWS if index < self._n_walks else changes[-1, -1]
                 found[index] = (left @ left) / max(number - unsure / variance, 1e-3 * number)
-            found = np.clip(found, self.variances / _MOST, self.variances * _MOST)
-            found = np.maximum(found, _NONE**2 / self._durations)
-            settled = np.abs(np.log(found / self.variances)).max() < _SETTLED
-            self.variances = found
-            if settled:
+            # Steps that go on in one direction, as those to zero, are doubled.
+            self._of_coupling = float(changes[-1, -1])
+            step = np.log(found / self.variances)
+            step, last = np.clip(np.where(step * last > 0, 2 * step, step), -_MOST, _MOST), step
+            step = np.maximum(step, np.log(_NONE**2 / self._durations / self.variances))
+            self.variances = self.variances * np.exp(step)
+            if np.abs(step).max() < _SETTLED:
                 break
         return bool(np.abs(np.log(self.variances / before)).max() > _SETTLED)
 
     def turns(self, state: Plane) -> bool:
-        """Return whether perspective changes with the shift as for a camera that turns."""
-        return bool(self._n_shared and state.coupling < 0 and self.variances[-1] > _NONE**2)
+        """Return whether perspective changes with the shift as for a camera that turns, by more than noise (Schwarz 1978)."""
+        return bool(self._n_shared and state.coupling < 0 and self.variances[-1] > self._of_coupling * self.price)
 
     def _components(self, state: Plane) -> list[Prior]:
         """Return the steps of each walk beyond the coupling, over the roots of their times; and the coupling."""

@@ -155,7 +155,10 @@ def level_record(result: LevelResult) -> LevelRecord:
         "std_px": mean_px if np.isfinite(mean_px) else None,
         "residual_px": located.solution.residual_px,
         "camera": _camera_record(result),
-        "evidence": {name: RivalRecord(chi2=chi2, unknowns=n, deviance=more) for name, (chi2, n, more) in located.rivals.items()},
+        "evidence": {
+            name: RivalRecord(chi2=chi2, unknowns=number, deviance=more)
+            for name, (chi2, number, more) in located.rivals.items()
+        },
         "walks_px": dict(located.solution.walks_px),
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
     }

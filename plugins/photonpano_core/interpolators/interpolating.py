@@ -16,7 +16,6 @@ from photonpano_core.interpolators.sl3 import exponential, logarithm, unimodular
 
 DEGREE = 3
 MAX_ITERATIONS = 50
-_BENT = 0.25  # share of the time beyond its ends for which a spline keeps its acceleration: half of the distance of its knots
 TOLERANCE_PX = 1e-7  # converged when the residual of the knots, at the corners of the frame, is below this
 
 
@@ -117,20 +116,19 @@ class HeldTrajectory(ABC):
 
 
 class SplinePath(HeldTrajectory):
-    """A spline of K numbers; `at` returns these, (N, K). Beyond its ends, it first keeps its acceleration, too."""
+    """A spline of K numbers; `at` returns these, (N, K)."""
 
-    def __init__(self, instants: FloatArray, spline: BSpline, hold_frames: float | None) -> None:
+    def __init__(self, instants: FloatArray, spline: BSpline, hold_frames: float | None, bent: float = 0.0) -> None:
+        """Take a spline, which beyond its ends keeps its acceleration, too, for a share `bent` of the time that is held."""
         super().__init__(instants, hold_frames)
         self._spline = spline
-        self._velocity = spline.derivative()
-        self._acceleration = spline.derivative(min(2, spline.k))
+        self._velocity, self._acceleration = spline.derivative(), spline.derivative(min(2, spline.k))
+        self._bent = bent * self._hold if spline.k > 1 else 0.0
 
     def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
-        found = self._spline(inside) + self._velocity(inside) * beyond[:, None]
-        if self._spline.k < 2:
-            return np.asarray(found)
-        bent = np.clip(beyond, -self._hold * _BENT, self._hold * _BENT)
-        return np.asarray(found + self._acceleration(inside) * (bent * (beyond - bent / 2))[:, None])
+        bent = np.clip(beyond, -self._bent, self._bent)
+        straight = self._spline(inside) + self._velocity(inside) * beyond[:, None]
+        return np.asarray(straight + self._acceleration(inside) * (bent * (beyond - bent / 2))[:, None])
 
 
 class ParameterTrajectory(SplinePath):

@@ -20,6 +20,7 @@ ORDER = 3  # of the derivative that is penalised: parabolas, which fit any three
 _SCALES = np.logspace(-10, 10, 41)
 # Candidates for the noise variance, relative to the squared distance of the quiet modes from a parabola.
 _NOISES = np.logspace(-16, 0, 129)
+_BENT = 0.25  # share of the time held beyond the ends in which a spline is a parabola: half of the distance of its knots
 _TINY = 1e-200  # floor on the noise variance, for knots that lie on a parabola exactly
 _MIN_INFORMATION = 1e-8  # floor on the information eigenvalues of a knot, relative to the largest
 _MAX_INFORMATION = 0.01**-2  # ceiling on them, in 1 / px^2: numbers that are known better spoil the equations by rounding
@@ -37,9 +38,9 @@ class SmoothingSplineInterpolator:
         sum of (y - f)' W (y - f)  +  sum over modes of (integral of the square of the third derivative of f) / scale,
 
     where y are the modes of the motion of the frame's corners, in px. Each mode has its own scale, which is estimated by
-    restricted maximum likelihood with white noise as the jerk. Covariances W^-1 that are given are trusted. Without them, corners
-    have equal variances, which are estimated from the twists alone: in the other modes, motion that is too fast for the knots
-    looks like noise.
+    restricted maximum likelihood with white noise as the jerk. Covariances W^-1 that are given are trusted. Without them,
+    corners have equal variances, which are estimated from the twists alone: in the other modes, motion that is too fast for the
+    knots looks like noise.
     """
 
     def __init__(self, config: InterpolatorConfig, frame_shape: tuple[int, int]) -> None:
@@ -51,7 +52,8 @@ class SmoothingSplineInterpolator:
         """Smooth; without information, corners have equal, independent errors. Up to three knots are interpolated."""
         if len(instants) > ORDER:
             homographies = self._smoothed(instants, homographies, information)
-        return ParameterTrajectory(instants, interpolating_spline(instants, parameters(homographies)), self._config.hold_frames)
+        spline = interpolating_spline(instants, parameters(homographies))
+        return ParameterTrajectory(instants, spline, self._config.hold_frames, _BENT)
 
     def fit_turns(
         self, instants: FloatArray, turns: FloatArray, information: FloatArray | None
@@ -67,7 +69,7 @@ class SmoothingSplineInterpolator:
                 covariances = np.asarray(np.linalg.inv(information))
             noise = None if information is None else 1.0
             turns = _smoothed_modes(instants, turns, covariances, range(3), noise)
-        return SplinePath(instants, interpolating_spline(instants, turns), self._config.hold_frames).at
+        return SplinePath(instants, interpolating_spline(instants, turns), self._config.hold_frames, _BENT).at
 
     def _smoothed(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> FloatArray:
         """Return the smoothed (N, 3, 3) homographies of the knots."""

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from photonpano.motion.evidence import Evidence, Rival
 
 from photonpano import FrameSpan
 from photonpano.geometry import Camera
-from photonpano.motion.evidence import Evidence, Rival
 from photonpano.motion.graph import Freed
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED, UNCUT_JUMP

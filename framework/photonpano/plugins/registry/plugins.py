@@ -11,14 +11,13 @@ from photonpano.errors import PluginError, described
 from photonpano.execution.interrupts import is_interrupt
 from photonpano.plugins import hookspecs
 from photonpano.plugins.contributions import API_VERSION, KINDS, PROJECT, Contribution, Kind
-from photonpano.plugins.hookspecs import observation
 from photonpano.text import listed
 
 PREFIX = f"{PROJECT}_"
-# The hooks that offer nothing: a run calls them, so that a plugin can watch it.
-OBSERVATION_HOOKS = tuple(name for name in vars(observation) if name.startswith(PREFIX))
 # All hooks: those that offer components, in the order in which a run needs these, and those that watch.
-HOOKS = (*(kind.hook for kind in KINDS.values()), *OBSERVATION_HOOKS)
+HOOKS = tuple(name for name in vars(hookspecs) if name.startswith(PREFIX))
+# The hooks that offer nothing: a run calls them, so that a plugin can watch it.
+OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for kind in KINDS.values()})
 MAX_OFFERED = 1000  # maximum number of components of a hook
 
 

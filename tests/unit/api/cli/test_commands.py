@@ -36,7 +36,7 @@ def test_info_group_size_is_that_of_run(cube: Path, invoke: Callable[..., Any]) 
     assert invoke("run", "scan.yaml").exit_code == 0
     decisions = json.loads((cube.parent / "runs" / "scan" / "run.json").read_text())["decisions"]
     found = {each["what"]: (each["value"], each["reason"]) for each in decisions}
-    assert found.pop("motion_model")[0] == "translation"  # the pan of this capture
+    assert found.pop("motion_model")[0] == "homography"
     assert found.pop("chunk_frames")[0] <= 10  # frames that move less than 1 px
     assert found == {
         "source": ("packed-npy", facts["reason"]),
