@@ -15,6 +15,7 @@ from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators.sl3 import exponential, logarithm, unimodular
 
 DEGREE = 3
+_FEWEST_BENT = 6  # knots that show whether accelerations predict anything
 MAX_ITERATIONS = 50
 TOLERANCE_PX = 1e-7  # converged when the residual of the knots, at the corners of the frame, is below this
 
@@ -119,16 +120,25 @@ class SplinePath(HeldTrajectory):
     """A spline of K numbers; `at` returns these, (N, K)."""
 
     def __init__(self, instants: FloatArray, spline: BSpline, hold_frames: float | None, bent: float = 0.0) -> None:
-        """Take a spline, which beyond its ends keeps its acceleration, too, for a share `bent` of the time that is held."""
+        """Take a spline, which beyond its ends keeps its acceleration, too, for a share `bent` of the time that is held.
+
+        It keeps it as far as accelerations predict anything: by the share of the second differences of its values, at the mean
+        distance of the knots, that third differences do not have. A motion that trembles faster has no such share.
+        """
         super().__init__(instants, hold_frames)
-        self._spline = spline
-        self._velocity, self._acceleration = spline.derivative(), spline.derivative(min(2, spline.k))
-        self._bent = bent * self._hold if spline.k > 1 else 0.0
+        self._spline, self._velocity = spline, spline.derivative()
+        self._acceleration, self._bent = None, bent * self._hold
+        if bent and len(instants) >= _FEWEST_BENT:
+            values = spline(np.linspace(self._first, self._last, len(instants)))
+            second, third = ((np.diff(values, order, axis=0) ** 2).mean(axis=0) for order in (2, 3))
+            self._acceleration = np.clip(1 - third / np.maximum(second, np.finfo(float).tiny), 0, 1), spline.derivative(2)
 
     def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
-        bent = np.clip(beyond, -self._bent, self._bent)
-        straight = self._spline(inside) + self._velocity(inside) * beyond[:, None]
-        return np.asarray(straight + self._acceleration(inside) * (bent * (beyond - bent / 2))[:, None])
+        found = self._spline(inside) + self._velocity(inside) * beyond[:, None]
+        if self._acceleration is None:
+            return np.asarray(found)
+        (share, acceleration), bent = self._acceleration, np.clip(beyond, -self._bent, self._bent)
+        return np.asarray(found + share * acceleration(inside) * (bent * (beyond - bent / 2))[:, None])
 
 
 class ParameterTrajectory(SplinePath):

@@ -1,17 +1,16 @@
 """The verdict: each test finds the residuals that were made for it, and nothing else; photon noise is trusted."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from photonpano.motion.evidence import Evidence, Rival
 
 from photonpano import FrameSpan
 from photonpano.geometry import Camera
-from photonpano.motion.graph import Freed
+from photonpano.motion.graph import Freed, Rival
 from photonpano.motion.model import MotionModel
 from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED, UNCUT_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
@@ -224,7 +223,7 @@ UNINFORMED = Located(np.eye(3))
 
 def level_with(
     rotations: object | None = None,
-    evidence: Evidence | None = None,
+    rivals: Mapping[str, Rival] | None = None,
     n_ambiguous: int = 0,
     motion: Located = UNINFORMED,
     change_px: float | None = None,
@@ -233,20 +232,27 @@ def level_with(
     """A level of 30 pairs."""
     pairs = tuple((index + 1, index) for index in range(n_ambiguous))
     ambiguity = Ambiguity(1, pairs, 40.0) if pairs else None
-    known = {"rotations": rotations, "outliers": (), "model": MotionModel("rotation"), "freed": lambda: None, "parallax": 0.0}
+    known = {
+        "rotations": rotations,
+        "walks_px": {"zoom": 1.0},
+        "outliers": (),
+        "model": MotionModel("rotation"),
+        "freed": lambda: None,
+        "parallax": 0.0,
+    }
     solution = SimpleNamespace(**known | of_solution)
     edges = (Edge(1, 0, motion),) * 30
-    located = SimpleNamespace(ambiguity=ambiguity, evidence=evidence, edges=edges, solution=solution, frame_shape=SHAPE)
+    located = SimpleNamespace(ambiguity=ambiguity, rivals=rivals or {}, edges=edges, solution=solution, frame_shape=SHAPE)
     return SimpleNamespace(level=SimpleNamespace(number=1), located=located, change_px=change_px)
 
 
-@pytest.mark.parametrize(("rotation", "gain", "doubtful"), [(1.2, 1.1, False), (25.0, 3.0, True), (4.0, 40.0, True)])
+@pytest.mark.parametrize(("rotation", "deviance", "doubtful"), [(1.2, 0.0, False), (25.0, 0.0, True), (4.0, 40.0, True)])
 def test_rotations_that_do_not_explain_the_pairs_are_doubtful(
-    explained: Explained, rotation: float, gain: float, doubtful: bool
+    explained: Explained, rotation: float, deviance: float, doubtful: bool
 ) -> None:
-    """Either the residuals are large, or those of homographies are much smaller."""
-    evidence = Evidence({"homography": Rival(1.0, 232, 0.0), "rotation": Rival(rotation, 88, gain)})
-    reasons = judge(explained, [level_with(object(), evidence)]).reasons
+    """Either the residuals are large, or homographies are likelier."""
+    rivals = {"homography": Rival(1.0, 232, 0.0), "rotation": Rival(rotation, 88, deviance)}
+    reasons = judge(explained, [level_with(object(), rivals)]).reasons
     assert [(reason.what, reason.figure) for reason in reasons] == [(NO_TURN, np.sqrt(rotation))] * doubtful
 
 
@@ -277,9 +283,9 @@ def test_advice_is_not_what_the_run_does_already(
     monkeypatch.setattr(
         "photonpano.residuals.residual_tests.distorting_lens", lambda _: LensDistortion(-0.1, 0.005, np.zeros((1, 2)))
     )
-    evidence = Evidence({"homography": Rival(1.0, 232, 0.0), "rotation": Rival(25.0, 88, 3.0)})
+    rivals = {"homography": Rival(1.0, 232, 0.0), "rotation": Rival(25.0, 88, 3.0)}
     run = replace(explained, motion=replace(explained.motion, camera=camera))
-    found = {reason.what: reason.what_to_do for reason in judge(run, [level_with(object(), evidence)]).reasons}
+    found = {reason.what: reason.what_to_do for reason in judge(run, [level_with(object(), rivals)]).reasons}
     assert found == {"the lens distorts the frames, which bends the motion": lens, NO_TURN: turn}
 
 
