@@ -52,14 +52,19 @@ class Knowing:
 
 
 class Knots:
-    """Linear between the knots, element by element."""
+    """Linear between the knots, element by element, and beyond them."""
 
     def __init__(self, instants: np.ndarray, homographies: np.ndarray) -> None:
-        self._instants, self._rows = instants, homographies.reshape(-1, 9).T
+        self._instants, self._knots = instants, homographies
 
     def at(self, frame_indices: Any) -> np.ndarray:
         frames = np.atleast_1d(frame_indices)
-        return np.stack([np.interp(frames, self._instants, row) for row in self._rows], axis=-1).reshape(-1, 3, 3)
+        if len(self._instants) == 1:
+            return np.repeat(self._knots, len(frames), axis=0)
+        before = np.clip(np.searchsorted(self._instants, frames) - 1, 0, len(self._instants) - 2)
+        first, last = self._instants[before], self._instants[before + 1]
+        share = ((frames - first) / (last - first))[:, None, None]
+        return (1 - share) * self._knots[before] + share * self._knots[before + 1]
 
 
 class Linear:

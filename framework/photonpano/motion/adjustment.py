@@ -28,6 +28,7 @@ NO_WORSE = 1e-6  # relative increase of the cost by rounding errors
 CAUCHY = 2.385
 OUTLIER = 8.0  # residual of an outlier, in scales of the residuals
 MEDIAN_NORM = 0.958  # the median of the root mean square of eight Gaussian numbers of unit variance
+_UNKNOWN_NORM = 1e-3 * MEDIAN_NORM  # least scale of the residuals of edges that say nothing of their errors
 # Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by.
 _DAMPING, _TINY = 1e-10, 1e-200
 SAMPLES = 64  # solutions drawn to estimate the expected error of each node, to a few per cent
@@ -104,6 +105,7 @@ class Adjustment(ABC, Generic[StateT]):
         self._targets = transform_points(problem.observed, self._corners)
         self._whitening = _whitening(problem.motions, self._rows)
         self._motions = problem.motions
+        self._informed = any(each.information is not None or each.residual_px for each in problem.motions)
         self._noise = ExposureNoise.of(problem.pairs, problem.spans)
 
     @abstractmethod
@@ -312,19 +314,19 @@ class Adjustment(ABC, Generic[StateT]):
         remaining = errors - of_plane / scale @ best
         return np.asarray(remaining.reshape(self._n_nodes, 8, -1))
 
-    def _residual_scale(self, norms: FloatArray, kept: BoolArray) -> float:
+    def _residual_scale(self, norms: FloatArray, kept: BoolArray, least: float = MEDIAN_NORM) -> float:
         """Return the robust scale of the whitened residuals: at least that of unit variance, which the information predicts."""
         # Each node absorbs some of the residuals; the redundant ones determine the scale. The median alone would be too
         # small where robust weights make half of the edges fit exactly.
         n_edges = int(kept.sum())
         redundancy = n_edges - self.unknowns / 8
         scale = float(np.median(norms[kept])) * float(np.sqrt(n_edges / redundancy)) if redundancy > 0 else 0.0
-        return max(scale, MEDIAN_NORM)
+        return max(scale, least)
 
     def weights(self, norms: FloatArray, kept: BoolArray) -> FloatArray:
         """Return the weights of the edges, (E,): robust (Cauchy), in units of their residuals; 0 if they are not kept."""
-        scale = self._residual_scale(norms, kept)
-        robust = cauchy_weights(norms, scale * CAUCHY) * (MEDIAN_NORM / scale) ** 2
+        robust = cauchy_weights(norms, self._residual_scale(norms, kept) * CAUCHY)
+        robust *= (MEDIAN_NORM / self._residual_scale(norms, kept, MEDIAN_NORM if self._informed else _UNKNOWN_NORM)) ** 2
         return np.asarray(np.where(kept, robust, 0.0) * self._noise.weights)
 
     def mapped_corners(self, state: StateT) -> FloatArray:

@@ -224,7 +224,7 @@ class PlanarAdjustment(Adjustment[Plane]):
                 found[index] = (left @ left) / max(number - unsure / variance, 1e-3 * number)
             # Steps that go on in one direction, as those to zero, are doubled.
             self._of_coupling = float(changes[-1, -1])
-            step = np.log(found / self.variances)
+            step = np.log(np.maximum(found / self.variances, np.exp(-_MOST)))
             step, last = np.clip(np.where(step * last > 0, 2 * step, step), -_MOST, _MOST), step
             step = np.maximum(step, np.log(_NONE**2 / self._durations / self.variances))
             self.variances = self.variances * np.exp(step)

@@ -166,7 +166,7 @@ def test_right_closures_stop_the_drift_although_others_are_refused(run: Callable
     found = run(level(answer))
     assert pairs_of(found.failures) == [pair for pair in PAIRS if pair[0] % 2]
     assert found.solution.outliers == ()
-    assert drift_px(found) < 0.15
+    assert drift_px(found) < 0.2
 
 
 def test_closure_that_no_locator_locates_keeps_its_reason(run: Callable, level: Callable) -> None:
