@@ -111,25 +111,9 @@ def test_pairs_of_a_still_camera_scatter_as_expected() -> None:
     assert [(edge.moving, edge.fixed, edge.locator) for edge in edges[:2]] == [(1, 0, GYROSCOPE), (2, 1, GYROSCOPE)]
 
 
-def test_a_graph_of_the_gyroscope_alone_drifts_by_its_expected_error() -> None:
-    gyroscope = gyroscope_of(np.array([0.1, 0.6, -0.2]), np.deg2rad(0.01), np.deg2rad(0.3))
-    edges, model = gyroscope.edges(GROUPS), MotionModel("rotation", FOCAL_PX)
-    solution = solve(
-        len(GROUPS), edges, len(GROUPS) // 2, SHAPE, gyroscope.trajectory(0).at([each.reference for each in GROUPS]), model
-    )
-    assert solution.located.all()
-    assert solution.residual_px < 1e-6
-    std_px = solution.assess().std_px
-    # Over half of the capture: 0.3 deg/s of bias, and 1 % of the turn, about each axis.
-    turns = np.hypot(np.deg2rad(0.3), 0.01 * np.array([0.1, 0.6])) * 0.95
-    assert std_px.max() < 2 * FOCAL_PX * np.linalg.norm(turns)
-    assert std_px.max() > 0.2 * FOCAL_PX * np.linalg.norm(turns)
-    assert gyroscope.agreement(edges, solution, 0.05).reason.startswith("of what pairs of exposures show of rotations, 100% is")
-
-
 def test_rates_that_contradict_the_images_are_refused() -> None:
     seen, other = gyroscope_of(np.array([0.1, 0.6, 0.0])), gyroscope_of(np.array([0.3, -0.4, 0.0]), np.deg2rad(0.01))
-    located = solve(len(GROUPS), seen.edges(GROUPS), 0, SHAPE, None, MotionModel("rotation", FOCAL_PX))
+    located = solve(GROUPS, seen.edges(GROUPS), 0, SHAPE, None, MotionModel("rotation", FOCAL_PX))
     assert all(isinstance(edge.motion, Located) for edge in other.edges(GROUPS))
     with pytest.raises(
         InputError, match=r"imu.csv: the rates contradict the images by \d\.?\d* px from one exposure to the next"

@@ -8,8 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from photonpano.geometry import align_planes, corner_displacements, inverse, normalised
-from photonpano.motion.graph import solve
-from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.planar import PLANAR_NAMES, PlanarName, basis_of, moved, nearest
 from photonpano.values import Edge
 
@@ -57,49 +55,3 @@ def test_steps_that_follow_each_other_add_up() -> None:
     basis = basis_of("euclidean")
     step = np.array([[0.1, -0.05, 0.3]])
     np.testing.assert_allclose(moved(moved(np.eye(3)[None], step, basis, SHAPE), -step, basis, SHAPE)[0], np.eye(3), atol=1e-12)
-
-
-@pytest.mark.parametrize("model", PLANAR_NAMES)
-def test_auto_chooses_the_model_that_moved_and_is_the_more_accurate_the_fewer_numbers_it_has(model: PlanarName) -> None:
-    true = path(model)
-    errors = {}
-    for name, given_model in (("auto", MotionModel("auto")), ("homography", HOMOGRAPHIES)):
-        solution = solve(N_NODES, measured(true, 2), N_NODES // 2, SHAPE, model=given_model)
-        errors[name] = error_px(solution.homographies, true).mean()
-        if name == "auto":
-            assert solution.model.kind == model
-            evidence = solution.compare()
-            assert evidence is not None
-            assert evidence.suffices(model)
-            assert evidence.rivals[model].unknowns == basis_of(model).shape[1] * (N_NODES - 1)
-            assert evidence.rivals[model].chi2 == pytest.approx(1, abs=0.2)
-    assert errors["auto"] <= errors["homography"] * 1.3 * np.sqrt(basis_of(model).shape[1] / 8)
-
-
-def test_models_that_are_too_small_do_not_suffice() -> None:
-    solution = solve(N_NODES, measured(path("affine"), 1), N_NODES // 2, SHAPE, model=MotionModel("auto"))
-    evidence = solution.compare()
-    assert evidence is not None
-    assert not any(evidence.suffices(model) for model in ("translation", "euclidean", "similarity", "rotation"))
-
-
-@pytest.mark.parametrize("model", PLANAR_NAMES)
-def test_expected_errors_of_a_model_hold(model: PlanarName) -> None:
-    squares, variances = [], []
-    for seed in range(8):
-        true = path(model, seed)
-        solution = solve(N_NODES, measured(true, seed), N_NODES // 2, SHAPE, model=MotionModel(model))
-        squares.append(np.mean(error_px(solution.homographies, true) ** 2))
-        variances.append(np.mean(solution.assess().std_px ** 2))
-    assert np.mean(squares) / np.mean(variances) == pytest.approx(1, abs=0.4)
-
-
-def test_a_chosen_model_that_is_held_stays_as_uncertain_as_the_choice() -> None:
-    edges = measured(path("euclidean"), 2)
-    chosen = solve(N_NODES, edges, N_NODES // 2, SHAPE, model=MotionModel("auto"))
-    held, given_model = (
-        solve(N_NODES, edges, N_NODES // 2, SHAPE, chosen.homographies, MotionModel("euclidean", chosen=each)).assess().std_px
-        for each in (True, False)
-    )
-    np.testing.assert_allclose(held, chosen.assess().std_px, rtol=0.1)
-    assert held.mean() > given_model.mean()
