@@ -252,6 +252,9 @@ class PlanarAdjustment(Adjustment[Plane]):
         if self._n_shared:
             by_coupling[:, _PERSPECTIVE] = -motions[:, 4:6]
             steps += state.coupling * by_coupling
+            shifts = np.eye(8)[4:6]
+            of_shift = np.stack([-shifts @ np.swapaxes(earlier, 1, 2), np.broadcast_to(shifts, (n_steps, 2, 8))], axis=2)
+            by_nodes[:, _PERSPECTIVE] -= state.coupling * (of_shift @ self._basis)
         rows = np.repeat(np.arange(n_steps), 2 * k)
         columns = (k * np.arange(n_steps)[:, None] + np.arange(2 * k)).ravel()
         parts = []
