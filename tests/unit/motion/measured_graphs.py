@@ -104,6 +104,27 @@ def apart(true: np.ndarray, skips: Sequence[int], rng: np.random.Generator, std_
     return [edge(true, *pair, own=(rng, std_px)) for pair in pairs(len(true), skips)]
 
 
+def seen_by_points(true: np.ndarray, skips: Sequence[int], rng: np.random.Generator, std_px: float) -> list[Edge]:
+    """Measure shifts, (N, 3, 3), as points of the scene show them that both exposures of a pair see.
+
+    Each exposure shows each point with errors of `std_px` along each axis, alike in all its pairs. A pair is the homography
+    with the least squares.
+    """
+    offsets, margin = true[:, :2, 2], np.array(SHAPE[::-1])
+    least, most = offsets.min(axis=0), offsets.max(axis=0) + margin
+    points = np.stack(np.meshgrid(*(np.arange(*ends, 25) for ends in zip(least, most, strict=True))), axis=-1).reshape(-1, 2)
+    places = points - offsets[:, None]
+    visible = np.all((places >= 0) & (places < margin), axis=-1)
+    errors, found = rng.normal(scale=std_px, size=places.shape), []
+    for moving, fixed in pairs(len(true), skips):
+        both, exact = visible[moving] & visible[fixed], normalised(inverse(true[fixed]) @ true[moving])
+        slopes = jacobian(exact, places[moving, both]).reshape(-1, 8)
+        change = np.linalg.lstsq(slopes, (errors[fixed] - errors[moving])[both].ravel(), rcond=None)[0]
+        motion = Located(from_parameters(parameters(exact) + change), slopes.T @ slopes / (2 * std_px**2))
+        found.append(Edge(moving, fixed, motion))
+    return found
+
+
 def graph(n_nodes: int, skips: Sequence[int] = (1, 2, 4)) -> tuple[np.ndarray, list[Edge]]:
     """Return a true motion, and pairs each of which errs by itself."""
     true = true_motion(n_nodes)

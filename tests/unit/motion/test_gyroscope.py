@@ -111,6 +111,29 @@ def test_pairs_of_a_still_camera_scatter_as_expected() -> None:
     assert [(edge.moving, edge.fixed, edge.locator) for edge in edges[:2]] == [(1, 0, GYROSCOPE), (2, 1, GYROSCOPE)]
 
 
+def test_a_graph_of_the_gyroscope_alone_follows_its_rates() -> None:
+    gyroscope = gyroscope_of(np.array([0.1, 0.6, -0.2]), np.deg2rad(0.01), np.deg2rad(0.3))
+    edges, model = gyroscope.edges(GROUPS), MotionModel("rotation", FOCAL_PX)
+    solution = solve(
+        GROUPS, edges, len(GROUPS) // 2, SHAPE, gyroscope.trajectory(0).at([each.reference for each in GROUPS]), model
+    )
+    assert solution.located.all()
+    assert solution.residual_px < 1e-6
+    assert gyroscope.agreement(edges, solution, 0.05).reason.startswith("of what pairs of exposures show of rotations, 100% is")
+
+
+@pytest.mark.xfail(reason="pairs are taken to err by the noise of their exposures, which does not add up along a chain")
+def test_a_graph_of_the_gyroscope_alone_drifts_by_its_expected_error() -> None:
+    """By 0.3 px for each pair, as of a random walk."""
+    gyroscope = gyroscope_of(np.array([0.1, 0.6, -0.2]), np.deg2rad(0.01), np.deg2rad(0.3))
+    edges, model = gyroscope.edges(GROUPS), MotionModel("rotation", FOCAL_PX)
+    std_px = solve(GROUPS, edges, len(GROUPS) // 2, SHAPE, None, model).assess().std_px
+    assert isinstance(edges[0].motion, Located)
+    of_pair = edges[0].motion.evidence["std_px"]
+    # From the mean of 20 places of a walk, its ends are sqrt(20 / 3) steps away.
+    assert std_px[[0, -1]] == pytest.approx(of_pair * np.sqrt(20 / 3), rel=0.3)
+
+
 def test_rates_that_contradict_the_images_are_refused() -> None:
     seen, other = gyroscope_of(np.array([0.1, 0.6, 0.0])), gyroscope_of(np.array([0.3, -0.4, 0.0]), np.deg2rad(0.01))
     located = solve(GROUPS, seen.edges(GROUPS), 0, SHAPE, None, MotionModel("rotation", FOCAL_PX))

@@ -1,19 +1,18 @@
 """A level that corrects a motion known at every frame: the motion keeps its tremor."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 
 from photonpano.geometry import (
     Camera,
     FrameTrajectory,
     corner_displacements,
+    from_parameters,
     inverse,
     normalised,
+    parameters,
     rotation_matrices,
 )
-from photonpano.motion.refined_motion import RefinedMotion
+from photonpano.motion.refined_motion import Knots, RefinedMotion
 from photonpano.motion.rotation_graph import Rotations
 from photonpano.motion.rotations import RotationTrajectory
 from photonpano.values import FloatArray
@@ -34,17 +33,27 @@ DRIFT = rotation_matrices(
 )  # by which what is known is off
 
 
-def located(homographies: FloatArray, camera: Camera | None = None, information: FloatArray | None = None) -> Any:
+def knots_of(homographies: FloatArray, camera: Camera | None = None, information: FloatArray | None = None) -> Knots:
     rotations = None if camera is None else Rotations(camera.rotations(homographies), camera)
-    return SimpleNamespace(
-        instants=INSTANTS, homographies=homographies, information=information, solution=SimpleNamespace(rotations=rotations)
-    )
+    return Knots(INSTANTS, homographies, information, rotations)
 
 
 def apart_px(first: FloatArray, second: FloatArray) -> float:
     """Return the largest difference at a corner of two motions, from their middle on."""
     middle = len(first) // 2
     return float(corner_displacements(*(inverse(each[middle]) @ each for each in (first, second)), SHAPE).max())
+
+
+def test_corrections_of_a_turn_leave_out_its_tremor_and_bring_the_refined_motion_to_the_true_one() -> None:
+    true = turned(2.5)
+    known = CAMERA.homographies(true @ np.swapaxes(DRIFT, -1, -2))
+    motion = RefinedMotion(RotationTrajectory(FrameTrajectory(known), CAMERA, 100), FRAMES, CAMERA, SHAPE)
+    knots = motion.corrections(knots_of(CAMERA.homographies(true[INSTANTS]), CAMERA))
+    assert knots.rotations is not None
+    np.testing.assert_allclose(normalised(CAMERA.homographies(knots.rotations.rotations)), knots.homographies, atol=1e-6)
+    assert apart_px(knots.homographies, CAMERA.homographies(DRIFT[INSTANTS])) < 0.03
+    corrected = motion.corrected(FrameTrajectory(CAMERA.homographies(DRIFT))).at(ALL)
+    assert apart_px(corrected, CAMERA.homographies(true)) < 1e-6
 
 
 def test_known_turn_of_a_camera_of_another_focal_length_moves_the_image_alike() -> None:
@@ -61,3 +70,41 @@ def test_known_homographies_become_turns_of_a_camera_that_move_the_corners_alike
     seen = RefinedMotion(FrameTrajectory(known), FRAMES, CAMERA, SHAPE).corrected(FrameTrajectory(np.eye(3)[None])).at(ALL)
     assert apart_px(seen, known) < 1e-6
     np.testing.assert_allclose(np.linalg.det(seen), 1)
+
+
+def test_information_is_carried_from_the_homographies_to_their_corrections() -> None:
+    """A small change of each homography is as many standard deviations as that of its correction."""
+    rng = np.random.default_rng(0)
+    scales = np.array([1e-2, 1e-2, 1e-2, 1e-2, 1, 1, 1e-4, 1e-4])
+    true = from_parameters(rng.normal(size=(FRAMES, 8)) * scales)
+    known = RefinedMotion(
+        FrameTrajectory(true @ from_parameters(0.1 * rng.normal(size=(FRAMES, 8)) * scales)), FRAMES, None, SHAPE
+    )
+    roots = rng.normal(size=(len(INSTANTS), 8, 8)) / scales
+    information = np.swapaxes(roots, -1, -2) @ roots
+    knots = known.corrections(knots_of(true[INSTANTS], information=information))
+    assert knots.rotations is None
+    assert knots.information is not None
+
+    change = 1e-5 * rng.normal(size=(len(INSTANTS), 8)) * scales
+    change[len(INSTANTS) // 2] = 0  # to which all corrections refer
+    moved = known.corrections(
+        knots_of(from_parameters(parameters(true[INSTANTS]) + change), information=information)
+    ).homographies
+    away = parameters(moved) - parameters(knots.homographies)
+    squares = [np.einsum("ni,nij,nj->n", each, of, each) for each, of in ((change, information), (away, knots.information))]
+    np.testing.assert_allclose(squares[1], squares[0], rtol=1e-2, atol=1e-15)
+
+
+def test_knots_move_within_their_frames_and_stay_turns_of_a_camera() -> None:
+    true = CAMERA.homographies(turned(2.5)[INSTANTS])
+    small = CAMERA.homographies(rotation_matrices([[0.002, -0.003, 0.01]] * len(INSTANTS)))
+    free, turns = knots_of(true).moved(small), knots_of(true, CAMERA).moved(small)
+    assert free.rotations is None
+    assert turns.rotations is not None
+    for found in (free.homographies, turns.homographies, CAMERA.homographies(turns.rotations.rotations)):
+        np.testing.assert_allclose(normalised(found), normalised(true @ small), atol=1e-9)
+    # What is no turn moves them like the turn nearest to it.
+    zoomed = knots_of(true, CAMERA).moved(small @ np.diag([1.01, 1.01, 1.0])).rotations
+    assert zoomed is not None
+    np.testing.assert_allclose(zoomed.rotations, turns.rotations.rotations, atol=2e-3)

@@ -1,46 +1,147 @@
 """The expected errors of a solved motion graph, and what its measurements say of a node."""
 
-from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from photonpano.geometry import (
-    align_planes,
-    corners,
-    transform_points,
-)
-from photonpano.values import Edge
+from photonpano import Group
+from photonpano.geometry import from_parameters, inverse, normalised, parameters
+from photonpano.motion.graph import GraphSolution, solve
+from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 
 from .measured_graphs import (
+    NOISE_PX,
     SHAPE,
     confident,
     edge,
+    graph,
+    groups_of,
     measured,
+    noise_of,
+    pairs,
+    seen_by_points,
+    squared_errors,
+    true_motion,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-
-def squared_errors(homographies: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Return the mean square distance of the corners from where they should be, after the best alignment of planes: (N,)."""
-    frame = corners(SHAPE)
-    missed = transform_points(np.linalg.inv(true) @ align_planes(homographies, true, SHAPE) @ homographies, frame) - frame
-    return np.sum(missed**2, axis=-1).mean(axis=-1)
+SEEDS = 16
+UNEQUAL = np.array([0.3, 0.1, 0.1, 0.2, 0.1, 0.3, 0.2, 0.2, 0.1, 0.3])
 
 
-def unequal(true: np.ndarray, skips: tuple[int, ...], rng: np.random.Generator) -> list[Edge]:
-    """Measure pairs with errors of 0.03 to 0.3 px, and matching information."""
-    stds = np.random.default_rng(1).choice([0.03, 0.1, 0.3], size=len(true) * len(skips))
-    pairs = [(moving, moving - skip) for moving in range(len(true)) for skip in skips if skip <= moving]
-    return [edge(true, *pair, rng, std_px) for pair, std_px in zip(pairs, stds, strict=False)]
+class Measured(NamedTuple):
+    """How a motion of ten exposures is measured: of which frames, by which pairs, and how well."""
+
+    groups: list[Group]
+    skips: tuple[int, ...]
+    std_px: np.ndarray | float = NOISE_PX
+    own_px: float = 0.0  # error that pairs that are no neighbours add by themselves
 
 
-GRAPHS: dict[str, Callable[..., list[Edge]]] = {
-    "a chain": lambda true, rng: measured(true, (1,), rng),
-    "second neighbours": lambda true, rng: measured(true, (1, 2), rng),
-    "closed at the end": lambda true, rng: measured(true, (1, len(true) - 1), rng),
-    "closed in a part": lambda true, rng: [*measured(true, (1,), rng), edge(true, 8, 1, rng)],
-    "unequal noise": lambda true, rng: unequal(true, (1, 2), rng),
-    "overconfident": lambda true, rng: confident(measured(true, (1, 2), rng), 3),
+GRAPHS = {
+    "a chain": Measured(groups_of(10), (1,)),
+    "second neighbours": Measured(groups_of(10), (1, 2)),
+    "unequal noise": Measured(groups_of(10), (1, 2), UNEQUAL),
+    "half overlapping": Measured(groups_of(10, 20, 10), (2, 3, 4)),
+    "dense": Measured(groups_of(10, 40, 10), (4, 5, 6, 7)),
+    "pairs with errors of their own": Measured(groups_of(10), (1, 2, 4), NOISE_PX, 0.2),
 }
+
+
+def errors_and_expected(solutions: list[GraphSolution], true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean square errors of every exposure, and what was expected of them: (N,) each."""
+    squares = np.array([squared_errors(solution.homographies, true) for solution in solutions])
+    expected = np.array([solution.assess().std_px for solution in solutions])
+    assert np.mean(np.sqrt(squares) < 3 * expected) > 0.99
+    return squares.mean(axis=0), (expected**2).mean(axis=0)
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_expected_error_matches_actual_error_of_every_exposure(name: str) -> None:
+    """Sixteen measurements of one motion, whose pairs err by the noise of their exposures."""
+    groups, skips, std_px, own_px = GRAPHS[name]
+    true, solutions = true_motion(10), []
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(seed)
+        noise = noise_of(groups, rng, std_px)
+        edges = [
+            edge(true, *pair, noise, std_px, (rng, own_px) if own_px and pair[0] - pair[1] > 1 else None)
+            for pair in pairs(10, skips)
+        ]
+        solutions.append(solve(groups, edges, 5, SHAPE))
+    squares, expected = errors_and_expected(solutions, true)
+    assert 0.8 < np.sqrt(squares.mean() / expected.mean()) < 1.25
+    ratios = np.sqrt(squares / expected)
+    assert 0.55 < ratios.min() < ratios.max() < 1.5
+
+
+@pytest.mark.parametrize("skips", [(1,), (1, 2, 3)], ids=["chain", "skips"])
+@pytest.mark.parametrize("step_px", [0, 124])
+def test_expected_error_holds_where_pairs_see_parts_of_their_exposures(step_px: float, skips: tuple[int, ...]) -> None:
+    """Each exposure shows points of the scene with errors of its own; next to each other, pairs see other points."""
+    steps, rng = np.arange(16.0), np.random.default_rng(7)
+    true = from_parameters(
+        np.stack([0 * steps] * 4 + [step_px * steps, *rng.normal(size=(1, 16)) * 5, 0 * steps, 0 * steps], axis=-1)
+    )
+    edges = [seen_by_points(true, skips, np.random.default_rng(seed), 0.5) for seed in range(SEEDS)]
+    solutions = [solve(groups_of(16), each, 8, SHAPE, model=MotionModel("euclidean")) for each in edges]
+    squares, expected = errors_and_expected(solutions, true)
+    assert 0.8 < np.sqrt(squares.mean() / expected.mean()) < 1.25
+
+
+@pytest.mark.parametrize("n_nodes", [9, 36])
+def test_expected_error_of_a_chain_is_the_noise_of_its_exposures_however_long_it_is(n_nodes: int) -> None:
+    """The camera stands still: three of eight numbers are free, and the best alignment of planes takes out their mean."""
+    still = np.broadcast_to(np.eye(3), (n_nodes, 3, 3))
+    solution = solve(groups_of(n_nodes), measured(still, (1,)), 0, SHAPE)
+    assert solution.walks_px == {}
+    np.testing.assert_allclose(solution.assess().std_px, NOISE_PX * np.sqrt(3 / 8 * (1 - 1 / n_nodes)), rtol=0.25)
+
+
+@pytest.mark.parametrize("model", [HOMOGRAPHIES, MotionModel("euclidean")])
+def test_expected_error_does_not_depend_on_the_anchor(model: MotionModel) -> None:
+    _, edges = graph(20, (1, 2))
+    first, last = (solve(groups_of(20), edges, anchor, SHAPE, model=model).assess().std_px for anchor in (0, 19))
+    np.testing.assert_allclose(first, last, rtol=0.03)
+
+
+@pytest.mark.parametrize("skips", [(1, 2), (1,)], ids=["loops", "chain"])
+def test_expected_error_corrects_overconfident_edges_only_with_loops(skips: tuple[int, ...]) -> None:
+    _, edges = graph(40, skips)
+    honest, overconfident, modest = (
+        solve(groups_of(40), confident(edges, times), 20, SHAPE).assess().std_px.mean() for times in (1, 5, 0.2)
+    )
+    assert overconfident == pytest.approx(honest if skips == (1, 2) else honest / 5, rel=0.2)
+    # With less to tell, walks are narrower.
+    assert 3 * honest < modest < 5.5 * honest
+
+
+def test_information_of_a_node_is_the_curvature_of_the_cost_with_others_held() -> None:
+    """A chain of three, whose pairs have their whole weight, and know much more than the prior."""
+    true = true_motion(3)
+    edges = [edge(true, 1, 0, std_px=1e-3), edge(true, 2, 1, std_px=2e-3)]
+    solution = solve(groups_of(3), edges, 1, SHAPE)
+    found = solution.assess().information
+
+    def cost(node: int, change: np.ndarray) -> float:
+        homographies = solution.homographies.copy()
+        homographies[node] = from_parameters(parameters(homographies[node]) + change)
+        total = 0.0
+        for each in (each for each in edges if node in (each.moving, each.fixed)):
+            relative = normalised(inverse(homographies[each.fixed]) @ homographies[each.moving])
+            missed = parameters(relative) - parameters(each.motion.homography)
+            total += missed @ each.motion.information @ missed / 2
+        return total
+
+    # Each step moves the corners by about as much.
+    steps = 1e-3 / np.array([250, 250, 250, 250, 1, 1, 250**2, 250**2])
+    for node in range(3):
+        curvature = np.zeros((8, 8))
+        for first, second in np.ndindex(8, 8):
+            for one, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                change = one * steps * (np.arange(8) == first) + other * steps * (np.arange(8) == second)
+                curvature[first, second] += one * other * cost(node, change) / 4
+        information = found[node] * np.outer(steps, steps)
+        np.testing.assert_allclose(information, curvature, rtol=0.01, atol=1e-3 * np.abs(information).max())
