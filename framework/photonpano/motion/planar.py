@@ -196,7 +196,6 @@ class PlanarAdjustment(Adjustment[Plane]):
             changed = assumed**2 / self._durations != self.variances
             self.variances = assumed**2 / self._durations
             return bool(changed.any())
-            return True
         before, free, rng = self.variances, self._free(state), np.random.default_rng(0)
         jacobians, residuals = self._of_edges(state, weights)
         jacobians = jacobians[:, free]
