@@ -68,6 +68,7 @@ class Problem:
     frame_shape: tuple[int, int]  # (height, width) of a frame
     instants: FloatArray  # (N,) of the nodes, in frames, in order
     spans: Sequence[FrameSpan]  # the frames of each node
+    shown: BoolArray | None = None  # (E,) whether exposures show an edge, so that it has a part in their noise; None for all
 
     @property
     def observed(self) -> FloatArray:
@@ -105,8 +106,9 @@ class Adjustment(ABC, Generic[StateT]):
         self._targets = transform_points(problem.observed, self._corners)
         self._whitening = _whitening(problem.motions, self._rows)
         self._motions = problem.motions
+        self._noise_norm: float | None = None
         self._informed = any(each.information is not None or each.residual_px for each in problem.motions)
-        self._noise = ExposureNoise.of(problem.pairs, problem.spans)
+        self._noise = ExposureNoise.of(problem.pairs, problem.spans, problem.shown)
 
     @abstractmethod
     def homographies(self, state: StateT) -> FloatArray:
@@ -222,7 +224,7 @@ class Adjustment(ABC, Generic[StateT]):
         """Return the information on each node while the others are held, and the expected error of its corners.
 
         The error is that of solutions for drawn noise of the exposures, each aligned with the best one as an evaluation aligns
-        planes. If residuals exceed what the information of the edges predicts, the noise is scaled up accordingly.
+        planes. An edge with a lower robust weight errs by as much more.
         """
         weights = self.weights(norms, kept)
         jacobians, _ = self._linearised(state, weights)
@@ -231,8 +233,7 @@ class Adjustment(ABC, Generic[StateT]):
         blocks = np.stack([normal[k * node : k * node + k, k * node : k * node + k].toarray() for node in range(self._n_nodes)])
         rng, changes = np.random.default_rng(0), np.zeros((len(free), SAMPLES))
         moving, fixed = self._body_slopes(state)
-        errors = np.sqrt(weights)[:, None, None] * self._noise.errors(moving, fixed, SAMPLES, rng)
-        errors *= self._residual_scale(norms, kept) / MEDIAN_NORM
+        errors = np.sqrt(self._noise.weights)[:, None, None] * self._noise.errors(moving, fixed, SAMPLES, rng)
         right = jacobians[: 8 * n_edges].T @ errors.reshape(8 * n_edges, SAMPLES)
         below = jacobians[8 * n_edges :]
         right += below.T @ rng.normal(size=(below.shape[0], SAMPLES))
@@ -326,8 +327,15 @@ class Adjustment(ABC, Generic[StateT]):
     def weights(self, norms: FloatArray, kept: BoolArray) -> FloatArray:
         """Return the weights of the edges, (E,): robust (Cauchy), in units of their residuals; 0 if they are not kept."""
         robust = cauchy_weights(norms, self._residual_scale(norms, kept) * CAUCHY)
-        robust *= (MEDIAN_NORM / self._residual_scale(norms, kept, MEDIAN_NORM if self._informed else _UNKNOWN_NORM)) ** 2
+        robust *= (MEDIAN_NORM / (self._noise_norm or self._least_norm(norms, kept))) ** 2
         return np.asarray(np.where(kept, robust, 0.0) * self._noise.weights)
+
+    def hold_noise(self, norms: FloatArray, kept: BoolArray) -> None:
+        """Take the scale of the residuals for noise from now on: a prior that holds unknowns leaves more of them."""
+        self._noise_norm = self._least_norm(norms, kept)
+
+    def _least_norm(self, norms: FloatArray, kept: BoolArray) -> float:
+        return self._residual_scale(norms, kept, MEDIAN_NORM if self._informed else _UNKNOWN_NORM)
 
     def mapped_corners(self, state: StateT) -> FloatArray:
         """Return where a state expects the corners that each edge maps: (E, 4, 2) px."""

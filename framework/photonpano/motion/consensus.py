@@ -38,9 +38,21 @@ def agreeing(motions: Sequence[Located], residuals: FloatArray, tolerance_px: fl
 
     `residuals` (E, P, 2) are what that leaves of where patches lie, in px of frames of (height, width).
     """
-    squares = (residuals**2).sum(axis=-1)
-    weights = 1 / (1 + squares / (2 * tolerance_px**2)) ** 2  # of Geman and McClure
+    weights = _weights(residuals, tolerance_px)
     return [_by_patches(*each, tolerance_px, shape) for each in zip(motions, weights, strict=True)]
+
+
+def agreed_share(motions: Sequence[Located], residuals: FloatArray, tolerance_px: float) -> float:
+    """Return the share of the patches that show something and agree with a motion, by the weights that they have then."""
+    weights = _weights(residuals, tolerance_px)
+    patches = [each.patches for each in motions]
+    shown = [each[seen.information[:, 0, 0] > 0] for each, seen in zip(weights, patches, strict=True) if seen is not None]
+    return float(np.concatenate(shown).mean()) if shown else 0.0
+
+
+def _weights(residuals: FloatArray, tolerance_px: float) -> FloatArray:
+    """Return the weights of Geman and McClure: (E, P)."""
+    return np.asarray(1 / (1 + (residuals**2).sum(axis=-1) / (2 * tolerance_px**2)) ** 2)
 
 
 def contradicting(motions: Sequence[Located], residuals: FloatArray) -> float:

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.values import FloatArray, FrameSpan
+from photonpano.values import BoolArray, FloatArray, FrameSpan
 
 # Least weight of a pair. Shared photons carry no new information: their noise agrees with the motion known so far.
 _LEAST_WEIGHT = 0.05
 _LEAST = 1e-9  # eigenvalue of the information of an exposure, relative to its largest
-_MOST_PAIRS = 16  # of an exposure that are compared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,10 +29,12 @@ class ExposureNoise:
     # (E,) weights with which pairs count the photons of each exposure once, however many of them it is in, and however many
     # exposures hold its frames
     weights: FloatArray
+    shown: BoolArray  # (E,) False for pairs that no exposures show: each errs by itself
 
     @classmethod
-    def of(cls, pairs: NDArray[np.integer], spans: Sequence[FrameSpan]) -> ExposureNoise:
-        """Compute what N exposures share from the frames of each."""
+    def of(cls, pairs: NDArray[np.integer], spans: Sequence[FrameSpan], shown: BoolArray | None = None) -> ExposureNoise:
+        """Compute what N exposures share from the frames of each; without `shown`, exposures show all pairs."""
+        shown = np.ones(len(pairs), dtype=bool) if shown is None else shown
         bounds = np.array([(span.start, span.stop) for span in spans], dtype=np.float64)
         ends = np.unique(bounds)
         inside = (bounds[:, :1] <= ends[:-1]) & (ends[1:] <= bounds[:, 1:])
@@ -44,9 +45,10 @@ class ExposureNoise:
         shared = np.maximum(common, 0) / np.minimum((stops - starts)[moving], (stops - starts)[fixed])
         # The correlations of each exposure with all others, at low frequencies of the motion, add up.
         repeated = shares @ shares.sum(axis=0)
-        degrees = np.bincount(pairs.ravel(), minlength=len(spans))
+        degrees = np.bincount(pairs[shown].ravel(), minlength=len(spans))
         counted = (degrees[moving] + degrees[fixed]) / 4 * np.sqrt(repeated[moving] * repeated[fixed])
-        return cls(pairs, shares, np.maximum(1 - shared, _LEAST_WEIGHT) / np.maximum(counted, 1))
+        weights = np.where(shown, np.maximum(1 - shared, _LEAST_WEIGHT) / np.maximum(counted, 1), 1.0)
+        return cls(pairs, shares, weights, shown)
 
     def errors(self, moving: FloatArray, fixed: FloatArray, n_draws: int, rng: np.random.Generator) -> FloatArray:
         """Draw errors of pairs, in units in which their covariance is the identity if they share nothing: (E, 8, n_draws).
@@ -54,6 +56,7 @@ class ExposureNoise:
         `moving` and `fixed` are the derivatives of the residuals of each pair, in these units, by small motions of its frames:
         (E, 8, 8).
         """
+        moving, fixed = (np.where(self.shown[:, None, None], slopes, 0) for slopes in (moving, fixed))
         roots = self._roots(moving, fixed)
         chunks = rng.normal(size=(self.shares.shape[1], 8 * n_draws))
         noise = roots @ (self.shares @ chunks).reshape(len(roots), 8, n_draws)
@@ -76,7 +79,7 @@ class ExposureNoise:
         rank = np.arange(len(nodes)) - np.searchsorted(nodes[order], nodes[order])
         information = np.broadcast_to(np.finfo(float).tiny * np.eye(8), (len(self.shares), 8, 8)).copy()
         information[nodes[order[rank == 0]]] = of_pairs[order[rank == 0]]
-        for number in range(1, min(int(rank.max(initial=0)) + 1, _MOST_PAIRS)):
+        for number in range(1, int(rank.max(initial=0)) + 1):
             here = order[rank == number]
             root, back = _roots(information[nodes[here]])
             values, vectors = np.linalg.eigh(back @ of_pairs[here] @ back)

@@ -15,9 +15,9 @@ from scipy.sparse.csgraph import dijkstra
 
 from photonpano.geometry import Camera, corners, inverse, lenses_apart_px, likely_rotations, scaled_ahead
 from photonpano.motion.adjustment import Adjustment, Assessment, Problem
-from photonpano.motion.consensus import agreeing, contradicting, layers, tolerances_px, travelled
+from photonpano.motion.consensus import agreed_share, agreeing, contradicting, layers, tolerances_px, travelled
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
-from photonpano.motion.pairs import adjacency, component_labels, instants_of
+from photonpano.motion.pairs import GYROSCOPE, TIE, adjacency, component_labels, instants_of
 from photonpano.motion.planar import PlanarAdjustment, Plane, nearest
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, FrameSpan, Group, Located
@@ -169,18 +169,18 @@ def _of_background(
     """
     if len(tied.order) < _FEWEST_NODES:
         return tied, fits
-    model = _likeliest(fits, tied.frame_shape)
-    first, fit = fits[model].adjustment, fits[model]
-    if not model.layered and contradicting(tied.motions, first.beside(fit.state)) < _CONTRADICTED:
+    likeliest = _likeliest(fits, tied.frame_shape)
+    contradicted = contradicting(tied.motions, fits[likeliest].adjustment.beside(fits[likeliest].state)) >= _CONTRADICTED
+    if not (likeliest.layered or contradicted):
         return tied, fits
-    background = tied
-    for tolerance_px in tolerances_px(tied.motions):
-        motions = agreeing(tied.motions, first.beside(fit.state), tolerance_px, tied.frame_shape)
-        background = replace(tied, motions=motions)
-        try:
-            fit = background.fit(background.adjustment(model), fit.state)
-        except (ValueError, np.linalg.LinAlgError):
-            return tied, fits  # too few patches agree
+    # A richer model may follow what is near, too, but then fits neither part: most patches agree with the right one.
+    turning = {model: fit for model, fit in fits.items() if model.kind == "rotation"}
+    rivals = {likeliest, *([_likeliest(turning, tied.frame_shape)] if turning else [])}
+    selected = {model: agreed for model in rivals if (agreed := _agreed(tied, model, fits[model]))}
+    if not selected:
+        return tied, fits
+    model = max(selected, key=lambda each: selected[each].share)
+    first, (background, fit, _) = fits[model].adjustment, selected[model]
     found = layers(tied.pairs, tied.motions, first.beside(fit.state), len(tied.located))
     background = replace(background, layers=found)
     if isinstance(fit.state, Rotations):
@@ -188,6 +188,27 @@ def _of_background(
         background = replace(background, parallax=way_px / fit.state.camera.focal_px)
     others = [each for each in fits if each is not model]
     return background, {each: _fitted(background, start, each) for each in others} | {model: fit}
+
+
+class _Agreed(NamedTuple):
+    """What patches of pairs agree on."""
+
+    tied: _Tied  # the pairs by these patches
+    fit: _Fit  # of a model to them
+    share: float  # of the patches that agree, by their weights
+
+
+def _agreed(tied: _Tied, model: MotionModel, fit: _Fit) -> _Agreed | None:
+    """Select the patches that agree with a model; None if too few do."""
+    first, background, tolerances = fit.adjustment, tied, tolerances_px(tied.motions)
+    for tolerance_px in tolerances:
+        motions = agreeing(tied.motions, first.beside(fit.state), tolerance_px, tied.frame_shape)
+        background = replace(tied, motions=motions)
+        try:
+            fit = background.fit(background.adjustment(model), fit.state)
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+    return _Agreed(background, fit, agreed_share(tied.motions, first.beside(fit.state), tolerances[-1]))
 
 
 def _likeliest(fits: Mapping[MotionModel, _Fit], frame_shape: tuple[int, int]) -> MotionModel:
@@ -289,6 +310,7 @@ class _Tied:
     frame_shape: tuple[int, int]  # (height, width) of a frame
     instants: FloatArray  # (N,) of all nodes
     spans: Sequence[FrameSpan]  # their frames
+    shown: BoolArray  # (E,) whether exposures show the edges
     layers: FloatArray | None = None  # see `GraphSolution`
     parallax: float = 0.0
 
@@ -305,7 +327,8 @@ class _Tied:
         positions = np.array([located_edges[index][0] for index in tied], dtype=int)
         motions = [motion for index in tied if isinstance(motion := located_edges[index][1].motion, Located)]
         spans = [group.span for group in nodes]
-        return cls(located, order, parents, positions, pairs[tied], motions, frame_shape, instants_of(nodes), spans)
+        shown = np.array([located_edges[index][1].locator not in (GYROSCOPE, TIE) for index in tied], dtype=bool)
+        return cls(located, order, parents, positions, pairs[tied], motions, frame_shape, instants_of(nodes), spans, shown)
 
     @property
     def anchor(self) -> int:
@@ -322,7 +345,9 @@ class _Tied:
         """The least-squares problem, without nodes that are not tied."""
         anchor = int(self.located[: self.anchor].sum())
         spans = [span for span, located in zip(self.spans, self.located, strict=True) if located]
-        return Problem(self.compact_pairs, anchor, self.motions, self.frame_shape, self.instants[self.located], spans)
+        return Problem(
+            self.compact_pairs, anchor, self.motions, self.frame_shape, self.instants[self.located], spans, self.shown
+        )
 
     def adjustment(self, model: MotionModel) -> PlanarAdjustment | RotationAdjustment:
         """Return the least-squares problem of a model."""
@@ -354,6 +379,7 @@ class _Tied:
 
     def _minimised(self, adjustment: Adjustment[Any], state: Any, kept: BoolArray) -> tuple[Any, FloatArray]:
         found, norms = adjustment.minimise(state, kept)
+        adjustment.hold_noise(norms, kept)
         for _ in range(_LEARNT):
             if not adjustment.learn(found, adjustment.weights(norms, kept)):
                 break

@@ -21,7 +21,7 @@ from photonpano.geometry import (
     rotation_vectors,
     slopes,
 )
-from photonpano.motion.pairs import instants_of
+from photonpano.motion.pairs import GYROSCOPE, instants_of
 from photonpano.motion.rates import Rates
 from photonpano.motion.rotations import RotationTrajectory
 from photonpano.values import Decision, Edge, FloatArray, Group, Homography, Located
@@ -29,7 +29,6 @@ from photonpano.values import Decision, Edge, FloatArray, Group, Homography, Loc
 if TYPE_CHECKING:
     from photonpano.motion.graph import GraphSolution
 
-GYROSCOPE = "gyroscope"  # stands for the locator of its pairs
 _SCALE = 0.01  # expected error of the rates, and of the focal length, relative to them
 _STIFF = 0.1  # expected departure of the corners from a rotation, relative to the error of the rotation
 _CONTRADICTION = 5.0  # median of the differences between gyroscope and motion, in expected ones

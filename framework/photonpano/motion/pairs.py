@@ -12,6 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from photonpano.geometry import inverse, why_implausible
 from photonpano.values import FloatArray, FrameSpan, Group
 
+GYROSCOPE, TIE = "gyroscope", "tie"  # stand for the locators of pairs that no exposures show
+
 
 def pairs_of(groups: Sequence[Group], skips: Sequence[float]) -> list[tuple[int, int]]:
     """Return the pairs (moving, fixed) of a level, moving later than fixed, ordered by the moving exposure.

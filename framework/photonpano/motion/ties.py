@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from photonpano.contracts.protocols import Source, Trajectory, camera_of
 from photonpano.errors import InputError
 from photonpano.geometry import corners, inverse, jacobian, transform_points, why_implausible
-from photonpano.motion.pairs import instants_of
+from photonpano.motion.pairs import TIE, instants_of
 from photonpano.text import listed
 from photonpano.values import BoolArray, Edge, FloatArray, Group, Homography, Located, StreamInfo
 
-TIE = "tie"  # stands for the locator of a pair whose motion the ties alone give
 _POINTS, _STD, _STD_PX = ("frame_a", "x_a", "y_a", "frame_b", "x_b", "y_b"), "std_px", 1.0
 # A motion contradicts a tie beyond this fraction of the shorter side of a frame, and so many of its standard deviations.
 _CONTRADICTION, _SIGMAS = 0.05, 8.0

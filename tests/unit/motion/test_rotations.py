@@ -230,7 +230,7 @@ def behind_things_that_are_near(rotations: FloatArray, camera: Camera) -> list[E
     "kind",
     [
         "rotation",
-        pytest.param("auto", marks=pytest.mark.xfail(reason="the background is told by homographies that follow what is near")),
+        "auto",
     ],
 )
 def test_pairs_follow_the_background_behind_things_that_are_near(kind: ModelName) -> None:

@@ -14,7 +14,8 @@ from photonpano.errors import InputError, LocationError
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, right_handed_axes
 from photonpano.merging import binning_of
-from photonpano.motion.gyroscope import GYROSCOPE, Gyroscope
+from photonpano.motion.gyroscope import Gyroscope
+from photonpano.motion.pairs import GYROSCOPE
 from photonpano.motion.rates import Rates, read_rates
 from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking.velocity import Contrast, Images, structure_of, varying_spans

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import Group, LocationError
-from photonpano.motion.ties import TIE
+from photonpano.motion.pairs import TIE
 from photonpano.specs.settings import GraphSettings
 
 
