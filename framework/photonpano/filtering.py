@@ -71,3 +71,15 @@ def exceeding_noise(steps: FloatArray, variances: FloatArray) -> Filtered:
         spread[place] += let_through[window] * taper**2
     inner = slice(half, half + len(steps))
     return Filtered(signal[inner], np.sqrt(spread[inner]))
+
+
+def smooth_share(path: FloatArray) -> float:
+    """Return how far accelerations predict an evenly sampled path: 1 if it is smooth, 0 if it trembles as fast as samples.
+
+    It is the share of the squares of second differences that third differences do not have. Noise has none.
+
+    Args:
+        path: (N, K) values, at least 4.
+    """
+    second, third = (float((np.diff(path, order, axis=0) ** 2).mean()) for order in (2, 3))
+    return float(np.clip(1 - third / max(second, np.finfo(float).tiny), 0, 1))

@@ -69,7 +69,7 @@ def test_masked_bar_leaves_motion_panorama_and_its_error_as_without_it(spec: dic
     part = spec["source"]["with"] | {"frames": [first, N_FRAMES]}
     result = run(parse_spec(spec | {"source": {"use": "packed-npy", "with": part}}, output=tmp_path / "run"))
     assert result.record["verdict"]["status"] == "trusted"
-    assert _error_px(tmp_path / "run", first) < 0.045
+    assert _error_px(tmp_path / "run", first) < 0.04
     with np.load(tmp_path / "run" / "trajectory.npz") as found:
         reference, canvas = int(found["reference"]), found["canvas"]
     truth = np.stack([_to_scene(frame) for frame in range(first, N_FRAMES)])

@@ -75,11 +75,14 @@ def test_panorama_is_close_to_oracle(scored: Evaluation) -> None:
     assert scored.oracle.psnr_db - scored.panorama.psnr_db < 3
 
 
-def test_each_level_reduces_the_error(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
-    """Measured: 0.13, 0.024 and 0.023 px, where a third level has little left to do."""
+def test_a_second_level_reduces_the_error_to_what_a_third_one_leaves(
+    run: Callable, three_levels: np.ndarray, error_px: Callable
+) -> None:
+    """Measured at levels 2 and 3: 0.023 and 0.024 px."""
     errors = [error_px(run(levels=1).homographies), error_px(run(levels=2).homographies), error_px(three_levels)]
     assert errors[1] < 0.85 * errors[0]
     assert errors[2] < 1.1 * errors[1]
+    assert errors[2] < 0.04
 
 
 def test_constant_groups_are_less_accurate_without_refinement(run: Callable, error_px: Callable) -> None:

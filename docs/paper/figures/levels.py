@@ -133,7 +133,7 @@ def groups_claims(numbers: Numbers) -> list[Claim]:
             "without new virtual exposures at each level, the estimates of the path are unreliable",
             f"mean corner error {few['mean_px']:g} px with {few['exposures']} exposures at each level, {many['mean_px']:g} px "
             f"with {many['exposures']} at the last",
-            few["mean_px"] > many["mean_px"],
+            few["mean_px"] > 2 * many["mean_px"],
         ),
         Claim(
             "this results in blur and ghosting artifacts",

@@ -14,6 +14,7 @@ from photonpano.contracts.loop import KNOTS, AttributedTrajectory, knot_errors, 
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
+from photonpano.filtering import smooth_share
 from photonpano.geometry import align_planes, corners, inverse, moving_corners, transform_points
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
@@ -151,7 +152,8 @@ def interpolate(
     Return also its expected errors at these instants, (N,): an interpolator that smooths leaves a part of those of exposures.
 
     An exposure shows the mean of its frames, which lies elsewhere than its instant if the motion within it was not what it was
-    merged along. How far is known as soon as the motion is, so that the knots are moved there, and the motion is fitted again.
+    merged along. How far is known as soon as the motion is, so that the knots are moved there, and the motion is fitted again:
+    as far as accelerations predict it, since a motion that trembles within groups is not known from their means.
 
     A `refined` motion is not replaced: what is interpolated is how far the exposures merged along it are from it.
 
@@ -161,9 +163,11 @@ def interpolate(
     """
     measured = Knots.of(located)
     with exposures.clock("interpolate"), exposures.level.attributing("interpolator"):
-        trajectory = _through(measured, exposures, located, timeline, reference, refined)
+        knots, trajectory = measured, _through(measured, exposures, located, timeline, reference, refined)
         for _ in range(_CENTRED):
-            knots = measured.moved(exposures.off_centre(trajectory)[located.solution.located])
+            displaced = exposures.off_centre(trajectory)[located.solution.located]
+            share = _smooth_share(trajectory, located)
+            knots = measured.moved(share * displaced + (1 - share) * np.eye(3))
             trajectory = _through(knots, exposures, located, timeline, reference, refined)
         std_px = located.std_px
         if len(std_px) < _FEWEST_KNOTS:
@@ -177,6 +181,17 @@ def interpolate(
     # The covariance of what is smoothed with the errors of what it is made of is its variance (a Gaussian smoother).
     before, after = uniform_filter1d(products, _AROUND, axis=1, mode="nearest")
     return trajectory, std_px * np.sqrt(np.clip(after / np.maximum(before, np.finfo(float).tiny), _LEAST_LEFT, 1))
+
+
+def _smooth_share(trajectory: Trajectory, located: LocatedLevel) -> float:
+    """Return how far accelerations predict the motion, at the mean distance of the exposures; 0 for few of them."""
+    instants = located.instants
+    if len(instants) < _FEWEST_KNOTS:
+        return 0.0
+    motions = trajectory.at(np.linspace(instants[0], instants[-1], len(instants)))
+    here = corners(located.frame_shape)
+    steps = transform_points(inverse(motions[:-1]) @ motions[1:], here) - here
+    return smooth_share(np.cumsum(steps.reshape(len(steps), -1), axis=0))
 
 
 def _through(

@@ -10,6 +10,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.sparse.linalg import splu
 
 from photonpano import FloatArray, LocationError
+from photonpano.filtering import smooth_share
 from photonpano.geometry import corners, from_parameters, inverse, normalised, parameters, transform_points
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators.sl3 import exponential, logarithm, unimodular
@@ -122,16 +123,15 @@ class SplinePath(HeldTrajectory):
     def __init__(self, instants: FloatArray, spline: BSpline, hold_frames: float | None, bent: float = 0.0) -> None:
         """Take a spline, which beyond its ends keeps its acceleration, too, for a share `bent` of the time that is held.
 
-        It keeps it as far as accelerations predict anything: by the share of the second differences of its values, at the mean
-        distance of the knots, that third differences do not have. A motion that trembles faster has no such share.
+        It keeps it as far as accelerations predict anything, at the mean distance of the knots: see `smooth_share`.
         """
         super().__init__(instants, hold_frames)
         self._spline, self._velocity = spline, spline.derivative()
         self._acceleration, self._bent = None, bent * self._hold
         if bent and len(instants) >= _FEWEST_BENT:
             values = spline(np.linspace(self._first, self._last, len(instants)))
-            second, third = ((np.diff(values, order, axis=0) ** 2).mean(axis=0) for order in (2, 3))
-            self._acceleration = np.clip(1 - third / np.maximum(second, np.finfo(float).tiny), 0, 1), spline.derivative(2)
+            share = np.array([smooth_share(values[:, [column]]) for column in range(values.shape[1])])
+            self._acceleration = share, spline.derivative(2)
 
     def _extrapolated(self, inside: FloatArray, beyond: FloatArray) -> FloatArray:
         found = self._spline(inside) + self._velocity(inside) * beyond[:, None]
