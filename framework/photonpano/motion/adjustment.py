@@ -55,7 +55,12 @@ class Assessment:
     @property
     def std_px(self) -> FloatArray:
         """The expected error of the corners of each node: (N,)."""
-        return np.asarray(np.sqrt((self.errors_px**2).mean(axis=(1, 2)) * 2))
+        return std_of(self.errors_px)
+
+
+def std_of(errors_px: FloatArray) -> FloatArray:
+    """Return the expected error of the corners of each node, (N,), from errors that were drawn: (N, 8, S)."""
+    return np.asarray(np.sqrt((errors_px**2).mean(axis=(1, 2)) * 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

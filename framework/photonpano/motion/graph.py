@@ -175,7 +175,7 @@ def _of_background(
         return tied, fits
     # A richer model may follow what is near, too, but then fits neither part: most patches agree with the right one.
     turning = {model: fit for model, fit in fits.items() if model.kind == "rotation"}
-    rivals = {likeliest, *([_likeliest(turning, tied.frame_shape)] if turning else [])}
+    rivals = dict.fromkeys([likeliest, *([_likeliest(turning, tied.frame_shape)] if turning else [])])
     selected = {model: agreed for model in rivals if (agreed := _agreed(tied, model, fits[model]))}
     if not selected:
         return tied, fits
@@ -370,16 +370,17 @@ class _Tied:
     def fit(self, adjustment: Adjustment[Any], state: Any) -> _Fit:
         """Solve from a start; drop outliers, unless the graph would fall apart, and solve again."""
         kept = np.ones(len(self.motions), dtype=bool)
-        found, norms = self._minimised(adjustment, state, kept)
+        found, norms = adjustment.minimise(state, kept)
+        adjustment.hold_noise(norms, kept)
+        found, norms = self._learnt(adjustment, found, norms, kept)
         inliers = adjustment.inliers(norms)
         if not inliers.all() and not component_labels(len(self.order), self.compact_pairs[inliers]).any():
             kept = inliers
-            found, norms = self._minimised(adjustment, found, kept)
+            found, norms = self._learnt(adjustment, *adjustment.minimise(found, kept), kept)
         return _Fit(adjustment, found, norms, kept)
 
-    def _minimised(self, adjustment: Adjustment[Any], state: Any, kept: BoolArray) -> tuple[Any, FloatArray]:
-        found, norms = adjustment.minimise(state, kept)
-        adjustment.hold_noise(norms, kept)
+    def _learnt(self, adjustment: Adjustment[Any], found: Any, norms: FloatArray, kept: BoolArray) -> tuple[Any, FloatArray]:
+        """Solve again with variances of the prior that the solution shows."""
         for _ in range(_LEARNT):
             if not adjustment.learn(found, adjustment.weights(norms, kept)):
                 break

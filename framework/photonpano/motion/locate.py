@@ -14,6 +14,7 @@ from photonpano.errors import PluginError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import thread_pool
 from photonpano.geometry import corner_displacements, inverse
+from photonpano.motion.adjustment import std_of
 from photonpano.motion.closures import MIN_SIMILARITY, closure_candidates, exposure_similarity
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.exposure_tasks import Pair
@@ -52,7 +53,7 @@ class LocatedLevel:
     @property
     def std_px(self) -> FloatArray:
         """The expected error of the corners of each located exposure, (N,); NaN for a single one."""
-        return np.asarray(np.sqrt((self.errors_px**2).mean(axis=(1, 2)) * 2))
+        return std_of(self.errors_px)
 
     @property
     def instants(self) -> FloatArray:
