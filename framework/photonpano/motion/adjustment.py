@@ -157,8 +157,8 @@ class Adjustment(ABC, Generic[StateT]):
 
     @property
     def n_hyperparameters(self) -> int:
-        """How many numbers beside those of the nodes were estimated."""
-        return self._n_shared
+        """How many variances of the prior were estimated."""
+        return 0
 
     def std_camera(self, state: StateT, shared: FloatArray) -> FloatArray:
         """Return what `Assessment` holds of a camera, given (s, S) draws of errors of the shared unknowns."""
@@ -215,8 +215,8 @@ class Adjustment(ABC, Generic[StateT]):
     def deviance(self, state: StateT, weights: FloatArray) -> float:
         """Return minus twice the logarithm of the marginal likelihood of a solution, up to a constant that all models share.
 
-        Unknowns are integrated out around it (Laplace), and each number that was estimated beside them has its price. `weights`
-        (E,) are the same for all models.
+        Unknowns are integrated out around it (Laplace), and each variance that was estimated has its price. `weights` (E,) are
+        the same for all models.
         """
         jacobians, residuals = self._linearised(state, weights)
         free = self._free(state)
