@@ -41,29 +41,17 @@ _BLANK = np.ones((1, 1), np.float32)
 
 @dataclass(frozen=True)
 class Cover:
-    """Something flat and upright.
+    """Something flat and upright."""
 
-    Attributes:
-        kind: board or person.
-        size: of its texture.
-        azimuth: (T,) of its middle in radians, to the right.
-        elevation: in radians, down.
-        distance_m: of its middle along the ground.
-        size_m: width and height.
-        slant: turn about its upright axis in radians; at 0 it faces the first camera.
-        swing: (T,) of the legs of a person, in radians.
-        texture: flux, (height, width).
-    """
-
-    kind: str
-    size: tuple[int, int]
-    azimuth: FloatArray
-    elevation: float
-    distance_m: float
-    size_m: tuple[float, float]
-    slant: float = 0.0
-    swing: FloatArray | None = None
-    texture: NDArray[np.float32] = field(default_factory=lambda: _BLANK)
+    kind: str  # board or person
+    size: tuple[int, int]  # of its texture
+    azimuth: FloatArray  # (T,) of its middle in radians, to the right
+    elevation: float  # in radians, down
+    distance_m: float  # of its middle along the ground
+    size_m: tuple[float, float]  # width and height
+    slant: float = 0.0  # turn about its upright axis in radians; at 0 it faces the first camera
+    swing: FloatArray | None = None  # (T,) of the legs of a person, in radians
+    texture: NDArray[np.float32] = field(default_factory=lambda: _BLANK)  # flux, (height, width)
 
     def plane(self, frame: int) -> FloatArray:
         """Return the map of its texels (x, y, 1) to the world: (3, 3)."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,8 +18,6 @@ from photonpano.record.contents import finish_run_folder
 from photonpano.text import counted
 
 _PARTIAL = re.compile(r"\.(.+\.)?[0-9a-f]{8}\.partial(\.\w+)?")
-_OLDER = re.compile(r"\.part-[a-z0-9_]{8}")
-_OLDER_S = 24 * 3600  # older versions lock nothing: their unfinished files are leftovers after a day
 _UNPACKED = ".unpacked.npy"
 
 
@@ -78,8 +75,6 @@ def _candidates(folder: Path, dry_run: bool) -> Iterator[Path]:
 def _is_temporary(path: Path) -> bool:
     if path.is_symlink():
         return False
-    if _OLDER.fullmatch(path.name):
-        return path.is_dir() and time.time() - path.stat().st_mtime > _OLDER_S
     if path.name.endswith(f".gz{_UNPACKED}"):
         return path.with_name(path.name.removesuffix(_UNPACKED)).is_file()
     return _PARTIAL.fullmatch(path.name) is not None or is_lock(path)

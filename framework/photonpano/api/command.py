@@ -33,26 +33,18 @@ class DoubtfulError(PhotonpanoError):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command of the program.
+    """A command of the program."""
 
-    Attributes:
-        function: does the work; its signature and docstring give the options.
-        prints: turns the result into the lines of standard output. Its keyword-only parameters are options as well.
-        example: the words after the name of the command, for its help.
-        plan: what gives the parameter `plan`: a spec, or a capture with options.
-        settings: options that stand for values of the section `render`, as `--scale 2` for `--set render.scale=2`.
-        notes: whether the notes of the progress are printed without a terminal, or the option that decides it.
-        calls: is called in place of `function`, with the same parameters.
-        options: how parameters are given, where names, types and docstring do not say it.
-    """
-
-    function: Callable[..., Any]
+    function: Callable[..., Any]  # does the work; its signature and docstring give the options
+    # turns the result into the lines of standard output; its keyword-only parameters are options as well
     prints: Callable[..., Iterable[str]]
-    example: str = ""
-    plan: Literal["spec", "capture"] | None = None
+    example: str = ""  # the words after the name of the command, for its help
+    plan: Literal["spec", "capture"] | None = None  # what gives the parameter `plan`: a spec, or a capture with options
+    # options that stand for values of the section `render`, as `--scale 2` for `--set render.scale=2`
     settings: Mapping[str, Any] = field(default_factory=dict)
-    notes: bool | str = False
-    calls: Callable[..., Any] | None = None
+    notes: bool | str = False  # whether the notes of the progress are printed without a terminal, or the option that decides it
+    calls: Callable[..., Any] | None = None  # is called in place of `function`, with the same parameters
+    # how parameters are given, where names, types and docstring do not say it
     options: Mapping[str, Any] = field(default_factory=dict)
 
 

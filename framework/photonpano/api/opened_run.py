@@ -40,21 +40,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenedRun:
-    """A finished run, with its capture.
-
-    Attributes:
-        capture: the capture, with the corrections of the spec.
-        source: the same, divided by the vignette, in the light and through the lens that the run found.
-        motion: of every frame; where the run did not record `std_px`, it is 0.
-    """
+    """A finished run, with its capture."""
 
     folder: Path
     record: RunRecord
     plan: Plan
-    capture: Source
-    source: Source
+    capture: Source  # with the corrections of the spec
+    source: Source  # the same, divided by the vignette, in the light and through the lens that the run found
     vignette: Vignette | None
-    motion: FrameMotion
+    motion: FrameMotion  # of every frame; where the run did not record `std_px`, it is 0
     has_std_px: bool
 
 

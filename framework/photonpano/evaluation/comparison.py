@@ -19,16 +19,11 @@ _ROUNDING_PX = 1e-6  # smaller differences are rounding errors: equal motions di
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionDifference:
-    """How far a motion is from another one of the same frames.
+    """How far a motion is from another one of the same frames."""
 
-    Attributes:
-        corners_px: (T,) mean distance of the corners of a frame, in px of a frame; 0 for the same motion, NaN where either has
-            not located it.
-        alignment: (3, 3), pixels of the reference plane to pixels of that of the other motion.
-    """
-
+    # (T,) mean distance of the corners of a frame, in px of a frame; 0 for the same motion, NaN where either has not located it
     corners_px: FloatArray
-    alignment: Homography
+    alignment: Homography  # (3, 3), pixels of the reference plane to pixels of that of the other motion
 
 
 def motion_difference(run: RunTrajectory, other: RunTrajectory) -> MotionDifference | None:

@@ -24,18 +24,13 @@ _ROWS = 256  # rows of the true scene sampled at a time, to bound the memory
 
 @dataclass(frozen=True, slots=True)
 class ImageScore:
-    """Similarity of an image to the truth, in sRGB from 0 to 1, over the compared pixels.
+    """Similarity of an image to the truth, in sRGB from 0 to 1, over the compared pixels."""
 
-    Attributes:
-        psnr_db: peak signal-to-noise ratio, `-10 log10(mean squared difference)`; infinite for equal images.
-        ssim: mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 px) over the pixels whose whole window is
-            compared; NaN if there is none.
-        compared_share: share of the pixels of the image that are compared.
-    """
-
-    psnr_db: float
+    psnr_db: float  # peak signal-to-noise ratio, `-10 log10(mean squared difference)`; infinite for equal images
+    # mean structural similarity (Wang et al. 2004: Gaussian window, sigma 1.5 px) over the pixels whose whole window is
+    # compared; NaN if there is none
     ssim: float
-    compared_share: float
+    compared_share: float  # share of the pixels of the image that are compared
 
 
 def covered(weight: FluxImage) -> BoolArray:

@@ -32,25 +32,19 @@ _TRUTH = "a truth as `photonpano simulate` writes it"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """True motion and scene of a simulated capture.
+    """True motion and scene of a simulated capture."""
 
-    Attributes:
-        homographies: (T, 3, 3), frame pixels to pixels of the scene; exact at the corners of the frame if the lens distorts.
-        scene: (H, W) float32, photons per pixel per frame; (H, W, 3) of red, green and blue pixels; None if only the motion is
-            known.
-        ideal_homographies: (T, 3, 3), those of a lens without distortion.
-        around: whether the scene is an equirectangular panorama, 360 degrees wide; homographies then map to pixels of the
-            camera that looks at its middle.
-        path: of the file, for messages.
-    """
-
+    # (T, 3, 3), frame pixels to pixels of the scene; exact at the corners of the frame if the lens distorts
     homographies: FloatArray
     frame_shape: tuple[int, int]
+    # (H, W) float32, photons per pixel per frame; (H, W, 3) of red, green and blue pixels; None if only the motion is known
     scene: FluxImage | None
-    ideal_homographies: FloatArray
+    ideal_homographies: FloatArray  # (T, 3, 3), those of a lens without distortion
     turn: Turn | None = None
+    # whether the scene is an equirectangular panorama, 360 degrees wide; homographies then map to pixels of the camera that
+    # looks at its middle
     around: bool = False
-    path: Path = Path("the truth")
+    path: Path = Path("the truth")  # of the file, for messages
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,19 +16,14 @@ class TrajectoryScore:
 
     The error of a frame is the mean, over its four corners, of the distance between the true and the estimated position, in
     pixels of the frame. Statistics are over the located frames.
-
-    Attributes:
-        errors_px: (T,) error of every frame, located or not.
-        alignment: (3, 3), pixels of the estimated reference plane to pixels of the true plane.
-        p95_px: 95 % quantile of the errors.
     """
 
-    errors_px: FloatArray
+    errors_px: FloatArray  # (T,) error of every frame, located or not
     located: BoolArray
-    alignment: Homography
+    alignment: Homography  # (3, 3), pixels of the estimated reference plane to pixels of the true plane
     mean_px: float
     median_px: float
-    p95_px: float
+    p95_px: float  # 95 % quantile of the errors
     max_px: float
     located_share: float
 

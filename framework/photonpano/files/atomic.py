@@ -26,7 +26,7 @@ def discard_unfinished() -> None:
     Each is renamed first. So a thread that still works finds nothing that it could give the final name to.
     """
     for each in list(_unfinished):
-        doomed = each.with_name(f".part-{secrets.token_hex(4)}")
+        doomed = each.with_name(f".{secrets.token_hex(4)}.partial")
         with suppress(OSError):
             each.rename(doomed)
             if doomed.is_dir():

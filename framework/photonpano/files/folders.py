@@ -25,8 +25,6 @@ from photonpano.files.locks import claim
 
 PENDING = ".photonpano-pending"  # the folder of new files that are complete, and not yet all in place
 _REMOVED = ".removed"  # a file in it: the names that the folder loses
-# Folders of unfinished files of older versions, and of what a stopped program discards
-_OLDER = re.compile(r"\.part-[a-z0-9_]{8}")
 _AT_FDCWD, _RENAME_EXCHANGE, _RENAME_SWAP = -100, 2, 2
 
 
@@ -109,8 +107,7 @@ def remove_leftovers(directory: Path) -> None:
     """Remove what dead replacements of a folder have left; for the process that holds its lock."""
     beside = partial_paths(directory.parent, f".{directory.name}.", ".partial")
     inside = partial_paths(directory, ".", ".partial")
-    older = [path for path in _entries(directory) if _OLDER.fullmatch(path.name)]
-    for path in (*beside, *inside, *older):
+    for path in (*beside, *inside):
         with claim(path) as mine:
             if mine is not False:
                 remove(path)
@@ -133,7 +130,7 @@ def others_in(directory: Path, own: Iterable[str]) -> list[Path]:
 
 def is_ours(name: str) -> bool:
     """Return whether a name in a folder belongs to its replacement."""
-    return name in (PENDING, ".lock") or is_partial(name, ".", ".partial") or _OLDER.fullmatch(name) is not None
+    return name in (PENDING, ".lock") or is_partial(name, ".", ".partial")
 
 
 def replace_folder(staging: Path, directory: Path, replaced: Iterable[str]) -> None:

@@ -120,19 +120,12 @@ def accumulate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:
-    """The sum of a run of chunks on the part of the grid that it covers.
+    """The sum of a run of chunks on the part of the grid that it covers."""
 
-    Attributes:
-        box: rows and columns of that part.
-        counts: (h, w) float32.
-        coverages: (P, h, w) float32.
-        n_frames: of the run.
-    """
-
-    box: tuple[slice, slice]
-    counts: FluxImage
-    coverages: FluxImage
-    n_frames: int
+    box: tuple[slice, slice]  # rows and columns of that part
+    counts: FluxImage  # (h, w) float32
+    coverages: FluxImage  # (P, h, w) float32
+    n_frames: int  # of the run
 
 
 def _frames(chunks: Sequence[Chunk]) -> int:

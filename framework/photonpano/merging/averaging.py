@@ -25,39 +25,25 @@ _INSIDE = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Averages:
-    """Means over the frames that show each pixel of a part of a canvas, (h, w) float32.
+    """Means over the frames that show each pixel of a part of a canvas, (h, w) float32."""
 
-    Attributes:
-        std_factor: standard deviation of a merge in units of that without interpolation, from 0.5 to 1.
-        motion_variance: of the place that they show along one direction, in squared pixels of the canvas. It is that of one
-            frame: neighbouring frames err alike.
-        light_variance: of their gain, relative to it.
-    """
-
-    std_factor: FluxImage
+    std_factor: FluxImage  # standard deviation of a merge in units of that without interpolation, from 0.5 to 1
+    # of the place that they show along one direction, in squared pixels of the canvas; it is that of one frame: neighbouring
+    # frames err alike
     motion_variance: FluxImage
-    light_variance: FluxImage
+    light_variance: FluxImage  # of their gain, relative to it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Averaging:
-    """The motion that brings pixels of frames between pixels of a canvas, at instants all over the frames that are rendered.
+    """The motion that brings pixels of frames between pixels of a canvas, at instants all over the frames that are rendered."""
 
-    Attributes:
-        homographies: (N, 3, 3), pixels of each instant's frame to pixels of the reference plane.
-        frame_shape: (height, width) of a frame.
-        canvas: the pixel grid.
-        camera: of the frames; None if it is not known.
-        std_px: (N,) expected corner error of each instant's frame, in its pixels.
-        std_light: (N,) standard deviation of the gain of its light.
-    """
-
-    homographies: FloatArray
-    frame_shape: tuple[int, int]
-    canvas: Canvas
-    camera: Camera | None
-    std_px: FloatArray
-    std_light: FloatArray
+    homographies: FloatArray  # (N, 3, 3), pixels of each instant's frame to pixels of the reference plane
+    frame_shape: tuple[int, int]  # (height, width) of a frame
+    canvas: Canvas  # the pixel grid
+    camera: Camera | None  # of the frames; None if it is not known
+    std_px: FloatArray  # (N,) expected corner error of each instant's frame, in its pixels
+    std_light: FloatArray  # (N,) standard deviation of the gain of its light
 
     @classmethod
     def of(

@@ -27,19 +27,13 @@ _BEHIND = 1e-6  # rays with less depth than this are behind the camera
 
 
 class Texture(NamedTuple):
-    """An image made ready for interpolation: a place takes one word of memory instead of four pixels.
+    """An image made ready for interpolation: a place takes one word of memory instead of four pixels."""
 
-    Attributes:
-        texels: (h + 1, w + 1) uint64, or uint32 for an image of bytes. That at (x, y) holds the pixels (x - 1, y - 1),
-            (x, y - 1), (x - 1, y) and (x, y), the first in its lowest bits, as levels of 16 or 8 bits; pixels outside of the
-            image are 0.
-        scale: value of a level, a power of two. Whole numbers up to 65,535 are exact, others to 1 / 65,535 of their range.
-        zero: level of 0.
-    """
-
+    # (h + 1, w + 1) uint64, or uint32 for an image of bytes. That at (x, y) holds the pixels (x - 1, y - 1), (x, y - 1),
+    # (x - 1, y) and (x, y), the first in its lowest bits, as levels of 16 or 8 bits; pixels outside of the image are 0
     texels: NDArray[np.uint32] | NDArray[np.uint64]
-    scale: float
-    zero: float
+    scale: float  # value of a level, a power of two; whole numbers up to 65,535 are exact, others to 1 / 65,535 of their range
+    zero: float  # level of 0
 
     @classmethod
     def of(cls, image: Image) -> Texture:
@@ -124,30 +118,19 @@ class Grid(NamedTuple):
     """Sums on a grid, and the rays of the pixels of a box of it: see `Canvas`.
 
     Sums are those of all of the grid, for loops over slices of them would not be vectorised.
-
-    Attributes:
-        p: (w,) of the columns of the box, relative to `p0`, for float32 is not exact enough for thousands of pixels.
-        s: (w,) of the columns, relative to `s0`.
-        p0: of the middle column of the grid.
-        s0: of the middle column.
-        q: (h,) of the rows of the box.
-        r: (h,) of the rows.
-        top: first row of the box.
-        left: first column.
-        total: (H, W) float32 sums of counts.
-        coverages: (P, H, W) float32 sums of what was seen.
     """
 
+    # (w,) of the columns of the box, relative to `p0`, for float32 is not exact enough for thousands of pixels
     p: NDArray[np.float32]
-    s: NDArray[np.float32]
-    p0: float
-    s0: float
-    q: NDArray[np.float64]
-    r: NDArray[np.float64]
-    top: int
-    left: int
-    total: NDArray[np.float32]
-    coverages: NDArray[np.float32]
+    s: NDArray[np.float32]  # (w,) of the columns, relative to `s0`
+    p0: float  # of the middle column of the grid
+    s0: float  # of the middle column
+    q: NDArray[np.float64]  # (h,) of the rows of the box
+    r: NDArray[np.float64]  # (h,) of the rows
+    top: int  # first row of the box
+    left: int  # first column
+    total: NDArray[np.float32]  # (H, W) float32 sums of counts
+    coverages: NDArray[np.float32]  # (P, H, W) float32 sums of what was seen
 
     @classmethod
     def zeros(cls, canvas: Canvas, number: int) -> Grid:

@@ -49,18 +49,13 @@ def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
 
 @dataclass(frozen=True, slots=True)
 class CaptureOpener:
-    """Opens a capture in another process, for the tasks of one run.
+    """Opens a capture in another process, for the tasks of one run."""
 
-    Attributes:
-        run: unique ID of the run: workers may outlive a run, and files may change.
-        needed: what the run needs, as `met_by` returns it.
-    """
-
-    run: str
+    run: str  # unique ID of the run: workers may outlive a run, and files may change
     seed: int = field(compare=False)
     source: str = field(compare=False)
     keys: Mapping[str, Any] = field(compare=False)
-    needed: Mapping[str, str] = field(compare=False)
+    needed: Mapping[str, str] = field(compare=False)  # what the run needs, as `met_by` returns it
 
     def __call__(self) -> PluginSource:
         """Open the capture. From then on, the libraries of the process work in one thread: workers are many processes.

@@ -30,24 +30,17 @@ _THINNEST_PX, _MARGIN_PX = 2, 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Film:
-    """What the pictures of a video show.
+    """What the pictures of a video show."""
 
-    Attributes:
-        source: the capture, divided by its vignette and in its light.
-        canvas: of the panorama; of the view of a frame, if the path is smooth.
-        tolerance_px: motion within which frames are summed before they are warped.
-        smooth_frames: standard deviation of the smooth path, in frames; None for pictures in the plane of the panorama.
-        white_flux: flux that is white, photons per pixel per frame.
-        panorama: (H, W) or (H, W, 3) flux, shown around the frame, whose outline is drawn; None for neither.
-    """
-
-    source: Source
+    source: Source  # the capture, divided by its vignette and in its light
     motion: FrameMotion
-    canvas: Canvas
-    tolerance_px: float
+    canvas: Canvas  # of the panorama; of the view of a frame, if the path is smooth
+    tolerance_px: float  # motion within which frames are summed before they are warped
+    # standard deviation of the smooth path, in frames; None for pictures in the plane of the panorama
     smooth_frames: float | None
-    white_flux: float
+    white_flux: float  # flux that is white, photons per pixel per frame
     white_balance: WhiteBalance
+    # (H, W) or (H, W, 3) flux, shown around the frame, whose outline is drawn; None for neither
     panorama: FluxImage | None = None
 
     def pictures(self, spans: Sequence[FrameSpan], threads: int, bits: Literal[8, 16]) -> Iterator[Picture]:

@@ -49,24 +49,17 @@ _EXPLAINED = 0.9  # changing light is accepted if it lowers the reduced chi-squa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Proposal:
-    """A change of the state.
+    """A change of the state."""
 
-    Attributes:
-        make: returns the new state; None if a closer look finds nothing to change.
-        worse: returns how the new motion explains the photons worse than the old one, as a clause, empty if it does not. None
-            to accept the new state without comparison, so that its errors end the run.
-        settle: completes the new state once it is accepted.
-        rejection: begins the message about a proposal that is rejected, of this severity.
-        refused: completes the state that is kept then.
-    """
-
-    make: Callable[[], State | None]
+    make: Callable[[], State | None]  # returns the new state; None if a closer look finds nothing to change
+    # returns how the new motion explains the photons worse than the old one, as a clause, empty if it does not; None to accept
+    # the new state without comparison, so that its errors end the run
     worse: Callable[[MotionFit, MotionFit], str] | None = MotionFit.worse_than
-    settle: Callable[[State], State] = lambda proposed: proposed
-    rejection: str = ""
-    severity: int = logging.DEBUG
+    settle: Callable[[State], State] = lambda proposed: proposed  # completes the new state once it is accepted
+    rejection: str = ""  # begins the message about a proposal that is rejected
+    severity: int = logging.DEBUG  # of this message
     summary: str = ""
-    refused: Callable[[State], State] = lambda state: state
+    refused: Callable[[State], State] = lambda state: state  # completes the state that is kept when the proposal is rejected
 
 
 Pass: TypeAlias = Callable[[State], Proposal | None]

@@ -183,21 +183,13 @@ def build_renderer(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredPanorama:
-    """The files of a rendered panorama: a `FinishedPanorama`.
+    """The files of a rendered panorama: a `FinishedPanorama`."""
 
-    Attributes:
-        flux: (H, W) or (H, W, 3) float32, on disk.
-        weight: the same shape, on disk.
-        std: the same shape, on disk.
-        canvas: (3, 3), pixels of the reference plane to pixels of the panorama: see `FinishedPanorama`.
-        white_flux: flux that is white in the picture.
-    """
-
-    flux: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    std: NDArray[np.float32]
-    canvas: Homography
-    white_flux: float
+    flux: NDArray[np.float32]  # (H, W) or (H, W, 3) float32, on disk
+    weight: NDArray[np.float32]  # the same shape, on disk
+    std: NDArray[np.float32]  # the same shape, on disk
+    canvas: Homography  # (3, 3), pixels of the reference plane to pixels of the panorama: see `FinishedPanorama`
+    white_flux: float  # flux that is white in the picture
     noise: CanvasNoise
     projection: str = "planar"
 

@@ -42,29 +42,21 @@ COMPILING = "compiling for this machine, once; `photonpano warm-up` does it befo
 
 @dataclass(eq=False)
 class BegunRun:
-    """A run that has begun.
-
-    Attributes:
-        start: when the capture was open, in seconds of `time.perf_counter`.
-        journal: the decisions so far, in the order in which they were taken.
-        levels: the levels so far; one that was located again is there more than once.
-        was_finished: whether the run was finished before, so that nothing is left to do.
-        record: of the finished run.
-        verdict: whether the results explain the photons.
-    """
+    """A run that has begun."""
 
     plan: Plan
     source: Source
     folder: RunFolder
     observers: Observers
     progress: Progress
-    start: float
-    journal: list[Decision] = field(default_factory=list)
+    start: float  # when the capture was open, in seconds of `time.perf_counter`
+    journal: list[Decision] = field(default_factory=list)  # the decisions so far, in the order in which they were taken
+    # the levels so far; one that was located again is there more than once
     levels: list[LevelResult] = field(default_factory=list)
     work: Work | None = None
-    was_finished: bool = False
-    record: RunRecord = field(init=False)
-    verdict: Verdict | None = None
+    was_finished: bool = False  # whether the run was finished before, so that nothing is left to do
+    record: RunRecord = field(init=False)  # of the finished run
+    verdict: Verdict | None = None  # whether the results explain the photons
 
     @cached_property
     def capture(self) -> CaptureRecord:

@@ -34,40 +34,25 @@ class View(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """A capture as corrected so far, and its motion as known so far. It is frozen: passes return new states.
-
-    Attributes:
-        source: the capture as corrected so far, in its light, but not yet through the camera that was found.
-        context: threads, progress, and checkpoints that depend on these corrections.
-        reference: the frame whose homography is the identity.
-        timeline: repeated frames, and where the motion is cut.
-        start: the motion known before the first level; None if there is none.
-        gyroscope: that turned with the camera; None if there is none.
-        shortened: groups whose size is chosen from the capture are shortened that many times.
-        outdated: whether the source was corrected since these levels were located.
-        watched: whether what hides the background was looked for.
-        vignette: by which the source is divided.
-        refined: the motion corrected by refiners; None for that of the last level.
-        known_fit: how well that explains the photons, if it is known without measuring them.
-    """
+    """A capture as corrected so far, and its motion as known so far. It is frozen: passes return new states."""
 
     plan: Plan
-    source: Source
-    context: Context
-    reference: int
+    source: Source  # the capture as corrected so far, in its light, but not yet through the camera that was found
+    context: Context  # threads, progress, and checkpoints that depend on these corrections
+    reference: int  # the frame whose homography is the identity
     levels: tuple[Level, ...]
-    timeline: Timeline
+    timeline: Timeline  # repeated frames, and where the motion is cut
     model: MotionModel = HOMOGRAPHIES
-    start: Trajectory | None = None
-    gyroscope: Gyroscope | None = None
-    shortened: int = 1
+    start: Trajectory | None = None  # the motion known before the first level; None if there is none
+    gyroscope: Gyroscope | None = None  # that turned with the camera; None if there is none
+    shortened: int = 1  # groups whose size is chosen from the capture are shortened that many times
     results: tuple[LevelResult, ...] = ()
-    outdated: bool = False
-    watched: bool = False
-    vignette: Vignette | None = None
+    outdated: bool = False  # whether the source was corrected since these levels were located
+    watched: bool = False  # whether what hides the background was looked for
+    vignette: Vignette | None = None  # by which the source is divided
     decisions: tuple[Decision, ...] = ()
-    refined: FrameMotion | None = None
-    known_fit: MotionFit | None = None
+    refined: FrameMotion | None = None  # the motion corrected by refiners; None for that of the last level
+    known_fit: MotionFit | None = None  # how well that explains the photons, if it is known without measuring them
 
     def located(self, levels: Sequence[Level], previous: Trajectory | None, corrected: Trajectory | None = None) -> State:
         """Run some levels of the loop from a motion, if one is known; they replace results of the same and later levels.

@@ -37,25 +37,18 @@ _MOST_DIFFERENCES = 60  # number of settings that are listed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ComparedRun:
-    """A run that is compared with others.
+    """A run that is compared with others."""
 
-    Attributes:
-        name: short, and different from those of the others.
-        picture: (H, W) or (H, W, 3) uint8, its panorama on the canvas of the first run.
-        difference_px: (T,) mean distance of the corners of each frame from where the first run has them, after the best
-            alignment of the planes, in px of a frame; NaN where either has not located it. None for the first run.
-        corner_error_px: mean distance of the corners from their true places; None without a truth.
-        psnr_db: of the panorama, as is `ssim`; None without a true scene.
-    """
-
-    name: str
+    name: str  # short, and different from those of the others
     folder: Path
     record: RunRecord
-    picture: NDArray[np.uint8]
+    picture: NDArray[np.uint8]  # (H, W) or (H, W, 3) uint8, its panorama on the canvas of the first run
+    # (T,) mean distance of the corners of each frame from where the first run has them, after the best alignment of the planes,
+    # in px of a frame; NaN where either has not located it; None for the first run
     difference_px: FloatArray | None
-    corner_error_px: float | None = None
-    psnr_db: float | None = None
-    ssim: float | None = None
+    corner_error_px: float | None = None  # mean distance of the corners from their true places; None without a truth
+    psnr_db: float | None = None  # of the panorama; None without a true scene
+    ssim: float | None = None  # likewise
 
     @property
     def mean_difference_px(self) -> float | None:

@@ -131,17 +131,12 @@ _CONTENTS = {
 
 @dataclass(frozen=True, slots=True)
 class ListedFile:
-    """A file of a run folder, or a folder in it, whose name ends in a slash.
-
-    Attributes:
-        bytes: its size, with all that a folder holds; None where it is not known yet.
-        content: what it holds; empty where only its writer knows.
-    """
+    """A file of a run folder, or a folder in it, whose name ends in a slash."""
 
     name: str
     link: str
-    bytes: int | None
-    content: str
+    bytes: int | None  # its size, with all that a folder holds; None where it is not known yet
+    content: str  # what it holds; empty where only its writer knows
 
 
 def listed_files(files: Mapping[str, FileContent]) -> tuple[list[ListedFile], int]:

@@ -84,16 +84,11 @@ _FRUSTUM = 0.14  # depth of a camera's frustum, relative to the radius of what i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Viewpoint:
-    """A place to look from at `middle`, from the side `name`, such as "from above".
+    """A place to look from at `middle`, from the side `name`, such as "from above"."""
 
-    Attributes:
-        axes: (3, 3) rows to the right, up, and towards the viewer, in the world.
-        distance: of the viewer from the middle.
-    """
-
-    axes: FloatArray
+    axes: FloatArray  # (3, 3) rows to the right, up, and towards the viewer, in the world
     middle: FloatArray
-    distance: float
+    distance: float  # of the viewer from the middle
     name: str
 
     def project(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:

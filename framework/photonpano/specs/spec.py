@@ -32,22 +32,15 @@ from photonpano.values import Decision
 
 @dataclass
 class Spec:
-    """A spec while it is resolved.
-
-    Attributes:
-        directory: what relative paths count from.
-        arriving: whether the capture is still being written, so that its files are not checked.
-        decisions: choices that the spec leaves open and that reading it made.
-        remark: added to the message of every problem.
-    """
+    """A spec while it is resolved."""
 
     root: Written
     catalog: Catalog = field(default_factory=Catalog)
-    directory: Path = Path()
-    arriving: bool = False
+    directory: Path = Path()  # what relative paths count from
+    arriving: bool = False  # whether the capture is still being written, so that its files are not checked
     problems: list[Problem] = field(default_factory=list)
-    decisions: list[Decision] = field(default_factory=list)
-    remark: str = ""
+    decisions: list[Decision] = field(default_factory=list)  # choices that the spec leaves open and that reading it made
+    remark: str = ""  # added to the message of every problem
 
     def wrong(self, value: Written, message: str) -> None:
         """Report a problem with a value."""

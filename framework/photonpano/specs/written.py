@@ -14,27 +14,17 @@ from photonpano.files.paths import Url
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a value of a spec was written, or would be.
+    """Where a value of a spec was written, or would be."""
 
-    Attributes:
-        where: path inside the spec, such as `levels.0.scale`; empty for the whole.
-        file: the spec file, None for a spec that was built in Python.
-        line: line of the key (of the value, if it has no key) in the file, from 1; None if unknown.
-        column: column of the key in the line, from 1; None if unknown.
-        override: the override that set the value, such as `run.seed=1`; None if it stands in the spec itself.
-        start: line and column of the value, if it has a key.
-        is_written: whether a value stands here; if not, line and column are those of the mapping or list where it would stand.
-        is_readable: whether what stands here, or around it, could be read; if not, that is the only problem with it.
-    """
-
-    where: str = ""
-    file: Path | None = None
-    line: int | None = None
-    column: int | None = None
-    override: str | None = None
-    start: tuple[int, int] | None = None
+    where: str = ""  # path inside the spec, such as `levels.0.scale`; empty for the whole
+    file: Path | None = None  # the spec file, None for a spec that was built in Python
+    line: int | None = None  # line of the key (of the value, if it has no key) in the file, from 1; None if unknown
+    column: int | None = None  # column of the key in the line, from 1; None if unknown
+    override: str | None = None  # the override that set the value, such as `run.seed=1`; None if it stands in the spec itself
+    start: tuple[int, int] | None = None  # line and column of the value, if it has a key
+    # whether a value stands here; if not, line and column are those of the mapping or list where it would stand
     is_written: bool = True
-    is_readable: bool = True
+    is_readable: bool = True  # whether what stands here, or around it, could be read; if not, that is the only problem with it
 
     def problem(self, message: str) -> Problem:
         """Return a problem with the key, or with the value that has none."""

@@ -19,8 +19,9 @@ from photonpano import (
     Url,
 )
 from photonpano import text as words
-from photonpano.files.atomic import atomic_path
-from photonpano.files.folders import atomic_folder
+from photonpano.api.clean import clean
+from photonpano.files.atomic import atomic_path, discard_unfinished, unfinished_folder
+from photonpano.files.folders import atomic_folder, is_ours
 from photonpano.files.paths import location
 from photonpano.filtering import exceeding_noise
 
@@ -233,6 +234,17 @@ def test_interrupt_while_the_temporary_file_is_made_leaves_nothing(
     monkeypatch.setattr("photonpano.files.atomic.claimed", interrupted)
     with pytest.raises(KeyboardInterrupt), lend(tmp_path / "cube.npy"):
         pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_stopped_program_had_no_time_to_remove_is_a_leftover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch, unfinished_folder(tmp_path / "scan", ".scan."):
+        patch.setattr("photonpano.files.atomic.shutil.rmtree", lambda *_, **__: None)
+        discard_unfinished()
+        (left,) = tmp_path.iterdir()
+        assert clean(tmp_path) == []  # its process holds it until it ends
+    assert is_ours(left.name)
+    assert clean(tmp_path) == [left]
     assert list(tmp_path.iterdir()) == []
 
 

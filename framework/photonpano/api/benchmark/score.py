@@ -47,31 +47,18 @@ Along: TypeAlias = "Callable[..., Panorama]"
 
 @dataclass(frozen=True, slots=True)
 class CaptureScore:
-    """The score of an entry on one capture; None where the entry, or the truth, does not tell.
+    """The score of an entry on one capture; None where the entry, or the truth, does not tell."""
 
-    Attributes:
-        capture: its name.
-        error_px: mean corner error of the located frames, after the best alignment.
-        p95_px: their 95 % quantile.
-        located_share: of the frames.
-        honest_share: of the located frames, those off by at most three times the error that the entry states.
-        psnr_db: of the panorama against the true scene.
-        ssim: likewise.
-        below_oracle_db: how much the panorama along the true motion is better.
-        seconds: that the program took, as the entry says.
-        note: what was adapted, or why there is no score.
-    """
-
-    capture: str
-    error_px: float | None = None
-    p95_px: float | None = None
-    located_share: float | None = None
-    honest_share: float | None = None
-    psnr_db: float | None = None
-    ssim: float | None = None
-    below_oracle_db: float | None = None
-    seconds: float | None = None
-    note: str = ""
+    capture: str  # its name
+    error_px: float | None = None  # mean corner error of the located frames, after the best alignment
+    p95_px: float | None = None  # their 95 % quantile
+    located_share: float | None = None  # of the frames
+    honest_share: float | None = None  # of the located frames, those off by at most three times the error that the entry states
+    psnr_db: float | None = None  # of the panorama against the true scene
+    ssim: float | None = None  # likewise
+    below_oracle_db: float | None = None  # how much the panorama along the true motion is better
+    seconds: float | None = None  # that the program took, as the entry says
+    note: str = ""  # what was adapted, or why there is no score
 
     def cells(self) -> list[str]:
         """Return the row of the table."""

@@ -28,17 +28,12 @@ _SHOWN = 3  # differences that a message names
 
 @dataclass(frozen=True, slots=True)
 class Continuation:
-    """What a run takes from the run before.
+    """What a run takes from the run before."""
 
-    Attributes:
-        resume: go on with an interrupted run of the same spec.
-        from_level: take the levels before this one, and compute this one and everything after it; None to take none.
-        keep: keep the work folder when the run is finished, for `from_level`.
-    """
-
-    resume: bool = False
+    resume: bool = False  # go on with an interrupted run of the same spec
+    # take the levels before this one, and compute this one and everything after it; None to take none
     from_level: int | None = None
-    keep: bool = False
+    keep: bool = False  # keep the work folder when the run is finished, for `from_level`
 
 
 class Work:

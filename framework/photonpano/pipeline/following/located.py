@@ -25,21 +25,13 @@ _MOST_GROUPS = 8  # maximum number of groups in a window, reached if frames come
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """Frames that were located in one call of the loop.
+    """Frames that were located in one call of the loop."""
 
-    Attributes:
-        source: the frames, as a capture of their own; those before `new` belong to the window before, too.
-        new: those that no window before had.
-        trajectory: of the source, to the frame that both windows have in common.
-        joins: whether it continues the window before; False for the first one, and after frames that could not be located.
-        to_next: the homography of the frame that it has in common with the next window.
-    """
-
-    source: Source
-    new: FrameSpan
-    trajectory: Trajectory
-    joins: bool
-    to_next: Homography
+    source: Source  # the frames, as a capture of their own; those before `new` belong to the window before, too
+    new: FrameSpan  # those that no window before had
+    trajectory: Trajectory  # of the source, to the frame that both windows have in common
+    joins: bool  # whether it continues the window before; False for the first one, and after frames that could not be located
+    to_next: Homography  # the homography of the frame that it has in common with the next window
 
 
 class LocatedSoFar:

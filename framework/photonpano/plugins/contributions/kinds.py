@@ -15,25 +15,16 @@ hookimpl = pluggy.HookimplMarker(PROJECT)
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """One kind of component. Hooks, the reader of specs, the JSON Schema and the conformance kit go by this row.
+    """One kind of component. Hooks, the reader of specs, the JSON Schema and the conformance kit go by this row."""
 
-    Attributes:
-        name: what a component of this kind is, such as `locator`.
-        section: where a spec chooses it, such as `locate` or `output.formats`.
-        contribution: the record that the hook yields; what its `build` returns is the interface of the component.
-        default: the component that a spec uses if it names none.
-        of_level: whether each level of a run has one.
-        several: whether the section is a list of components.
-        meaning: what the section chooses, for editors; empty if its keys say so.
-    """
-
-    name: str
-    section: str
+    name: str  # what a component of this kind is, such as `locator`
+    section: str  # where a spec chooses it, such as `locate` or `output.formats`
+    # the record that the hook yields; what its `build` returns is the interface of the component
     contribution: type[Any] = field(repr=False)
-    default: str | None = None
-    of_level: bool = False
-    several: bool = False
-    meaning: str = ""
+    default: str | None = None  # the component that a spec uses if it names none
+    of_level: bool = False  # whether each level of a run has one
+    several: bool = False  # whether the section is a list of components
+    meaning: str = ""  # what the section chooses, for editors; empty if its keys say so
 
     @property
     def hook(self) -> str:

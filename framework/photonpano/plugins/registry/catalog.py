@@ -16,16 +16,11 @@ from photonpano.text import listed, suggestion
 
 @dataclass(frozen=True, slots=True, order=True)
 class Origin:
-    """The plugin that something comes from.
+    """The plugin that something comes from."""
 
-    Attributes:
-        plugin: its distribution, such as "photonpano".
-        entry_point: how the distribution names the plugin, such as "core = photonpano_core.hooks".
-    """
-
-    plugin: str
+    plugin: str  # its distribution, such as "photonpano"
     version: str
-    entry_point: str
+    entry_point: str  # how the distribution names the plugin, such as "core = photonpano_core.hooks"
 
     def label(self, kind: str, name: str) -> str:
         """Return the name of a component for messages, such as "merger 'photon-mle' of photonpano 0.1.0"."""

@@ -194,20 +194,14 @@ _COMPUTED = "computed"  # stands for a default that only the config itself can c
 
 @dataclass(frozen=True, slots=True)
 class ConfigRow:
-    """One key of a config, in words.
+    """One key of a config, in words."""
 
-    Attributes:
-        key: the key under `with`; that of a mapping in a mapping with dots, such as `filter.size`, and that of a mapping in a
-            list with brackets, such as `filters[].size`.
-        type: such as "integer" or "first, last or number".
-        default: as it is written in YAML, or "computed"; None if the key is required.
-        bounds: such as "at least 1"; empty if there are none.
-    """
-
+    # the key under `with`; that of a mapping in a mapping with dots, such as `filter.size`, and that of a mapping in a list
+    # with brackets, such as `filters[].size`
     key: str
-    type: str
-    default: str | None
-    bounds: str
+    type: str  # such as "integer" or "first, last or number"
+    default: str | None  # as it is written in YAML, or "computed"; None if the key is required
+    bounds: str  # such as "at least 1"; empty if there are none
     description: str
 
 
