@@ -14,7 +14,7 @@ from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.motion.timeline import REPEATED
 from photonpano.pipeline.obstacles import timeline_of
 from photonpano.plugins.registry import Catalog
-from photonpano.residuals.motion_tests import NO_TURN, REPEATS, contradictions
+from photonpano.residuals.motion_tests import NARROW, REPEATS, contradictions
 from photonpano.residuals.refinement import MotionFit
 from photonpano.residuals.verdict import judge
 from photonpano.values import Decision, Reason, Verdict
@@ -86,6 +86,6 @@ def check_run(
         if (reason := contradictions(*pairs)) is not None:
             reasons.append(reason)
     recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
-    reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NO_TURN)]
+    reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NARROW)]
     judged = Verdict.of(reasons, verdict.residual_ratio, verdict.untested, verdict.notes)
     return RunCheck(replace(judged, reduced_chi2=verdict.reduced_chi2), tuple(unknown))

@@ -13,7 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from photonpano.geometry import Camera, corners, inverse, lenses_apart_px, likely_rotations, scaled_ahead
+from photonpano.geometry import (
+    Camera,
+    align_planes,
+    corner_displacements,
+    corners,
+    inverse,
+    lenses_apart_px,
+    likely_rotations,
+    scaled_ahead,
+)
 from photonpano.motion.adjustment import Adjustment, Assessment, Problem
 from photonpano.motion.consensus import agreed_share, agreeing, contradicting, layers, tolerances_px, travelled
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
@@ -68,6 +77,7 @@ class Rival(NamedTuple):
     chi2: float  # mean square of their whitened residuals, in which pairs that share photons have a part of their noise only
     unknowns: int
     deviance: float  # minus twice the logarithm of its marginal likelihood, above that of the likeliest model
+    apart_px: float = 0.0  # mean distance of the corners by it from those by the model that was taken, after the best alignment
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +100,9 @@ class GraphSolution:
     rotations: Rotations | None = None  # of the L located nodes, and their camera; None for homographies
     # how far what homographies do beyond shift and roll moves the ends of a frame over the capture, px; none that are 0
     walks_px: Mapping[str, float] = field(default_factory=dict)
-    # returns how well rival models explain the edges, by their names; for rotations it takes as long as solving the graph
+    # of a camera that turns and travels: one in whose homographies perspective follows the shift; else None
+    turning_px: float | None = None
+    # returns how well rival models explain the edges, by their names; homographies beside others take as long as the graph
     compare: Callable[[], Mapping[str, Rival]] = dict
     # (N, P) how far patches of each node lie from where the motion lets expect them, as mean squares in variances, 1 for noise;
     # 0 where nothing is known, and None where patches do not contradict the motion
@@ -129,7 +141,7 @@ def solve(
     fits = _rivals(tied, start, model)
     tied, fits = _of_background(tied, start, fits)
     chosen = _likeliest(fits, frame_shape)
-    return tied.solution(fits[chosen], chosen, partial(_compared, tied, start, fits))
+    return tied.solution(fits[chosen], chosen, partial(_compared, tied, start, fits, chosen))
 
 
 def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[MotionModel, _Fit]:
@@ -143,7 +155,7 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
         fit = _fitted(tied, start, plane)
         if _in_front(fit.state.homographies, tied.frame_shape):
             fits[plane] = fit
-            if isinstance(fit.adjustment, PlanarAdjustment) and not fit.adjustment.turns(fit.state):
+            if isinstance(fit.adjustment, PlanarAdjustment) and not fit.adjustment.turning_px(fit.state):
                 return fits
     for rotation in model.rotations:
         if fits:
@@ -230,18 +242,20 @@ def _deviances(fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, float]:
     return {model: fit.adjustment.deviance(fit.state, weights) for model, fit in fits.items()}
 
 
-def _compared(tied: _Tied, start: FloatArray | None, fits: Mapping[MotionModel, _Fit]) -> dict[str, Rival]:
-    """Compare the models that were fitted; rotations alone with homographies, where one plane holds all frames."""
-    fits = dict(fits)
-    if all(model.kind == "rotation" for model in fits):
+def _compared(tied: _Tied, start: FloatArray | None, fits: Mapping[MotionModel, _Fit], chosen: MotionModel) -> dict[str, Rival]:
+    """Compare the models that were fitted, and homographies where one plane holds all frames."""
+    fits, shape = dict(fits), tied.frame_shape
+    if all(model.kind != "homography" for model in fits):
         with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
             fits[HOMOGRAPHIES] = _fitted(tied, start, HOMOGRAPHIES)
-    deviances = _deviances(fits)
-    least = min(deviances.values())
-    return {
-        model.name: Rival(fit.adjustment.chi2(fit.norms, fit.kept), fit.adjustment.unknowns, deviances[model] - least)
-        for model, fit in fits.items()
-    }
+    deviances, taken = _deviances(fits), fits[chosen].homographies
+    least, rivals = min(deviances.values()), {}
+    for model, fit in fits.items():
+        beside = inverse(taken) @ align_planes(fit.homographies, taken, shape, np.eye(3)) @ fit.homographies
+        apart_px = float(corner_displacements(beside, np.eye(3), shape).mean())
+        chi2, unknowns = fit.adjustment.chi2(fit.norms, fit.kept), fit.adjustment.unknowns
+        rivals[model.name] = Rival(chi2, unknowns, deviances[model] - least, apart_px)
+    return rivals
 
 
 def _freed(tied: _Tied, model: MotionModel, fit: _Fit) -> Freed | None:
@@ -290,6 +304,11 @@ class _Fit:
     state: Any  # of least cost
     norms: FloatArray  # (E,) of the whitened residuals
     kept: BoolArray  # (E,) False for outliers
+
+    @property
+    def homographies(self) -> FloatArray:
+        """The maps from the frame of each node to that of the anchor: (N, 3, 3)."""
+        return self.adjustment.homographies(self.state)
 
     @property
     def weights(self) -> FloatArray:
@@ -391,7 +410,7 @@ class _Tied:
         """Return a fit as the solution of the graph."""
         adjustment, found = fit.adjustment, fit.state
         homographies = np.full((len(self.located), 3, 3), np.nan)
-        homographies[self.located] = adjustment.homographies(found)
+        homographies[self.located] = fit.homographies
         return GraphSolution(
             homographies,
             self.located,
@@ -401,6 +420,7 @@ class _Tied:
             model,
             found if isinstance(found, Rotations) else None,
             adjustment.walks_px if isinstance(adjustment, PlanarAdjustment) else {},
+            adjustment.turning_px(found) if isinstance(adjustment, PlanarAdjustment) else None,
             compare,
             self.layers,
             self.parallax,

@@ -231,9 +231,10 @@ class PlanarAdjustment(Adjustment[Plane]):
                 break
         return bool(np.abs(np.log(self.variances / before)).max() > _SETTLED)
 
-    def turns(self, state: Plane) -> bool:
-        """Return whether perspective changes with the shift as for a camera that turns, by more than noise (Schwarz 1978)."""
-        return bool(self._n_shared and state.coupling < 0 and self.variances[-1] > self._of_coupling * self.price)
+    def turning_px(self, state: Plane) -> float | None:
+        """Return the focal length of a camera that turns; None unless perspective follows the shift (Schwarz 1978)."""
+        turns = self._n_shared and state.coupling < 0 and self.variances[-1] > self._of_coupling * self.price
+        return self._half / float(np.sqrt(-state.coupling)) if turns else None
 
     def _components(self, state: Plane) -> list[Prior]:
         """Return the steps of each walk beyond the coupling, over the roots of their times; and the coupling."""

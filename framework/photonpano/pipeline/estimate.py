@@ -168,6 +168,8 @@ def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decisio
     rivals = [f"{name} {rival.deviance:,.0f} ({rival.unknowns:,})" for name, rival in located.rivals.items()]
     walks = [f"{name} {px:.2g} px" for name, px in located.solution.walks_px.items()]
     reason = f"beyond shift and roll, the ends of a frame move by {listed(walks) or 'nothing'} over the capture"
+    if (focal_px := located.solution.turning_px) is not None and walks:
+        reason += f", and perspective follows the shift: a camera of about {focal_px:,.0f} px that turns and travels"
     if len(rivals) > 1:
         reason += f"; deviances of the models, and their unknowns: {', '.join(rivals)}"
     return [Decision("motion_model", located.solution.model.name, reason)]

@@ -156,8 +156,8 @@ def level_record(result: LevelResult) -> LevelRecord:
         "residual_px": located.solution.residual_px,
         "camera": _camera_record(result),
         "evidence": {
-            name: RivalRecord(chi2=chi2, unknowns=number, deviance=more)
-            for name, (chi2, number, more) in located.rivals.items()
+            name: RivalRecord(chi2=chi2, unknowns=number, deviance=more, apart_px=apart_px)
+            for name, (chi2, number, more, apart_px) in located.rivals.items()
         },
         "walks_px": dict(located.solution.walks_px),
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},

@@ -71,12 +71,14 @@ class RivalRecord(TypedDict):
     """How well a model of the motion explains the pairs of a level.
 
     `chi2` is the mean square of their residuals, in units of photon noise; `deviance` is minus twice the logarithm of its
-    marginal likelihood, above that of the likeliest model.
+    marginal likelihood, above that of the likeliest model; `apart_px` is the mean distance of the corners by it from those by
+    the model that was taken.
     """
 
     chi2: float
     unknowns: int
     deviance: float
+    apart_px: float
 
 
 class LevelRecord(TypedDict):

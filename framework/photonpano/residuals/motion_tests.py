@@ -7,14 +7,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from photonpano.geometry import corners, jacobian
+from photonpano.motion.model import SAME_LENS_PX
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
 from photonpano.residuals.scene_tests import of_either_part
-from photonpano.residuals.tested_run import FIND_LENS, RIVAL, TestedRun, Tests
+from photonpano.residuals.tested_run import FIND_LENS, FREE, RIVAL, TestedRun, Tests
 from photonpano.values import Located, Reason
 from photonpano.values.verdict import Found
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
-NO_TURN = "the camera does more than turn, or its lens distorts: rotations of one camera do not explain the pairs"
+NARROW = "the motion is more than the model of it that was written holds"
 _UNCERTAIN_PX = 1.0
 _ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
 
@@ -94,19 +95,20 @@ def contradictions(dropped: int, pairs: int) -> Reason | None:
     return _contradictions.reason(_contradicting(dropped, pairs))
 
 
-@MOTION_TESTS.doubtful_above(3.0, NO_TURN, "write motion: {model: homography}")
-def _no_turn(run: TestedRun) -> Found | None:
-    if not run.levels or run.levels[-1].located.solution.rotations is None:
+@MOTION_TESTS.doubtful_above(3.0, NARROW, FREE)
+def _narrow(run: TestedRun) -> Found | None:
+    """Homographies are likelier, and farther away than the motion is expected to err."""
+    if not run.levels:
         return None
-    located = run.levels[-1].located
-    rivals, name = located.rivals, located.solution.model.name
-    if not {name, "homography"} <= rivals.keys():
+    located, motion = run.levels[-1].located, run.explained.motion
+    rivals, model = located.rivals, located.solution.model
+    if model.kind == "homography" or "homography" not in rivals or not rivals[model.name].deviance:
         return None
-    residual, free = np.sqrt([rivals[each].chi2 for each in (name, "homography")]).tolist()
-    where = f"residuals in units of their noise; those of any homographies are {free:.2g}"
-    camera = run.explained.motion.camera
-    what_to_do = "" if camera is not None and camera.distorts else f"write motion: {{model: homography}}, or {FIND_LENS}"
-    return Found(residual, where, rivals[name].deviance > 0, what_to_do=what_to_do)
+    apart_px, std_px = rivals["homography"].apart_px, float(motion.std_px[motion.located].mean())
+    where = f"expected errors from {model.name} to homographies, which are likelier: {apart_px:.2g} px"
+    finds = model.kind == "rotation" and not (motion.camera is not None and motion.camera.distorts)
+    what_to_do = f"{FREE}, or {FIND_LENS}" if finds else ""
+    return Found(apart_px / float(np.hypot(std_px, SAME_LENS_PX)), where, what_to_do=what_to_do)
 
 
 @MOTION_TESTS.doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")

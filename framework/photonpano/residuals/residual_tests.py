@@ -146,7 +146,7 @@ def _lens(run: TestedRun) -> Found | None:
     found = distorting_lens(run.explained)
     if found is None:
         return None
-    camera, what_to_do = run.explained.motion.camera, ""
+    camera, what_to_do = run.explained.motion.camera, run.freer_model
     if camera is not None:
         distortion = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
         what_to_do = f"{distortion}; or {_WITHOUT_LENS}"
@@ -160,7 +160,7 @@ def _lens(run: TestedRun) -> Found | None:
 )
 def _deformation(run: TestedRun) -> Found | None:
     size = deformation_px(*run.explained.residuals.block_shifts())
-    return None if size is None else Found(size, "px, over the frame")
+    return None if size is None else Found(size, "px, over the frame", what_to_do=run.freer_model)
 
 
 # After those that name a cause.

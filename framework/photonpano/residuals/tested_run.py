@@ -11,6 +11,7 @@ from photonpano.residuals.refinement import Explained
 from photonpano.values import Decision
 from photonpano.values.verdict import Found, Test
 
+FREE = "write motion: {model: homography}"  # what a spec says of a motion that may be any
 FIND_LENS = "camera: {distortion: {k1: find}}"  # what a spec says to measure the lens
 RIVAL = "rival_motion"  # name of the decision on a part of the frame that moves otherwise
 
@@ -30,6 +31,12 @@ class TestedRun:
             return None
         located = self.levels[-1].located
         return len(located.solution.outliers), len(located.edges)
+
+    @property
+    def freer_model(self) -> str:
+        """What to do if a planar model that was written may hold less than the motion; "" for those that hold any."""
+        kind = self.levels[-1].located.solution.model.kind if self.levels else "homography"
+        return "" if kind in ("homography", "rotation") else f"{FREE}, as {kind} may hold less than the motion"
 
     def decided(self, what: str, meaning: str = "") -> Found | None:
         """Return the figure of the last decision of a name, with its reason if no meaning is given; None if there is none."""

@@ -11,12 +11,12 @@ import pytest
 from photonpano import FrameSpan
 from photonpano.geometry import Camera
 from photonpano.motion.graph import Freed, Rival
-from photonpano.motion.model import MotionModel
+from photonpano.motion.model import SAME_LENS_PX, MotionModel
 from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED, UNCUT_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
 from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals
-from photonpano.residuals.motion_tests import NO_TURN, contradictions
+from photonpano.residuals.motion_tests import NARROW, contradictions
 from photonpano.residuals.refinement import Explained, residual_ratio
 from photonpano.residuals.shaking import Shaking
 from photonpano.residuals.tested_run import RIVAL
@@ -246,14 +246,16 @@ def level_with(
     return SimpleNamespace(level=SimpleNamespace(number=1), located=located, change_px=change_px)
 
 
-@pytest.mark.parametrize(("rotation", "deviance", "doubtful"), [(1.2, 0.0, False), (25.0, 0.0, True), (4.0, 40.0, True)])
-def test_rotations_that_do_not_explain_the_pairs_are_doubtful(
-    explained: Explained, rotation: float, deviance: float, doubtful: bool
+@pytest.mark.parametrize(("times", "deviance", "doubtful"), [(9.0, 0.0, False), (2.0, 40.0, False), (9.0, 40.0, True)], ids=str)
+def test_model_that_holds_less_than_the_motion_is_doubtful(
+    explained: Explained, times: float, deviance: float, doubtful: bool
 ) -> None:
-    """Either the residuals are large, or homographies are likelier."""
-    rivals = {"homography": Rival(1.0, 232, 0.0), "rotation": Rival(rotation, 88, deviance)}
-    reasons = judge(explained, [level_with(object(), rivals)]).reasons
-    assert [(reason.what, reason.figure) for reason in reasons] == [(NO_TURN, np.sqrt(rotation))] * doubtful
+    """Homographies are likelier, and farther away than the motion is expected to err."""
+    std_px = float(np.hypot(explained.motion.std_px.mean(), SAME_LENS_PX))
+    rivals = {"homography": Rival(1.0, 232, 0.0, times * std_px), "affine": Rival(1.0, 88, deviance)}
+    reasons = judge(explained, [level_with(None, rivals, model=MotionModel("affine"))]).reasons
+    assert [(reason.what, pytest.approx(reason.figure)) for reason in reasons] == [(NARROW, times)] * doubtful
+    assert all("affine" in reason.where for reason in reasons)
 
 
 FIND = "camera: {distortion: {k1: find}}"
@@ -283,10 +285,10 @@ def test_advice_is_not_what_the_run_does_already(
     monkeypatch.setattr(
         "photonpano.residuals.residual_tests.distorting_lens", lambda _: LensDistortion(-0.1, 0.005, np.zeros((1, 2)))
     )
-    rivals = {"homography": Rival(1.0, 232, 0.0), "rotation": Rival(25.0, 88, 3.0)}
+    rivals = {"homography": Rival(1.0, 232, 0.0, 9.0), "rotation": Rival(25.0, 88, 3.0)}
     run = replace(explained, motion=replace(explained.motion, camera=camera))
     found = {reason.what: reason.what_to_do for reason in judge(run, [level_with(object(), rivals)]).reasons}
-    assert found == {"the lens distorts the frames, which bends the motion": lens, NO_TURN: turn}
+    assert found == {"the lens distorts the frames, which bends the motion": lens, NARROW: turn}
 
 
 def test_little_that_changes_or_differs_is_a_note(explained: Explained) -> None:
