@@ -13,7 +13,7 @@ from photonpano.contracts.protocols import camera_of
 from photonpano.errors import PluginError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import thread_pool
-from photonpano.geometry import corner_displacements, inverse
+from photonpano.geometry import corner_displacements, corners, inverse, transform_points, translation
 from photonpano.motion.adjustment import std_of
 from photonpano.motion.closures import MIN_SIMILARITY, closure_candidates, exposure_similarity
 from photonpano.motion.diagnosis import require_tied, solving
@@ -172,7 +172,7 @@ def locate(
         shape,
         assessed.std_camera,
         rivals,
-        _ambiguity(level.number, registrar.alternatives_px, edges),
+        _ambiguity(level.number, registrar.alternatives_px, edges, shape),
     )
 
 
@@ -265,10 +265,22 @@ def _not_outvoting(
     return tuple(found)
 
 
-def _ambiguity(level: int, alternatives_px: Mapping[tuple[int, int], float], edges: Sequence[Edge]) -> Ambiguity | None:
-    """Return the located pairs that fit the scene at a second place, and its median distance."""
-    located = {(edge.moving, edge.fixed) for edge in edges if isinstance(edge.motion, Located)}
-    pairs = tuple(sorted(located & alternatives_px.keys()))
+def _ambiguity(
+    level: int, alternatives_px: Mapping[tuple[int, int], float], edges: Sequence[Edge], frame_shape: tuple[int, int]
+) -> Ambiguity | None:
+    """Return the located pairs that fit the scene at a second place, and its median distance.
+
+    Where a roll or a zoom moves the corners of a frame otherwise than its middle by as much, a part of it lies there.
+    """
+    middle = corners(frame_shape).mean(axis=0)
+
+    def spread_px(motion: Located) -> float:
+        shift = translation(*(transform_points(motion.homography, middle[None])[0] - middle))
+        return float(corner_displacements(motion.homography, shift, frame_shape).max())
+
+    motions = {(edge.moving, edge.fixed): edge.motion for edge in edges if isinstance(edge.motion, Located)}
+    both = sorted(motions.keys() & alternatives_px.keys())
+    pairs = tuple(pair for pair in both if alternatives_px[pair] > spread_px(motions[pair]))
     if not pairs:
         return None
     return Ambiguity(level, pairs, float(np.median([alternatives_px[pair] for pair in pairs])))
