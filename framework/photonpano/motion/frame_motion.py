@@ -48,7 +48,13 @@ class FrameMotion:
     std_px: FloatArray  # (T,) expected corner error, infinite where not located
     reference: int  # the frame whose homography is the identity
     frame_shape: tuple[int, int]  # (height, width) of a frame
+    remaining_px: FloatArray | float = 0.0  # (T,) the part of `std_px` that a correction of the motion may find
     camera: Camera | None = None  # that turns; None where homographies are any. Theirs are K R K^-1 of determinant 1 otherwise.
+
+    @property
+    def noise_px(self) -> FloatArray:
+        """The rest of `std_px`: (T,)."""
+        return np.asarray(np.sqrt(np.maximum(self.std_px**2 - np.square(self.remaining_px), 0)))
 
     @property
     def rotations(self) -> FloatArray | None:
@@ -69,11 +75,11 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     located = (span.start <= frames) & (frames < span.stop)
     if (timeline := last.exposures.timeline) is not None:
         located &= timeline.shown
-    std_px = np.where(located, last.uncertainty.at(frames), np.inf)
+    std_px, remaining_px = np.where(located, last.uncertainty.at(frames), np.inf), last.uncertainty.remaining_at(frames)
     homographies = np.concatenate([last.trajectory.at(block) for block in np.split(frames, frames[BLOCK_FRAMES::BLOCK_FRAMES])])
     trajectory = FrameTrajectory(homographies)
     camera = camera_of_motion(last.trajectory)
-    return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, camera)
+    return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, remaining_px, camera)
 
 
 def frames_displaced(motion: FrameMotion) -> float:

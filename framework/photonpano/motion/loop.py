@@ -15,7 +15,7 @@ from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.filtering import smooth_share
-from photonpano.geometry import align_planes, corners, inverse, moving_corners, transform_points
+from photonpano.geometry import align_planes, corner_displacements, corners, inverse, moving_corners, transform_points
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.graph import GraphOptions
 from photonpano.motion.gyroscope import Gyroscope
@@ -27,12 +27,13 @@ from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory
 from photonpano.motion.ties import require_agreement, ties_of
 from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking import starting_motion
-from photonpano.motion.uncertainty import Uncertainty
+from photonpano.motion.uncertainty import Interpolated, Uncertainty
 from photonpano.values import FloatArray, FrameSpan, Group
 
 _DRAWS = 4  # errors of knots by which it is found how much of them an interpolator leaves
 _FEWEST_KNOTS = 8  # that an interpolator smooths
 _AROUND, _LEAST_LEFT = 9, 0.05  # knots over which that is averaged, and least share of the variance that is left
+_AROUND_BEYOND = 33  # knots over which it is averaged how far they lie beside the motion
 _CENTRED = 2  # times that knots are moved to the instants of their exposures
 _SHRINKS = 0.75  # change of the motion by a level, over that by the level before, from which on it no longer converges
 
@@ -119,9 +120,10 @@ def estimate_motion(
             start = start and replace(start, timeline=timeline)
         exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start, known)
         located = locate(exposures, graph, context, model, start, gyroscope)
-        trajectory, std_px = interpolate(exposures, located, timeline, reference, corrected)
+        interpolated = interpolate(exposures, located, timeline, reference, corrected)
+        trajectory = interpolated.trajectory
         require_agreement(ties_of(graph.tie, seen), groups, located.solution.located, trajectory)
-        uncertainty = Uncertainty(located, std_px, trajectory, previous, timeline)
+        uncertainty = Uncertainty(located, interpolated, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
         context.progress.note(_summary(results[-1]))
         context.on_level(results[-1])
@@ -146,10 +148,8 @@ def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]
 
 def interpolate(
     exposures: VirtualExposures, located: LocatedLevel, timeline: Timeline, reference: int, refined: Trajectory | None = None
-) -> tuple[Trajectory, FloatArray]:
+) -> Interpolated:
     """Fit a homography for every frame to the located instants (paper, section 4, "Interpolate"), between cuts.
-
-    Return also its expected errors at these instants, (N,): an interpolator that smooths leaves a part of those of exposures.
 
     An exposure shows the mean of its frames, which lies elsewhere than its instant if the motion within it was not what it was
     merged along. How far is known as soon as the motion is, so that the knots are moved there, and the motion is fitted again:
@@ -166,21 +166,27 @@ def interpolate(
         knots, trajectory = measured, _through(measured, exposures, located, timeline, reference, refined)
         for _ in range(_CENTRED):
             displaced = exposures.off_centre(trajectory)[located.solution.located]
-            share = _smooth_share(trajectory, located)
-            knots = measured.moved(share * displaced + (1 - share) * np.eye(3))
+            smooth = _smooth_share(trajectory, located)
+            knots = measured.moved(smooth * displaced + (1 - smooth) * np.eye(3))
             trajectory = _through(knots, exposures, located, timeline, reference, refined)
         std_px = located.std_px
         if len(std_px) < _FEWEST_KNOTS:
-            return trajectory, std_px
+            return Interpolated(trajectory, std_px, np.zeros(len(std_px)))
         products, here, known = np.zeros((2, len(std_px))), corners(located.frame_shape), trajectory.at(located.instants)
+        among = trajectory.at(knots.instants)
+        aligned = inverse(among) @ align_planes(knots.homographies, among, located.frame_shape) @ knots.homographies
+        left_px2 = (corner_displacements(aligned, np.eye(3), located.frame_shape) ** 2).mean(axis=-1)
         for errors in np.moveaxis(located.errors_px, -1, 0)[:_DRAWS]:
             moved = knots.moved(moving_corners(errors, located.frame_shape))
             answer = _through(moved, exposures, located, timeline, reference, refined).at(located.instants)
             answer = inverse(known) @ align_planes(answer, known, located.frame_shape) @ answer
             products += (errors**2).sum(axis=1), ((transform_points(answer, here) - here).reshape(-1, 8) * errors).sum(axis=1)
-    # The covariance of what is smoothed with the errors of what it is made of is its variance (a Gaussian smoother).
+    # The covariance of what is smoothed with the errors of what it is made of is its variance (a Gaussian smoother), and knots
+    # lie beside it by the rest of theirs.
     before, after = uniform_filter1d(products, _AROUND, axis=1, mode="nearest")
-    return trajectory, std_px * np.sqrt(np.clip(after / np.maximum(before, np.finfo(float).tiny), _LEAST_LEFT, 1))
+    share = np.clip(after / np.maximum(before, np.finfo(float).tiny), _LEAST_LEFT, 1)
+    beyond = uniform_filter1d(left_px2 - (1 - share) * std_px**2, _AROUND_BEYOND, mode="reflect")
+    return Interpolated(trajectory, std_px * np.sqrt(share), np.sqrt(np.maximum(beyond, 0)))
 
 
 def _smooth_share(trajectory: Trajectory, located: LocatedLevel) -> float:

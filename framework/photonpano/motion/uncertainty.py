@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -12,9 +14,19 @@ from photonpano.motion.rotations import RotationTrajectory
 from photonpano.motion.timeline import Timeline
 from photonpano.values import FloatArray
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Interpolated:
+    """The motion through the located exposures of a level."""
+
+    trajectory: Trajectory
+    std_px: FloatArray  # (N,) its expected errors at their instants due to photon noise: a part of those of the exposures
+    beyond_px: FloatArray  # (N,) how far exposures lie beside it, beyond what noise explains
+
+
 _COMPARED = 1000  # number of frames at which two levels are compared
 # Error after a level, as a share of the change it made: each level removes at least three quarters of the error.
-_REMAINING_SHARE = 0.25
+REMAINING_SHARE = 0.25
 _BLUR_SHARE = 0.02  # error after the first level, as a share of the motion within a group, by which its exposures are blurred
 
 
@@ -22,7 +34,8 @@ class Uncertainty:
     """The expected corner error of a trajectory at any frame, in px, after the best alignment of the planes.
 
     It combines the expected error at the located instants, due to photon noise; the extrapolation at constant velocity beyond
-    the first and the last of them; and a share of the last change, since exposures merged along a wrong motion confirm it.
+    the first and the last of them; and what another level may find: how far exposures lie beside the motion, and a share of
+    the last change, since exposures merged along a wrong motion confirm it.
     """
 
     change_px: float | None  # mean displacement of the corners since the previous level, px of a frame; None at the first level
@@ -33,23 +46,20 @@ class Uncertainty:
     def __init__(
         self,
         located: LocatedLevel,
-        std_px: FloatArray,
-        trajectory: Trajectory,
+        interpolated: Interpolated,
         previous: Trajectory | None,
         timeline: Timeline,
     ) -> None:
-        """Compare a level with the one before, None at the first; beyond a cut, nothing is known from the other side.
-
-        `std_px` (N,) are the expected errors at the located instants, due to photon noise.
-        """
+        """Compare a level with the one before, None at the first; beyond a cut, nothing is known from the other side."""
+        trajectory = interpolated.trajectory
         turned, before = located.solution.rotations, camera_of_motion(previous)
         # A single exposure tells nothing of its camera.
         self.std_camera = located.std_camera if len(located.std_camera) else None
         if self.std_camera is not None and turned is not None and before is not None:
             change = turned.camera.numbers - before.numbers
-            self.std_camera = np.hypot(self.std_camera, _REMAINING_SHARE * change)
+            self.std_camera = np.hypot(self.std_camera, REMAINING_SHARE * change)
         self._instants = located.instants
-        self._std_px = std_px
+        self._std_px, self._beyond_px = interpolated.std_px, interpolated.beyond_px
         self._timeline = timeline
         shown = np.flatnonzero(timeline.shown)
         self._frames = shown[np.unique(np.linspace(0, len(shown) - 1, _COMPARED).round().astype(int))].astype(np.float64)
@@ -67,7 +77,7 @@ class Uncertainty:
             moved = inverse(known) @ align_planes(current, known, shape, start) @ current
             changes_px = corner_displacements(moved, np.eye(3), shape).mean(axis=-1)
             self.change_px = float(changes_px.mean())
-            self._remaining_px = _REMAINING_SHARE * changes_px
+            self._remaining_px = REMAINING_SHARE * changes_px
 
     @property
     def mean_px(self) -> float:
@@ -77,7 +87,13 @@ class Uncertainty:
     def at(self, frame_indices: ArrayLike) -> FloatArray:
         """Return the expected corner error at N instants, in px: (N,). Infinite if a single exposure was located."""
         frames = np.asarray(frame_indices, dtype=np.float64)
-        return np.asarray(np.hypot(self._noise_px(frames), np.interp(frames, self._frames, self._remaining_px)))
+        return np.asarray(np.hypot(self._noise_px(frames), self.remaining_at(frames)))
+
+    def remaining_at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the part of that error that another level may find: (N,)."""
+        frames = np.asarray(frame_indices, dtype=np.float64)
+        of_change = np.interp(frames, self._frames, self._remaining_px)
+        return np.asarray(np.hypot(of_change, np.interp(frames, self._instants, self._beyond_px)))
 
     def _noise_px(self, frames: FloatArray) -> FloatArray:
         noise_px = np.full(frames.shape, np.inf)

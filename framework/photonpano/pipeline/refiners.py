@@ -14,12 +14,13 @@ from photonpano.contracts.rules import attributing
 from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, likely_rotations
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.level import Recorder
+from photonpano.motion.uncertainty import REMAINING_SHARE
 from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.passes import Proposal, tried, without_what_changes
 from photonpano.pipeline.state import State
 from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, Refined
+from photonpano.values import Decision, FloatArray, Refined
 
 MAX_ROUNDS = 6  # maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against
 # A later correction that moves frames by less than this on average needs no new panorama: residuals change in proportion to it.
@@ -60,12 +61,14 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Expla
 
 def _corrected(state: State, refiner: NamedRefiner, place: int, number: int) -> Proposal | None:
     """Propose the motion that a refiner finds at a round, from 1; `place` is its own among those of the run."""
-    given = place, number, state.motion.homographies, state.motion.std_px
+    given = place, number, state.motion.homographies, state.motion.noise_px
     found = state.view.context.checkpoints.once("refined", partial(_refined, refiner, state, number), *given)
     if found is None:
         return None
-    homographies, std_px = found.homographies, found.std_px
-    motion = replace(state.motion, trajectory=FrameTrajectory(homographies), homographies=homographies, std_px=std_px)
+    remaining_px = REMAINING_SHARE * _moved_px(state.motion, found.homographies)
+    std_px = np.hypot(found.std_px, remaining_px)
+    trajectory, homographies = FrameTrajectory(found.homographies), found.homographies
+    motion = replace(state.motion, trajectory=trajectory, homographies=homographies, std_px=std_px, remaining_px=remaining_px)
     if number > 1 and _change_px(state.motion, motion) < _LINEAR_PX:
         return Proposal(lambda: replace(state, refined=motion, known_fit=state.fit.moved(motion)), None, summary=found.summary)
     rejection = f"a correction of {refiner.origin} is not used"
@@ -76,7 +79,7 @@ def _refined(refiner: NamedRefiner, state: State, number: int) -> Refined | None
     """Call a refiner, check what it returns, and make the homography of the reference frame the identity."""
     motion, fit = state.motion, state.fit
     with attributing(refiner.origin, f"round {number}"):
-        std_px = motion.std_px.copy()
+        std_px = motion.noise_px
         found = refiner.component.refine(state.view.source, motion.trajectory, std_px, fit.residuals.steps(), fit.predictions)
         if found is None:
             return None
@@ -93,8 +96,11 @@ def _refined(refiner: NamedRefiner, state: State, number: int) -> Refined | None
 
 def _change_px(before: FrameMotion, after: FrameMotion) -> float:
     """Return the mean displacement of the corners of the located frames."""
-    total, located = 0.0, np.flatnonzero(before.located)
-    for start in range(0, len(located), BLOCK_FRAMES):
-        first, last = (motion.homographies[located[start : start + BLOCK_FRAMES]] for motion in (before, after))
-        total += float(corner_displacements(inverse(first) @ last, np.eye(3), before.frame_shape).mean(axis=-1).sum())
-    return total / max(len(located), 1)
+    return float(_moved_px(before, after.homographies)[before.located].mean())
+
+
+def _moved_px(before: FrameMotion, after: FloatArray) -> FloatArray:
+    """Return the displacement of the corners of each frame, (T,), to other homographies, (T, 3, 3)."""
+    blocks = [slice(start, start + BLOCK_FRAMES) for start in range(0, len(after), BLOCK_FRAMES)]
+    steps = (inverse(before.homographies[block]) @ after[block] for block in blocks)
+    return np.concatenate([corner_displacements(step, np.eye(3), before.frame_shape).mean(axis=-1) for step in steps])

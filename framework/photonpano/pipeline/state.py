@@ -81,7 +81,7 @@ class State:
         result = self.results[-1]
         again = replace(self, model=result.located.solution.model).located([result.level], motion, motion)
         again = replace(again, refined=None, known_fit=None)
-        known, before = self.motion.std_px, replace(self, refined=None).motion.std_px
+        known, before = self.motion.noise_px, replace(self, refined=None).motion.noise_px
         finite = np.isfinite(known) & np.isfinite(before)
         noise_px = np.zeros_like(known)
         noise_px[finite] = np.sqrt(np.maximum(known[finite] ** 2 - before[finite] ** 2, 0))
