@@ -117,7 +117,7 @@ def _motion(run: RunTrajectory) -> FrameMotion:
     reference = int(np.abs(run.homographies - np.eye(3)).max(axis=(1, 2)).argmin())
     trajectory = FrameTrajectory(run.homographies)
     std_px = np.where(run.located, np.nan_to_num(run.std_px, posinf=np.inf), np.inf)
-    return FrameMotion(trajectory, span, run.homographies, run.located, std_px, reference, run.frame_shape, camera=run.camera)
+    return FrameMotion(trajectory, span, run.homographies, run.located, std_px, reference, run.frame_shape, run.camera)
 
 
 def load_panorama(run_folder: Path | str) -> Panorama:

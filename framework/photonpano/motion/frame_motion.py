@@ -48,8 +48,8 @@ class FrameMotion:
     std_px: FloatArray  # (T,) expected corner error, infinite where not located
     reference: int  # the frame whose homography is the identity
     frame_shape: tuple[int, int]  # (height, width) of a frame
-    remaining_px: FloatArray | float = 0.0  # (T,) the part of `std_px` that a correction of the motion may find
     camera: Camera | None = None  # that turns; None where homographies are any. Theirs are K R K^-1 of determinant 1 otherwise.
+    remaining_px: FloatArray | float = 0.0  # (T,) the part of `std_px` that a correction of the motion may find
 
     @property
     def noise_px(self) -> FloatArray:
@@ -79,7 +79,7 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     homographies = np.concatenate([last.trajectory.at(block) for block in np.split(frames, frames[BLOCK_FRAMES::BLOCK_FRAMES])])
     trajectory = FrameTrajectory(homographies)
     camera = camera_of_motion(last.trajectory)
-    return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, remaining_px, camera)
+    return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, camera, remaining_px)
 
 
 def frames_displaced(motion: FrameMotion) -> float:
