@@ -24,6 +24,7 @@ from photonpano.corrections import divided_by
 from photonpano.corrections.lighting import LIGHT_DECISION, find_light, in_light, in_light_of
 from photonpano.evaluation.images import covered, image_score, true_panorama, white_flux
 from photonpano.execution.context import Context
+from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import estimate_motion
 from photonpano.photometry import linear_to_srgb
 from photonpano.pipeline.components import build_levels, open_source
@@ -193,7 +194,10 @@ def false_alarm(seed: int) -> tuple[str, bool, bool] | None:
         with open_source(plan) as source:
             levels, timeline = build_levels(plan, source, []), timeline_of(source, context)
             try:
-                first = estimate_motion(source, levels, plan.graph, source.info.n_frames // 2, context, timeline=timeline)[0]
+                setting = LoopSetting(
+                    source=source, graph=plan.graph, reference=source.info.n_frames // 2, context=context, timeline=timeline
+                )
+                first = estimate_motion(setting, levels)[0]
             except LocationError:
                 return None
             vignette = vignette_of(plan, source, first.trajectory)

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from photonpano.contracts.loop import why_still
-from photonpano.contracts.protocols import camera_of
+from photonpano.contracts.protocols import Source, camera_of
 from photonpano.errors import PluginError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import thread_pool
@@ -25,12 +25,26 @@ from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import alike, excluded_pairs, instants_of, pairs_of
 from photonpano.motion.registration import Registrar
 from photonpano.motion.ties import TiedPair, tied_pairs, ties_of
+from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking import StartingMotion
 from photonpano.text import listed
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated
 
 # A fallback contradicts the first locator beyond this fraction of the shorter side of a frame.
 _CONTRADICTION = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LoopSetting:
+    """What all levels of the loop have in common."""
+
+    source: Source
+    graph: GraphOptions
+    context: Context
+    reference: int  # the frame whose homography is the identity
+    timeline: Timeline  # where the image jumps, and which frames show something
+    model: MotionModel = HOMOGRAPHIES
+    gyroscope: Gyroscope | None = None  # ties exposures, and knows how they tremble
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,19 +96,12 @@ class LocatedLevel:
         return tuple(edge for edge in self.edges if isinstance(edge.motion, NotLocated))
 
 
-def locate(
-    exposures: VirtualExposures,
-    graph: GraphOptions,
-    context: Context,
-    model: MotionModel = HOMOGRAPHIES,
-    start: StartingMotion | None = None,
-    gyroscope: Gyroscope | None = None,
-) -> LocatedLevel:
+def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMotion | None = None) -> LocatedLevel:
     """Register the pairs of a level, and solve the motion graph (paper, section 4, "Locate").
 
     Each exposure is merged and described once, in order, a few ahead of the pairs that need it, and released after its last
     pair. At the first level, pairs begin with the `start` that short spans show, if any. A pair that the first locator does not
-    locate is passed to the next. Pairs that are tied by hand are registered from there, and those of a `gyroscope` are added.
+    locate is passed to the next. Pairs that are tied by hand are registered from there, and those of a gyroscope are added.
     Once the graph is solved, pairs of exposures that overlap at different times are registered as loop closures, and the graph
     is solved again. Fallback locators and loop closures need exposures that were released; these are merged again.
 
@@ -103,6 +110,7 @@ def locate(
         PluginError: a locator failed, or broke its contract.
     """
     level, groups, shape = exposures.level, exposures.groups, exposures.frame_shape
+    graph, context, model, gyroscope = setting.graph, setting.context, setting.model, setting.gyroscope
     excluded, previous = excluded_pairs(groups, graph.exclude), exposures.previous
     by_hand = tied_pairs(ties_of(graph.tie, exposures.source), groups, previous or exposures.start)
     excluded |= {(each.moving, each.fixed) for each in by_hand}

@@ -12,16 +12,13 @@ from scipy.ndimage import uniform_filter1d
 from photonpano.capture import capture_of, seen_through
 from photonpano.contracts.loop import KNOTS, AttributedTrajectory, knot_errors, require_groups
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
-from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.filtering import smooth_share
 from photonpano.geometry import align_planes, corner_displacements, corners, inverse, moving_corners, transform_points
 from photonpano.motion.diagnosis import require_in_front
-from photonpano.motion.graph import GraphOptions
-from photonpano.motion.gyroscope import Gyroscope
 from photonpano.motion.level import Level, VirtualExposures
-from photonpano.motion.locate import LocatedLevel, locate
-from photonpano.motion.model import HOMOGRAPHIES, MotionModel
+from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
+from photonpano.motion.model import MotionModel
 from photonpano.motion.refined_motion import Knots, RefinedMotion
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
 from photonpano.motion.ties import require_agreement, ties_of
@@ -71,18 +68,13 @@ def converges(results: Sequence[LevelResult]) -> bool:
 
 
 def estimate_motion(
-    source: Source,
+    setting: LoopSetting,
     levels: Sequence[Level],
-    graph: GraphOptions,
-    reference: int,
-    context: Context,
-    until_converged: bool = False,
     previous: Trajectory | None = None,
-    timeline: Timeline | None = None,
-    model: MotionModel = HOMOGRAPHIES,
-    corrected: Trajectory | None = None,
+    *,
     known: FrameSpan | None = None,
-    gyroscope: Gyroscope | None = None,
+    corrected: Trajectory | None = None,
+    until_converged: bool = False,
 ) -> list[LevelResult]:
     """Estimate the motion of a capture, level by level (paper, section 4).
 
@@ -90,11 +82,10 @@ def estimate_motion(
     it; the description is kept until the last pair of the exposure is registered. Memory therefore does not grow with the
     number of groups. An exposure that a fallback locator or a loop closure needs is merged again.
 
-    The homography of the frame `reference` is the identity. With `until_converged`, the loop ends as soon as another level
-    would gain nothing: see `converges`. `previous` is the motion known so far, which each level replaces; one that
-    is `known` in some frames alone was extrapolated to the others. A motion that is `corrected`, by default that of the
-    gyroscope, is not replaced: it keeps its tremor, and goes on beyond the first and the last exposure. Without a timeline, no
-    frame is missing or repeated. A `gyroscope` ties exposures, and knows how they tremble.
+    `previous` is the motion known so far, which each level replaces; one that is `known` in some frames alone was extrapolated
+    to the others. A motion that is `corrected`, by default that of the gyroscope, is not replaced: it keeps its tremor, and
+    goes on beyond the first and the last exposure. With `until_converged`, the loop ends as soon as another level would gain
+    nothing: see `converges`.
 
     Raises:
         InputError: the images contradict points that are tied by hand, or the gyroscope.
@@ -102,14 +93,17 @@ def estimate_motion(
         PluginError: a component failed, or broke its contract.
     """
     results: list[LevelResult] = []
-    if corrected is None and gyroscope is not None:
-        corrected = gyroscope.trajectory(reference)
-    previous, timeline = corrected if previous is None else previous, timeline or Timeline.regular(source.info.n_frames)
+    source, context, reference, timeline = setting.source, setting.context, setting.reference, setting.timeline
+    if corrected is None and setting.gyroscope is not None:
+        corrected = setting.gyroscope.trajectory(reference)
+    previous = corrected if previous is None else previous
     for level in levels:
         if results and context.time_limit.leaves_out("further levels"):
             break
         clock = Stopwatch(context.threads)
-        model = replace(model.knowing(camera_of_motion(previous)), layered=capture_of(source).background is not None)
+        layered = capture_of(source).background is not None
+        model = replace(setting.model.knowing(camera_of_motion(previous)), layered=layered)
+        setting = replace(setting, model=model)
         groups = timeline.parts(resample(level, source.info.n_frames, clock))
         turning = level.turning(model.turning_camera(source.info.frame_shape))
         seen = through_lens(source, model)
@@ -119,10 +113,10 @@ def estimate_motion(
                 start = context.checkpoints.once("level-1-start", partial(starting_motion, seen, groups, context), groups)
             start = start and replace(start, timeline=timeline)
         exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start, known)
-        located = locate(exposures, graph, context, model, start, gyroscope)
+        located = locate(exposures, setting, start)
         interpolated = interpolate(exposures, located, timeline, reference, corrected)
         trajectory = interpolated.trajectory
-        require_agreement(ties_of(graph.tie, seen), groups, located.solution.located, trajectory)
+        require_agreement(ties_of(setting.graph.tie, seen), groups, located.solution.located, trajectory)
         uncertainty = Uncertainty(located, interpolated, previous, timeline)
         results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
         context.progress.note(_summary(results[-1]))

@@ -16,6 +16,7 @@ from photonpano.execution.context import Context
 from photonpano.motion.frame_motion import FrameMotion, motion_of_frames
 from photonpano.motion.gyroscope import Gyroscope
 from photonpano.motion.level import Level
+from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.rotations import RotationTrajectory
@@ -62,11 +63,20 @@ class State:
         if not levels:
             return self
         before = [each for each in self.results if each.level.number < levels[0].number]
-        given = self.plan.graph, self.reference, self.context, self.plan.until_converged, previous, self.timeline, self.model
         known = self.results[-1].located.covered if self.results else None
         if corrected is None and self.gyroscope is None:
             corrected = self.start
-        results = estimate_motion(self.source, levels, *given, corrected, known, self.gyroscope)
+        setting = LoopSetting(
+            source=self.source,
+            graph=self.plan.graph,
+            context=self.context,
+            reference=self.reference,
+            timeline=self.timeline,
+            model=self.model,
+            gyroscope=self.gyroscope,
+        )
+        until_converged = self.plan.until_converged
+        results = estimate_motion(setting, levels, previous, known=known, corrected=corrected, until_converged=until_converged)
         return replace(self, results=(*before, *results), outdated=False)
 
     def relocated(self) -> State:

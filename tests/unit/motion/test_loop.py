@@ -13,6 +13,7 @@ from photonpano.contracts.loop import AttributedTrajectory
 from photonpano.execution.context import Context, Quiet
 from photonpano.geometry import from_parameters, inverse, normalised, translation
 from photonpano.motion.level import Level
+from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import LevelResult, ReferencedTrajectory, converges, estimate_motion
 from photonpano.motion.timeline import Cut, Timeline
 from photonpano.motion.tracking.velocity import ConstantVelocity, Velocity
@@ -50,9 +51,16 @@ def source(memory_source: type) -> Any:
 
 @pytest.fixture
 def run(source: Any) -> Callable[..., list]:
-    def run(*levels: Level, reference: int = 60, notes: Any = None, **options: Any) -> list:
+    def run(*levels: Level, reference: int = 60, notes: Any = None, timeline: Timeline | None = None, **options: Any) -> list:
         context = Context(2) if notes is None else Context(2, notes)
-        return estimate_motion(source, levels, GraphSettings(), reference, context, **options)
+        setting = LoopSetting(
+            source=source,
+            graph=GraphSettings(),
+            context=context,
+            reference=reference,
+            timeline=timeline or Timeline.regular(N_FRAMES),
+        )
+        return estimate_motion(setting, levels, **options)
 
     return run
 

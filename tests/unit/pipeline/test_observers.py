@@ -12,7 +12,9 @@ from photonpano import LocationError, hookimpl
 from photonpano.errors import described
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas
+from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import estimate_motion
+from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.observers import Observers, frozen
 from photonpano.plugins.registry import Catalog
 from photonpano.specs.settings import GraphSettings
@@ -82,7 +84,9 @@ def test_observers_receive_four_stages_of_each_level(
 ) -> None:
     source = memory_source(np.zeros((120, 40, 60)))
     levels = [make_level(), make_level(number=2)]
-    results = estimate_motion(source, levels, GraphSettings(), 60, Context(2, on_level=watching(log).level_finished))
+    context = Context(2, on_level=watching(log).level_finished)
+    setting = LoopSetting(source=source, graph=GraphSettings(), context=context, reference=60, timeline=Timeline.regular(120))
+    results = estimate_motion(setting, levels)
     assert [(level, stage) for level, stage, _, _ in told] == [
         (level, stage) for level in (1, 2) for stage in ("resample", "merge", "locate", "interpolate")
     ]

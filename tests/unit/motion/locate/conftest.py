@@ -12,7 +12,8 @@ from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import inverse, translation
 from photonpano.motion.level import Level, VirtualExposures
-from photonpano.motion.locate import LocatedLevel, locate
+from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
+from photonpano.motion.timeline import Timeline
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import KnownMotion
 
@@ -37,7 +38,10 @@ def run(source: Any) -> Callable[..., LocatedLevel]:
     ) -> LocatedLevel:
         groups = level.resampler.groups(N_FRAMES, level.number)
         exposures = VirtualExposures(level, source, groups, previous, Stopwatch(threads), known=known)
-        return locate(exposures, graph, Context(threads))
+        setting = LoopSetting(
+            source=source, graph=graph, context=Context(threads), reference=0, timeline=Timeline.regular(N_FRAMES)
+        )
+        return locate(exposures, setting)
 
     return run
 

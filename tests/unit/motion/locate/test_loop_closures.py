@@ -16,7 +16,8 @@ from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import inverse, rescaling, translation
 from photonpano.motion.closures import MIN_SIMILARITY
 from photonpano.motion.level import Level, VirtualExposures
-from photonpano.motion.locate import LocatedLevel, locate
+from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
+from photonpano.motion.timeline import Timeline
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import KnownMotion, MemorySource, photographed
 from photonpano.testing.scenes import seen_along
@@ -75,7 +76,11 @@ def run() -> Callable[..., LocatedLevel]:
     def run(level: Level, closure_overlap: float | None = 0.5, threads: int = 2) -> LocatedLevel:
         groups = level.resampler.groups(10 * N, level.number)
         graph = GraphSettings(skips=(1.0, 2.0), closure_overlap=closure_overlap)
-        return locate(VirtualExposures(level, source, groups, None, Stopwatch(threads)), graph, Context(threads))
+        exposures = VirtualExposures(level, source, groups, None, Stopwatch(threads))
+        setting = LoopSetting(
+            source=source, graph=graph, context=Context(threads), reference=0, timeline=Timeline.regular(10 * N)
+        )
+        return locate(exposures, setting)
 
     return run
 
