@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from photonpano.values import FloatArray
 
@@ -29,6 +31,11 @@ class Filtered:
 
     signal: FloatArray
     std: FloatArray
+
+
+def gradient_of(image: NDArray[Any]) -> NDArray[Any]:
+    """Return the central differences of an image along y and x, (2, h, w): 0 along an axis of a single pixel."""
+    return np.stack([np.gradient(image, axis=axis) if n > 1 else np.zeros_like(image) for axis, n in enumerate(image.shape)])
 
 
 def exceeding_noise(steps: FloatArray, variances: FloatArray) -> Filtered:

@@ -158,7 +158,8 @@ def information_of(
     scatter, root = _hessian(moving.smoothed, moving.smoothed, buffers.weight), np.zeros((8, 8))
     if not cholesky(scatter, root):
         return PRIOR.copy(), np.inf, 0.0
-    common = float(np.trace(np.linalg.solve(own, hessian))) / 8
+    # Few rows that overlap show nothing of some directions.
+    common = float(np.trace(np.linalg.pinv(own, hermitian=True) @ hessian)) / 8
     solve_lower(root, hessian)
     information = hessian.T @ hessian / max(1.0, noise_ratio) + PRIOR
     std_px = expected_px(information, np.eye(8), coordinates.to_corners)

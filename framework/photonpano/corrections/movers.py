@@ -19,6 +19,7 @@ from photonpano.corrections.lighting.finding import speed_px
 from photonpano.corrections.lighting.gains import least_weight, scene_canvas
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
+from photonpano.filtering import gradient_of
 from photonpano.geometry import PATCHES, Camera, Canvas
 from photonpano.merging import Chunk, accumulate, binned_mean
 from photonpano.motion.consensus import APART
@@ -88,7 +89,7 @@ class _Seen:
 
         The motion is not exact, and a tremor may be left in it.
         """
-        slopes, steady = np.gradient(usual), self.root.copy()
+        slopes, steady = gradient_of(usual), self.root.copy()
         for index, (root, known) in enumerate(zip(self.root, self.known, strict=True)):
             terms, weight = np.stack([each[known] for each in (usual, *slopes)], axis=1), np.ones(int(known.sum()))
             for _ in range(_ROUNDS):
@@ -232,7 +233,7 @@ def _usual(seen: _Seen, root: FluxImage) -> tuple[FluxImage, BoolArray]:
 
 def _squares(seen: _Seen, root: FluxImage, usual: FluxImage, misplaced_px: float) -> FluxImage:
     """Return the squared difference of squares from the usual, in variances; NaN where they are not seen: (S, h, w)."""
-    slopes = np.square(np.gradient(usual)).sum(axis=0)
+    slopes = np.square(gradient_of(usual)).sum(axis=0)
     tolerated = (_UNEVEN * usual) ** 2 + (misplaced_px / CELL_PX) ** 2 * slopes
     return np.where(seen.known, (root - usual) ** 2 / (np.where(seen.known, seen.std, 1) ** 2 + tolerated), np.nan)
 

@@ -12,6 +12,7 @@ from photonpano.corrections.applying import corrected_source
 from photonpano.corrections.colour_filter import ColourFilter
 from photonpano.corrections.hot_pixels import brightest, outliers, reach_of, sorted_neighbours
 from photonpano.corrections.pixels import Correction
+from photonpano.filtering import gradient_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from photonpano.contracts.protocols import Source
     from photonpano.corrections.pixels import Decide, Pixels
-    from photonpano.values import BoolArray, FluxImage
+from photonpano.values import BoolArray, FluxImage
 
 _SPANS, _SPAN_FRAMES = 32, 128  # 32 spans of at most 128 frames are summed all over the capture
 _THRESHOLD = 6.0  # smallest deviation of a hot or dead pixel from its neighbours, in robust standard deviations
@@ -190,7 +191,7 @@ def _weakest_structure(mean: FluxImage, slope_noise: NDArray[Any]) -> FluxImage:
 
     A horizontal edge stays as it is while the camera pans along it, so the direction with the least structure counts.
     """
-    down, across = (np.asarray(slopes, np.float32) for slopes in np.gradient(mean))
+    down, across = (np.asarray(slopes, np.float32) for slopes in gradient_of(mean))
     xx, yy = _averaged(across**2 - slope_noise), _averaged(down**2 - slope_noise)
     return np.asarray((xx + yy) / 2 - np.hypot((xx - yy) / 2, _averaged(across * down)), np.float32)
 

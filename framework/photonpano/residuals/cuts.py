@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from photonpano.contracts.protocols import Source
 from photonpano.execution.context import Context
+from photonpano.filtering import gradient_of
 from photonpano.geometry import corners, inverse, steps_px, transform_points
 from photonpano.locating import shift_of_spectra
 from photonpano.merging import binned_mean, binning_of
@@ -277,7 +278,7 @@ class _Sides:
         covariance, best = np.zeros((2, 2)), 0.0
         for side in (~self.after, self.after):
             means = (self._mean(path, side & parity) for parity in (self._even, ~self._even))
-            first, second = (np.array(np.gradient(mean)[::-1]) for mean in means)  # along x and y: (2, h, w)
+            first, second = (gradient_of(mean)[::-1] for mean in means)  # along x and y: (2, h, w)
             seen = np.isfinite(first + second).all(axis=0)
             information = first[:, seen] @ second[:, seen].T
             values, directions = np.linalg.eigh((information + information.T) / 2)

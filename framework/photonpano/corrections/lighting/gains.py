@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.execution.context import Context
+from photonpano.filtering import gradient_of
 from photonpano.geometry import Camera, Canvas, canvas_around, canvas_of, covered_by, depths
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.accumulate import weights_of
@@ -207,7 +208,7 @@ def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: 
     """Return the part of residuals that a shift of each span explains: (N,)."""
     unseen = np.bincount(seen.cells, minlength=seen.n_cells) == 0
     image = np.where(unseen, np.nan, brightness).reshape(seen.canvas.shape)
-    gradient = np.stack([np.nan_to_num(each).ravel() for each in np.gradient(image)])[:, seen.cells]
+    gradient = np.stack([np.nan_to_num(each).ravel() for each in gradient_of(image)])[:, seen.cells]
     columns = np.concatenate([gradient, np.ones((1, len(left)))])
     normal, right = equations_of_groups(seen.times, len(seen.spans), columns, weight, left)
     shift = np.linalg.solve(normal + np.eye(3), right[..., None])[:, :2, 0]
