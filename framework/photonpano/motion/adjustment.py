@@ -155,6 +155,10 @@ class Adjustment(ABC, Generic[StateT]):
         del state, weights
         return False
 
+    def narrowed(self, state: StateT) -> tuple[Adjustment[StateT], StateT]:
+        """Return the problem without unknowns that are known to be 0, and the nearest state that it holds."""
+        return self, state
+
     @property
     def n_hyperparameters(self) -> int:
         """How many variances of the prior were estimated."""

@@ -391,20 +391,23 @@ class _Tied:
         kept = np.ones(len(self.motions), dtype=bool)
         found, norms = adjustment.minimise(state, kept)
         adjustment.hold_noise(norms, kept)
-        found, norms = self._learnt(adjustment, found, norms, kept)
+        adjustment, found, norms = self._learnt(adjustment, found, norms, kept)
         inliers = adjustment.inliers(norms)
         if not inliers.all() and not component_labels(len(self.order), self.compact_pairs[inliers]).any():
             kept = inliers
-            found, norms = self._learnt(adjustment, *adjustment.minimise(found, kept), kept)
+            adjustment, found, norms = self._learnt(adjustment, *adjustment.minimise(found, kept), kept)
         return _Fit(adjustment, found, norms, kept)
 
-    def _learnt(self, adjustment: Adjustment[Any], found: Any, norms: FloatArray, kept: BoolArray) -> tuple[Any, FloatArray]:
-        """Solve again with variances of the prior that the solution shows."""
+    def _learnt(
+        self, adjustment: Adjustment[Any], found: Any, norms: FloatArray, kept: BoolArray
+    ) -> tuple[Adjustment[Any], Any, FloatArray]:
+        """Solve again with variances of the prior that the solution shows, and without unknowns that these hold at 0."""
         for _ in range(_LEARNT):
             if not adjustment.learn(found, adjustment.weights(norms, kept)):
                 break
+            adjustment, found = adjustment.narrowed(found)
             found, norms = adjustment.minimise(found, kept)
-        return found, norms
+        return adjustment, found, norms
 
     def solution(self, fit: _Fit, model: MotionModel, compare: Callable[[], Mapping[str, Rival]]) -> GraphSolution:
         """Return a fit as the solution of the graph."""

@@ -42,6 +42,8 @@ _ROOTS = 8  # Newton steps of a square root
 _FIRST, _ASSUMED, _NONE = 1.0, 0.02, 2e-5
 _FEWEST_STEPS = 3  # that tell how wide the walks are
 _ROUNDS, _MOST, _SETTLED = 12, 6.0, 0.1  # rounds; most change of the logarithm of a variance in one, and least that counts
+# By how much a walk must lower the deviance: as the prior of a number does whose square is twice its variance (Akaike 1974).
+_WORTH = 1 - float(np.log(2))
 _DRAWS = 24  # by which the variances' degrees of freedom are estimated
 
 
@@ -131,7 +133,7 @@ class PlanarAdjustment(Adjustment[Plane]):
 
     def __init__(self, problem: Problem, model: PlanarName) -> None:
         """Set up the problem."""
-        self._basis = basis_of(model)
+        self._problem, self._basis = problem, basis_of(model)
         self._n_walks = max(self._basis.shape[1] - _FREE, 0)
         super().__init__(problem, n_shared=int(model == "homography"))
         # Nodes are in order of time; those of one instant make no step.
@@ -187,7 +189,8 @@ class PlanarAdjustment(Adjustment[Plane]):
         """Estimate the variances of the prior from pairs of these weights, (E,); return whether they changed.
 
         Variance components of least squares (Foerstner 1979; MacKay 1992): the sum of the squared steps, over the number of
-        them that the pairs determine. The marginal likelihood is largest where this changes nothing.
+        them that the pairs determine. The marginal likelihood is largest where this changes nothing. A walk that hardly
+        raises it is none.
         """
         if not self._n_walks:
             return False
@@ -229,7 +232,34 @@ class PlanarAdjustment(Adjustment[Plane]):
             self.variances = self.variances * np.exp(step)
             if np.abs(step).max() < _SETTLED:
                 break
+        known = [float(part.residuals @ part.residuals) for part in parts]
+        numbers = [len(part.residuals) for part in parts]
+
+        def deviance(variances: FloatArray) -> float:
+            factors = factorised(normal + sum(square / each for square, each in zip(squares, variances, strict=True)))
+            given = right[:, 0] + sum(side[:, 0] / each for side, each in zip(sides, variances, strict=True))
+            determinant = float(np.log(np.abs(factors.U.diagonal())).sum())
+            left = float((known / variances).sum() - given @ factors.solve(given))
+            return left + determinant + float(numbers @ np.log(variances))
+
+        least = deviance(self.variances)
+        for index in range(self._n_walks):  # none by which errors become larger
+            without = self.variances.copy()
+            without[index] = _NONE**2 / self._durations[index]
+            if without[index] < self.variances[index] and (other := deviance(without)) < least + _WORTH:
+                self.variances, least = without, other
         return bool(np.abs(np.log(self.variances / before)).max() > _SETTLED)
+
+    def narrowed(self, state: Plane) -> tuple[PlanarAdjustment, Plane]:
+        """Return the problem without walks that are none, and the nearest state that it holds."""
+        there = self.variances > _NONE**2 / self._durations
+        most = int(np.flatnonzero(there).max(initial=-1)) + 1
+        model = next(name for name in PLANAR_NAMES[1:] if len(_MOVED[name]) - _FREE >= min(most, len(_WALKS)))
+        if len(_MOVED[model]) >= self._n_node:
+            return self, state
+        narrow = PlanarAdjustment(self._problem, model)
+        narrow.variances, narrow._noise_norm = self.variances[: narrow._n_walks], self._noise_norm
+        return narrow, Plane(nearest(model, state.homographies, self._frame_shape))
 
     def turning_px(self, state: Plane) -> float | None:
         """Return the focal length of a camera that turns; None unless perspective follows the shift (Schwarz 1978)."""
