@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.linalg import SuperLU
 
 from photonpano.geometry import corners, generators, inverse, parameters, scaled_ahead, transform_points, unit_coordinates
 from photonpano.motion.adjustment import Adjustment, Prior, Problem, factorised
@@ -121,6 +122,32 @@ class Plane(NamedTuple):
     coupling: float = 0.0  # perspective that a shift brings along, in unit coordinates: -(s / f)^2 for a camera that turns
 
 
+class _Around(NamedTuple):
+    """The linear problem around a state, for any variances of the components of its prior.
+
+    Right sides have columns: that of the solution, and draws of its error.
+    """
+
+    normal: sparse.csr_array  # of the edges
+    right: FloatArray  # (n, 1 + D) of the edges
+    parts: list[Prior]  # the components, before they are divided by their standard deviations
+    squares: list[sparse.csr_array]  # of their slopes
+    sides: list[FloatArray]  # (n, 1 + D) each
+
+    def factors(self, variances: FloatArray) -> SuperLU:
+        """Factorise the normal equations."""
+        return factorised(self.normal + sum(square / each for square, each in zip(self.squares, variances, strict=True)))
+
+    def deviance(self, variances: FloatArray) -> float:
+        """Return that of the solution: see `Adjustment`."""
+        factors = self.factors(variances)
+        known = sum(float(part.residuals @ part.residuals) / each for part, each in zip(self.parts, variances, strict=True))
+        given = self.right[:, 0] + sum(side[:, 0] / each for side, each in zip(self.sides, variances, strict=True))
+        determinant = float(np.log(np.abs(factors.U.diagonal())).sum())
+        numbers = [len(part.residuals) for part in self.parts]
+        return float(known - given @ factors.solve(given) + determinant + numbers @ np.log(variances))
+
+
 class PlanarAdjustment(Adjustment[Plane]):
     """The least-squares problem of a graph of homographies.
 
@@ -199,27 +226,16 @@ class PlanarAdjustment(Adjustment[Plane]):
             changed = assumed**2 / self._durations != self.variances
             self.variances = assumed**2 / self._durations
             return bool(changed.any())
-        before, free, rng = self.variances, self._free(state), np.random.default_rng(0)
-        jacobians, residuals = self._of_edges(state, weights)
-        jacobians = jacobians[:, free]
-        # Columns: what is estimated, draws of its error, and the last shared unknown alone, whose variance is exact.
-        drawn = jacobians.T @ rng.normal(size=(jacobians.shape[0], _DRAWS))
-        normal, right = jacobians.T @ jacobians, np.column_stack([jacobians.T @ residuals, drawn])
-        parts = [Prior(part.residuals, sparse.csr_array(part.slopes[:, free])) for part in self._components(state)]
-        squares = [sparse.csr_array(part.slopes.T @ part.slopes) for part in parts]
-        sides = [
-            part.slopes.T @ np.column_stack([part.residuals, rng.normal(size=(len(part.residuals), _DRAWS))]) for part in parts
-        ]
-        alone = np.zeros((right.shape[0], 1))
-        alone[-1], last = self._n_shared, np.zeros(len(parts))
+        before, problem = self.variances, self._around(state, weights)
+        alone = np.zeros((problem.right.shape[0], 1))
+        alone[-1], last = self._n_shared, np.zeros(len(before))
         for _ in range(_ROUNDS):
-            whole = normal + sum(square / variance for square, variance in zip(squares, self.variances, strict=True))
-            scales = np.ones((len(parts), _DRAWS + 1)) / np.sqrt(self.variances)[:, None]
+            scales = np.ones((len(before), _DRAWS + 1)) / np.sqrt(self.variances)[:, None]
             scales[:, 0] **= 2
-            given = right + sum(side * scale for side, scale in zip(sides, scales, strict=True))
-            changes = factorised(whole).solve(np.column_stack([given, alone]))
-            found = np.empty(len(parts))
-            for index, (part, variance) in enumerate(zip(parts, self.variances, strict=True)):
+            given = problem.right + sum(side * scale for side, scale in zip(problem.sides, scales, strict=True))
+            changes = problem.factors(self.variances).solve(np.column_stack([given, alone]))
+            found = np.empty(len(before))
+            for index, (part, variance) in enumerate(zip(problem.parts, self.variances, strict=True)):
                 moves, number = part.slopes @ changes, len(part.residuals)
                 left = part.residuals - moves[:, 0]
                 unsure = (moves[:, 1:-1] ** 2).sum() / _DRAWS if index < self._n_walks else changes[-1, -1]
@@ -232,23 +248,25 @@ class PlanarAdjustment(Adjustment[Plane]):
             self.variances = self.variances * np.exp(step)
             if np.abs(step).max() < _SETTLED:
                 break
-        known = [float(part.residuals @ part.residuals) for part in parts]
-        numbers = [len(part.residuals) for part in parts]
-
-        def deviance(variances: FloatArray) -> float:
-            factors = factorised(normal + sum(square / each for square, each in zip(squares, variances, strict=True)))
-            given = right[:, 0] + sum(side[:, 0] / each for side, each in zip(sides, variances, strict=True))
-            determinant = float(np.log(np.abs(factors.U.diagonal())).sum())
-            left = float((known / variances).sum() - given @ factors.solve(given))
-            return left + determinant + float(numbers @ np.log(variances))
-
-        least = deviance(self.variances)
+        least = problem.deviance(self.variances)
         for index in range(self._n_walks):  # none by which errors become larger
             without = self.variances.copy()
             without[index] = _NONE**2 / self._durations[index]
-            if without[index] < self.variances[index] and (other := deviance(without)) < least + _WORTH:
+            if without[index] < self.variances[index] and (other := problem.deviance(without)) < least + _WORTH:
                 self.variances, least = without, other
         return bool(np.abs(np.log(self.variances / before)).max() > _SETTLED)
+
+    def _around(self, state: Plane, weights: FloatArray) -> _Around:
+        free, rng = self._free(state), np.random.default_rng(0)
+        jacobians, residuals = self._of_edges(state, weights)
+        jacobians = jacobians[:, free]
+        drawn = jacobians.T @ rng.normal(size=(jacobians.shape[0], _DRAWS))
+        parts = [Prior(part.residuals, sparse.csr_array(part.slopes[:, free])) for part in self._components(state)]
+        sides = [
+            part.slopes.T @ np.column_stack([part.residuals, rng.normal(size=(len(part.residuals), _DRAWS))]) for part in parts
+        ]
+        squares = [sparse.csr_array(part.slopes.T @ part.slopes) for part in parts]
+        return _Around(jacobians.T @ jacobians, np.column_stack([jacobians.T @ residuals, drawn]), parts, squares, sides)
 
     def narrowed(self, state: Plane) -> tuple[PlanarAdjustment, Plane]:
         """Return the problem without walks that are none, and the nearest state that it holds."""
