@@ -94,6 +94,16 @@ def test_zoom_out_and_back_is_no_outlier() -> None:
         assert all(px < 0.5 for walk, px in solution.walks_px.items() if walk != "zoom")
 
 
+def test_what_only_shifts_and_rolls_has_three_unknowns_an_exposure() -> None:
+    """Walks that are not worth their place are left out, and with them their noise."""
+    for seed in range(4):
+        edges = measured_with(path("euclidean", seed), seed, NOISE_PX)
+        found, told = (solve(GROUPS, edges, N_NODES // 2, SHAPE, model=MotionModel(name)) for name in ("auto", "euclidean"))
+        assert found.walks_px == {}
+        assert found.compare()["homography"].unknowns == 3 * (N_NODES - 1)
+        assert rms_px(found.homographies, path("euclidean", seed)) < 1.05 * rms_px(told.homographies, path("euclidean", seed))
+
+
 def test_turns_couple_perspective_to_shift() -> None:
     """What couples is no walk: without it, perspective walks far; and rotations are the likelier model."""
     edges = measured_with(turned(), 0, NOISE_PX)

@@ -231,6 +231,22 @@ def test_motion_that_explains_photons_better_is_used_until_none_is_left(run: Cal
     np.testing.assert_allclose(found.motion.homographies, PATH.at(np.arange(FRAMES)), atol=1e-9)
 
 
+def test_what_a_level_left_is_replaced_by_a_share_of_the_correction(run: Callable[..., Explained]) -> None:
+    """Noise stays; the frames that were right keep less of the expected error than those that were corrected by 1 px."""
+
+    def mend(homographies: np.ndarray, std_px: np.ndarray) -> Refined | None:
+        given.append(std_px)
+        return Refined(PATH.at(np.arange(FRAMES)), std_px, "1 px") if len(given) == 1 else None
+
+    given = list[np.ndarray]()
+    motion = run(mend, offset_px=1.0).motion
+    expected = [np.full(FRAMES, 0.05), np.full(FRAMES, 0.05)]
+    np.testing.assert_allclose(given, expected)
+    assert motion.remaining_px[: FRAMES // 2] == pytest.approx(0.25, rel=0.01)
+    assert motion.remaining_px[FRAMES // 2 :] == pytest.approx(0, abs=1e-9)
+    np.testing.assert_allclose(motion.noise_px, np.minimum(motion.noise_px, 0.05))
+
+
 @pytest.mark.parametrize(("offset_px", "relocated"), [(1.5, []), (3.0, [1])], ids=["sharp", "blurred"])
 def test_last_level_runs_again_along_a_motion_corrected_by_more_than_a_pixel(
     offset_px: float, relocated: list[int], run: Callable[..., Explained], monkeypatch: pytest.MonkeyPatch

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, Homography, Located, LocationError, NotLocated, PluginError
-from photonpano.geometry import corners, from_parameters, inverse, jacobian, normalised, translation
+from photonpano.geometry import corners, from_parameters, inverse, jacobian, normalised, rotation_matrices, translation
 from photonpano.motion.level import Level, NamedLocator
+from photonpano.motion.locate import _ambiguity
 from photonpano.specs.settings import GraphSettings
+from photonpano.values import Edge
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -150,6 +152,15 @@ def test_hypothesis_that_continues_the_motion_is_taken(run: Callable, hypothesis
     initials = made.locators[0].component.initials
     np.testing.assert_allclose([initials[later, later - 1][0, 2] for later in range(1, 12)], [2.0] + 10 * [4.0], atol=1e-9)
     assert found.ambiguity is None
+
+
+@pytest.mark.parametrize(("turn_deg", "second"), [(0.0, True), (10.0, True), (30.0, False)])
+def test_part_of_a_frame_that_a_roll_moves_is_no_second_place(turn_deg: float, second: bool) -> None:
+    """A roll by 30 degrees moves the corners by 18 px beside the middle, one by 10 degrees by 6 px."""
+    middle = translation(*corners(SHAPE).mean(axis=0))
+    rolled = translation(5, 3) @ middle @ rotation_matrices(np.array([0, 0, np.radians(turn_deg)])) @ inverse(middle)
+    found = _ambiguity(1, {(1, 0): 10.0}, [Edge(1, 0, Located(rolled))], SHAPE)
+    assert (found is not None) == second
 
 
 def test_first_of_several_hypotheses_is_taken_and_named_as_ambiguous(run: Callable, hypothesising: Callable) -> None:
