@@ -124,6 +124,8 @@ def test_a_turn_with_a_zoom_is_no_rotation(zoom: float) -> None:
     assert solution.model.kind == "homography"
     assert solution.outliers == ()
     assert rms_px(solution.homographies, turned(zoom)) < 1.5 * NOISE_PX
+    assert solution.turning_px == pytest.approx(FOCAL_PX, rel=0.1)
+    assert solution.walks_px["zoom"] > 50 * zoom
 
 
 @pytest.mark.parametrize(("true", "likelier"), [(turned(), "rotation"), (turned(0.02), "homography")], ids=["turn", "zoom"])
