@@ -1,4 +1,4 @@
-"""Denoise a series of steps with an empirical Wiener filter, whose spectrum is estimated from the series itself."""
+"""Filters: of a series of steps, whose spectrum is estimated from the series itself; differences of paths and images."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ class GraphSolution:
     rotations: Rotations | None = None  # of the L located nodes, and their camera; None for homographies
     # how far what homographies do beyond shift and roll moves the ends of a frame over the capture, px; none that are 0
     walks_px: Mapping[str, float] = field(default_factory=dict)
-    # of a camera that turns and travels: one in whose homographies perspective follows the shift; else None
+    # focal length of a camera that turns and travels: perspective of its homographies follows the shift. None for all others
     turning_px: float | None = None
     # returns how well rival models explain the edges, by their names; homographies beside others take as long as the graph
     compare: Callable[[], Mapping[str, Rival]] = dict

@@ -30,7 +30,7 @@ from photonpano.values import FloatArray, FrameSpan, Group
 _DRAWS = 4  # errors of knots by which it is found how much of them an interpolator leaves
 _FEWEST_KNOTS = 8  # that an interpolator smooths
 _AROUND, _LEAST_LEFT = 9, 0.05  # knots over which that is averaged, and least share of the variance that is left
-_AROUND_BEYOND = 33  # knots over which it is averaged how far they lie beside the motion
+_BESIDE = 33  # knots over which it is averaged how far they lie beside the motion
 _CENTRED = 2  # times that knots are moved to the instants of their exposures
 _SHRINKS = 0.75  # change of the motion by a level, over that by the level before, from which on it no longer converges
 
@@ -179,7 +179,7 @@ def interpolate(
     # lie beside it by the rest of theirs.
     before, after = uniform_filter1d(products, _AROUND, axis=1, mode="nearest")
     share = np.clip(after / np.maximum(before, np.finfo(float).tiny), _LEAST_LEFT, 1)
-    beyond = uniform_filter1d(left_px2 - (1 - share) * std_px**2, _AROUND_BEYOND, mode="reflect")
+    beyond = uniform_filter1d(left_px2 - (1 - share) * std_px**2, _BESIDE, mode="reflect")
     return Interpolated(trajectory, std_px * np.sqrt(share), np.sqrt(np.maximum(beyond, 0)))
 
 

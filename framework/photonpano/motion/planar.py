@@ -227,6 +227,7 @@ class PlanarAdjustment(Adjustment[Plane]):
             self.variances = assumed**2 / self._durations
             return bool(changed.any())
         before, problem = self.variances, self._around(state, weights)
+        # The variance of the last shared unknown, the coupling, is exact; others are those of draws.
         alone = np.zeros((problem.right.shape[0], 1))
         alone[-1], last = self._n_shared, np.zeros(len(before))
         for _ in range(_ROUNDS):

@@ -15,7 +15,7 @@ from photonpano.values import Located, Reason
 from photonpano.values.verdict import Found
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
-NARROW = "the motion is more than the model of it that was written holds"
+NARROW = "the camera moves by more than the model of its motion holds"
 _UNCERTAIN_PX = 1.0
 _ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
 
@@ -105,7 +105,7 @@ def _narrow(run: TestedRun) -> Found | None:
     if model.kind == "homography" or "homography" not in rivals or not rivals[model.name].deviance:
         return None
     apart_px, std_px = rivals["homography"].apart_px, float(motion.std_px[motion.located].mean())
-    where = f"expected errors from {model.name} to homographies, which are likelier: {apart_px:.2g} px"
+    where = f"times the expected error lie between {model.name} and any homographies, which are likelier: {apart_px:.2g} px"
     finds = model.kind == "rotation" and not (motion.camera is not None and motion.camera.distorts)
     what_to_do = f"{FREE}, or {FIND_LENS}" if finds else ""
     return Found(apart_px / float(np.hypot(std_px, SAME_LENS_PX)), where, what_to_do=what_to_do)
