@@ -34,13 +34,7 @@ class Contrast:
 
 
 class UntiedError(LocationError):
-    """Too many exposures of a level are not tied to the others.
-
-    Attributes:
-        parts: (N,) number of the connected component of each exposure, 0 for the largest.
-        signal_to_noise: median of those that are lost; None if nothing can be seen in any.
-        merged: returns an exposure by its number; None where they cannot be merged again.
-    """
+    """Too many exposures of a level are not tied to the others."""
 
     def __init__(
         self,
@@ -53,8 +47,10 @@ class UntiedError(LocationError):
         merged: Callable[[int], VirtualExposure] | None,
     ) -> None:
         super().__init__(message)
-        self.level, self.groups, self.edges, self.parts, self.merged = level, groups, edges, parts, merged
-        self.signal_to_noise = signal_to_noise
+        self.level, self.groups, self.edges = level, groups, edges
+        self.parts = parts  # (N,) number of the connected component of each exposure, 0 for the largest
+        self.merged = merged  # returns an exposure by its number; None where they cannot be merged again
+        self.signal_to_noise = signal_to_noise  # median of those that are lost; None if nothing can be seen in any
 
     @property
     def blurred(self) -> bool:

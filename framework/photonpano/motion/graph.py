@@ -27,7 +27,7 @@ from photonpano.motion.adjustment import Adjustment, Assessment, Problem
 from photonpano.motion.consensus import agreed_share, agreeing, contradicting, layers, tolerances_px, travelled
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
 from photonpano.motion.pairs import GYROSCOPE, TIE, adjacency, component_labels, instants_of
-from photonpano.motion.planar import PlanarAdjustment, Plane, nearest
+from photonpano.motion.planar import PlanarAdjustment, PlanarName, Plane, nearest
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, FrameSpan, Group, Located
 
@@ -284,8 +284,12 @@ def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel, fits: Seq
     given = None if start is None else inverse(start[tied.anchor]) @ start[tied.located]
     adjustment = tied.adjustment(model)
     if isinstance(adjustment, PlanarAdjustment):
-        found = nearest(model.planar, problem.observed if given is None else given, shape)
-        return tied.fit(adjustment, Plane(tied.composed(found) if given is None else found))
+        fit = _planar(tied, given, model.planar)
+        if model.planar != "homography" or fit.adjustment.unknowns <= 3 * len(problem.instants):
+            return fit
+        # Along a long chain, homographies without walks may be too far from those with walks to be found from there.
+        still = _planar(tied, given, "euclidean")
+        return min((fit, still), key=lambda each: each.adjustment.deviance(each.state, fit.weights))
     state = next((fit.state for fit in fits if isinstance(fit.state, Rotations)), None)
     if state is None:
         camera = model.camera(shape)
@@ -294,6 +298,12 @@ def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel, fits: Seq
         rotations = likely_rotations(camera, problem.observed if given is None else given, shape)
         state = Rotations(tied.composed(rotations) if given is None else rotations, camera)
     return tied.fit(adjustment, state)
+
+
+def _planar(tied: _Tied, given: FloatArray | None, model: PlanarName) -> _Fit:
+    found = nearest(model, tied.problem.observed if given is None else given, tied.frame_shape)
+    adjustment = PlanarAdjustment(tied.problem, model)
+    return tied.fit(adjustment, Plane(tied.composed(found) if given is None else found))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -37,13 +37,7 @@ class Registered:
 
 
 class Registrar:
-    """Has the exposures of a level described and pairs of them registered: see `ExposureTasks`.
-
-    Attributes:
-        contrasts: of the exposures described so far, by their numbers.
-        alternatives_px: by pair, the distance of a second motion that fits as well from where its registration started.
-        to_plane: (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level.
-    """
+    """Has the exposures of a level described and pairs of them registered: see `ExposureTasks`."""
 
     def __init__(
         self,
@@ -63,6 +57,7 @@ class Registrar:
         tasks = ExposureTasks(exposures)
         self._tasks = context.executor.share(tasks)
         # One call for all exposures: a trajectory takes about as long for one instant as for a thousand.
+        # (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level
         self.to_plane = None if exposures.previous is None else exposures.previous.at(instants_of(exposures.groups))
         self._from_plane = None if self.to_plane is None else inverse(self.to_plane)
         # Only locators that keep hypotheses start from a motion at the first level.
@@ -72,7 +67,8 @@ class Registrar:
         self._start = context.executor.share(start) if self._tracks else None
         self._places: dict[int, Place] = {}
         self._kept: dict[int, Descriptions] = {}
-        self.contrasts: dict[int, Contrast] = {}
+        self.contrasts: dict[int, Contrast] = {}  # of the exposures described so far, by their numbers
+        # by pair, the distance of a second motion that fits as well from where its registration started
         self.alternatives_px: dict[tuple[int, int], float] = {}
         self._decided, self._lock = set[Decision](), Lock()
 

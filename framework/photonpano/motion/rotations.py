@@ -23,14 +23,11 @@ class RotationTrajectory:
     Convention:
         Homographies are K R K^-1 of determinant 1: they map ideal pixels of a frame to those of the reference frame, and h33
         is negative or zero where the camera looks backwards.
-
-    Attributes:
-        camera: of all frames.
     """
 
     def __init__(self, free: Trajectory, camera: Camera, reference: float) -> None:
         """Take a trajectory of rotations of a camera, as homographies to any plane."""
-        self.camera = camera
+        self.camera = camera  # of all frames
         self._free = free
         self._to_reference = self._free_rotations([reference])[0].T
 

@@ -104,6 +104,18 @@ def test_what_only_shifts_and_rolls_has_three_unknowns_an_exposure() -> None:
         assert rms_px(found.homographies, path("euclidean", seed)) < 1.05 * rms_px(told.homographies, path("euclidean", seed))
 
 
+def test_a_long_way_without_walks_is_as_accurate_as_told() -> None:
+    """Perspective that noise alone shows bends a way of 30 frames so far that none is hard to find from there."""
+    n_nodes = 200
+    true = np.array([translation(30 * SHAPE[1] * each, 0) for each in np.linspace(0, 1, n_nodes)])
+    edges = measured_with(true, 0, 0.3)
+    found, told = (
+        solve(groups_of(n_nodes), edges, n_nodes // 2, SHAPE, model=MotionModel(name)) for name in ("auto", "euclidean")
+    )
+    assert found.walks_px == {}
+    assert rms_px(found.homographies, true) < 1.05 * rms_px(told.homographies, true)
+
+
 def test_turns_couple_perspective_to_shift() -> None:
     """What couples is no walk: without it, perspective walks far; and rotations are the likelier model."""
     edges = measured_with(turned(), 0, NOISE_PX)

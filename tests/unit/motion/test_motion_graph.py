@@ -191,7 +191,10 @@ def test_components_are_numbered_from_the_largest() -> None:
 def test_solve_of_a_large_graph_takes_few_steps_with_sparse_factors(
     monkeypatch: pytest.MonkeyPatch, closures: int, most: int
 ) -> None:
-    """The factors of the normal equations stay sparse: at most `most` blocks for each exposure."""
+    """The factors of the normal equations stay sparse: at most `most` blocks for each exposure.
+
+    What only shifts and rolls, which is solved for, too, has factors of less than a half of this size.
+    """
     filled: list[int] = []
     factorise = adjustment.splu
 
@@ -210,7 +213,8 @@ def test_solve_of_a_large_graph_takes_few_steps_with_sparse_factors(
         if late - early > 4
     ]
     solve(groups_of(300), edges, 150, SHAPE)
-    assert len(filled) <= 30
+    assert sum(size > max(filled) / 2 for size in filled) <= 31  # thirty, and one to compare
+    assert len(filled) <= 40
     assert max(filled) < 300 * 8**2 * most
 
 

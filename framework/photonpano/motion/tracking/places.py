@@ -24,12 +24,7 @@ class Place:
 
 
 class Track:
-    """The exposures of the first level, each tied to the nearest earlier one.
-
-    Attributes:
-        places: where exposures lie, by their numbers: those that were given, and those that were settled since.
-        alternatives_px: of the pairs that may just as well have another motion, how far that is from the one they start at.
-    """
+    """The exposures of the first level, each tied to the nearest earlier one."""
 
     def __init__(
         self, start: StartingMotion | None, groups: Sequence[Group], frame_shape: tuple[int, int], places: Mapping[int, Place]
@@ -37,7 +32,8 @@ class Track:
         """Take the motion that short spans show, all groups of the level, and the places of some of them."""
         self._start, self._groups = start, groups
         self._middle = corners(frame_shape).mean(axis=0)
-        self.places = dict(places)
+        self.places = dict(places)  # where exposures lie, by their numbers: those that were given, and those settled since
+        # of the pairs that may just as well have another motion, how far that is from the one they start at
         self.alternatives_px: dict[tuple[int, int], float] = {}
 
     def expected(
