@@ -48,6 +48,7 @@ class Assessment:
     # rotation vector in its own frame. NaN for a single node.
     information: FloatArray
     errors_px: FloatArray  # (N, 8, S) drawn errors of the corners of each node, after the best alignment of the planes
+    shared_px: FloatArray  # (N, 8, S) the part of these errors that comes with those of unknowns that all nodes share
     # (5,) expected errors of the camera that all nodes share: of its focal length in px, and of k1, k2, p1 and p2. They are 0
     # for what is given; () without a camera.
     std_camera: FloatArray
@@ -248,8 +249,9 @@ class Adjustment(ABC, Generic[StateT]):
         right += below.T @ rng.normal(size=(below.shape[0], SAMPLES))
         changes[free] = _solved(normal[free][:, free], right[free], draws=True)
         changes += self._common_errors(normal, free, float(weights.sum()), rng)
-        std_camera = self.std_camera(state, changes[k * self._n_nodes :])
-        return Assessment(self.information(state, blocks), self._corner_errors_px(state, changes), std_camera)
+        shared, errors_px = changes[k * self._n_nodes :], self._corner_errors_px(state, changes)
+        shared_px = errors_px @ np.linalg.pinv(shared) @ shared if self._n_shared else np.zeros_like(errors_px)
+        return Assessment(self.information(state, blocks), errors_px, shared_px, self.std_camera(state, shared))
 
     def _body_slopes(self, state: StateT) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives of the whitened residual of each edge by small motions of both its frames: (E, 8, 8) each."""

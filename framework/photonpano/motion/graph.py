@@ -445,7 +445,8 @@ class _Tied:
         homographies = np.full((len(self.located), 3, 3), np.nan)
         homographies[self.anchor] = np.eye(3)
         rotations = None if model.kind != "rotation" else Rotations(np.eye(3)[None], model.camera(self.frame_shape))
-        nothing = Assessment(np.full((1, 8, 8), np.nan), np.full((1, 8, 1), np.nan), np.zeros(0))
+        unknown = np.full((1, 8, 1), np.nan)
+        nothing = Assessment(np.full((1, 8, 8), np.nan), unknown, unknown, np.zeros(0))
         return GraphSolution(homographies, self.located, (), 0.0, lambda: nothing, model, rotations)
 
 

@@ -59,6 +59,7 @@ class LocatedLevel:
     # vector for a camera that only turns; None for a single exposure
     information: FloatArray | None
     errors_px: FloatArray  # (N, 8, S) errors of the corners of each located exposure that were drawn; NaN for a single one
+    shared_px: FloatArray  # (N, 8, S) the part of them that all exposures share, see `Assessment`
     frame_shape: tuple[int, int]  # (height, width) of a frame
     std_camera: FloatArray  # (5,) expected errors of the camera, see `Assessment`
     rivals: Mapping[str, Rival]  # how well models of the motion explain the pairs, by their names
@@ -177,6 +178,7 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
         solution,
         assessed.information if len(assessed.errors_px) > 1 else None,
         assessed.errors_px,
+        assessed.shared_px,
         shape,
         assessed.std_camera,
         rivals,

@@ -15,6 +15,7 @@ from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.execution.threads import Stopwatch
 from photonpano.filtering import smooth_share
 from photonpano.geometry import align_planes, corner_displacements, corners, inverse, moving_corners, transform_points
+from photonpano.motion.adjustment import std_of
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
@@ -163,14 +164,15 @@ def interpolate(
             smooth = _smooth_share(trajectory, located)
             knots = measured.moved(smooth * displaced + (1 - smooth) * np.eye(3))
             trajectory = _through(knots, exposures, located, timeline, reference, refined)
-        std_px = located.std_px
+        # No interpolator smooths what all exposures share, such as the error of a focal length.
+        own_px, std_px, shared_px = located.errors_px - located.shared_px, located.std_px, std_of(located.shared_px)
         if len(std_px) < _FEWEST_KNOTS:
             return Interpolated(trajectory, std_px, np.zeros(len(std_px)))
         products, here, known = np.zeros((2, len(std_px))), corners(located.frame_shape), trajectory.at(located.instants)
         among = trajectory.at(knots.instants)
         aligned = inverse(among) @ align_planes(knots.homographies, among, located.frame_shape) @ knots.homographies
         left_px2 = (corner_displacements(aligned, np.eye(3), located.frame_shape) ** 2).mean(axis=-1)
-        for errors in np.moveaxis(located.errors_px, -1, 0)[:_DRAWS]:
+        for errors in np.moveaxis(own_px, -1, 0)[:_DRAWS]:
             moved = knots.moved(moving_corners(errors, located.frame_shape))
             answer = _through(moved, exposures, located, timeline, reference, refined).at(located.instants)
             answer = inverse(known) @ align_planes(answer, known, located.frame_shape) @ answer
@@ -179,8 +181,9 @@ def interpolate(
     # lie beside it by the rest of theirs.
     before, after = uniform_filter1d(products, _AROUND, axis=1, mode="nearest")
     share = np.clip(after / np.maximum(before, np.finfo(float).tiny), _LEAST_LEFT, 1)
-    beyond = uniform_filter1d(left_px2 - (1 - share) * std_px**2, _BESIDE, mode="reflect")
-    return Interpolated(trajectory, std_px * np.sqrt(share), np.sqrt(np.maximum(beyond, 0)))
+    own_std_px = std_of(own_px)
+    beyond = uniform_filter1d(left_px2 - (1 - share) * own_std_px**2, _BESIDE, mode="reflect")
+    return Interpolated(trajectory, np.hypot(shared_px, own_std_px * np.sqrt(share)), np.sqrt(np.maximum(beyond, 0)))
 
 
 def _smooth_share(trajectory: Trajectory, located: LocatedLevel) -> float:
