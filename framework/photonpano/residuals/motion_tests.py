@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from photonpano.geometry import corners, jacobian
-from photonpano.motion.model import SAME_LENS_PX
+from photonpano.motion.locate import TOO_NARROW
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
 from photonpano.residuals.scene_tests import of_either_part
 from photonpano.residuals.tested_run import FIND_LENS, FREE, RIVAL, TestedRun, Tests
@@ -95,20 +95,20 @@ def contradictions(dropped: int, pairs: int) -> Reason | None:
     return _contradictions.reason(_contradicting(dropped, pairs))
 
 
-@MOTION_TESTS.doubtful_above(3.0, NARROW, FREE)
+@MOTION_TESTS.doubtful_above(TOO_NARROW, NARROW, FREE)
 def _narrow(run: TestedRun) -> Found | None:
     """Homographies are likelier, and farther away than the motion is expected to err."""
     if not run.levels:
         return None
     located, motion = run.levels[-1].located, run.explained.motion
-    rivals, model = located.rivals, located.solution.model
-    if model.kind == "homography" or "homography" not in rivals or not rivals[model.name].deviance:
+    model = located.solution.model
+    if not (times := located.narrow(float(motion.std_px[motion.located].mean()))):
         return None
-    apart_px, std_px = rivals["homography"].apart_px, float(motion.std_px[motion.located].mean())
+    apart_px = located.rivals["homography"].apart_px
     where = f"times the expected error lie between {model.name} and any homographies, which are likelier: {apart_px:.2g} px"
     finds = model.kind == "rotation" and not (motion.camera is not None and motion.camera.distorts)
     what_to_do = f"{FREE}, or {FIND_LENS}" if finds else ""
-    return Found(apart_px / float(np.hypot(std_px, SAME_LENS_PX)), where, what_to_do=what_to_do)
+    return Found(times, where, what_to_do=what_to_do)
 
 
 @MOTION_TESTS.doubtful_above(0.05, REPEATS, "look at the path in the report; a slower motion tells the places apart")
