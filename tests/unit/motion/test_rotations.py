@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano.contracts.protocols import Interpolator
+from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import (
     Camera,
     align_rotations,
@@ -22,11 +23,16 @@ from photonpano.geometry import (
     transform_points,
 )
 from photonpano.locating import fit_homography
+from photonpano.motion.adjustment import std_of
 from photonpano.motion.graph import GraphSolution, solve
 from photonpano.motion.lens_shift import LensShift
+from photonpano.motion.level import VirtualExposures
+from photonpano.motion.locate import LocatedLevel
+from photonpano.motion.loop import interpolate
 from photonpano.motion.model import ModelName, MotionModel
 from photonpano.motion.rotation_graph import Rotations
 from photonpano.motion.rotations import RotationTrajectory, fit_rotations
+from photonpano.motion.timeline import Timeline
 from photonpano.values import Edge, FloatArray, Located, NotLocated, Patches
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators.interpolating import GeodesicInterpolator, LieInterpolator, LucasKanadeInterpolator
@@ -98,6 +104,26 @@ def test_expected_errors_of_rotations_hold() -> None:
         focal_stds.append(assessed.std_camera[0] / FOCAL_PX)
     assert 0.8 < np.sqrt(np.mean(errors) / np.mean(stds)) < 1.25
     assert np.std(focals) / np.mean(focal_stds) == pytest.approx(1, abs=0.5)
+
+
+def test_interpolators_leave_the_error_of_the_focal_length(make_level: Callable, memory_source: type) -> None:
+    """All exposures share it. The rest of their errors is smoothed, as that of a camera whose focal length is known."""
+    groups, n_frames = groups_of(40), 400
+    edges = tuple(edges_of(turn(40, 4.0), np.random.default_rng(0)))
+    level = make_level(interpolator=INTERPOLATORS["smoothing-spline"])
+    exposures = VirtualExposures(level, memory_source(np.zeros((n_frames, *SHAPE))), groups, None, Stopwatch(1))
+    variances, shared = [], []
+    for focal_px in (FOCAL_PX, None):
+        solution = solve(groups, edges, 20, SHAPE, model=MotionModel("rotation", focal_px=focal_px))
+        assessed = solution.assess()
+        of_errors = assessed.information, assessed.errors_px, assessed.shared_px
+        located = LocatedLevel(groups, edges, (), solution, *of_errors, SHAPE, assessed.std_camera, {})
+        variances.append(interpolate(exposures, located, Timeline.regular(n_frames), 200).std_px ** 2)
+        shared.append(std_of(assessed.shared_px) ** 2)
+    assert not shared[0].any()
+    inner = slice(5, -5)
+    assert np.mean(variances[1][inner]) == pytest.approx(np.mean((variances[0] + shared[1])[inner]), rel=0.1)
+    assert np.mean(variances[1][inner]) > 1.3 * np.mean(variances[0][inner])
 
 
 def test_known_focal_length_is_kept() -> None:
