@@ -12,6 +12,7 @@ import pytest
 
 from photonpano import parse_spec
 from photonpano.evaluation import corner_errors, load_run_trajectory
+from photonpano.residuals.motion_tests import NARROW
 from photonpano.testing.scenes import detected, seen_along, textured
 
 SHAPE, SCENE_SHAPE, N_FRAMES, FLUX = (96, 128), (400, 520), 900, 0.3
@@ -54,16 +55,31 @@ def test_frames_of_few_rows_are_located(tmp_path: Path, outcome_of: Callable[...
     assert within_3 >= WITHIN_3
 
 
+def test_what_a_freer_motion_explains_does_not_move_by_itself(tmp_path: Path, outcome_of: Callable[..., Any]) -> None:
+    """Shifts and rolls of a camera that zooms leave much that looks as if it moved by itself."""
+    true = motion_paths.path_of(motion_paths.MOTIONS["zoom"], SHAPE, N_FRAMES, SCENE_SHAPE, 5)
+    scene = textured(SCENE_SHAPE, FLUX, seed=5).astype(np.float32)
+    outcome = outcome_of(spec_of(true, scene, SHAPE, tmp_path, motion={"model": "euclidean"}))
+    verdict, decisions = outcome.record["verdict"], {each["what"] for each in outcome.record["decisions"]}
+    assert verdict["status"] == "doubtful"
+    assert NARROW in [each["what"] for each in verdict["reasons"]]
+    assert "movers" not in decisions
+
+
 def run_along(
     true: np.ndarray, scene: np.ndarray, shape: tuple[int, int], folder: Path, outcome_of: Callable[..., Any]
 ) -> tuple[float, float]:
     """Run a capture by default; return its mean error, and the share of the frames within 3 std_px: it is trusted."""
-    np.save(folder / "cube.npy", np.packbits(detected(seen_along(scene, true, shape), 7), axis=-1))
-    outcome = outcome_of(
-        parse_spec({"version": 1, "source": {"use": "packed-npy", "with": {"path": str(folder / "cube.npy")}}})
-    )
+    outcome = outcome_of(spec_of(true, scene, shape, folder))
     found = load_run_trajectory(outcome.directory)
     score = corner_errors(found.corner_homographies, true, shape, found.located)
     assert found.located.all()
     assert outcome.record["verdict"]["status"] == "trusted", outcome.record["verdict"]["reasons"]
     return score.mean_px, float(np.mean(score.errors_px <= 3 * found.std_px))
+
+
+def spec_of(true: np.ndarray, scene: np.ndarray, shape: tuple[int, int], folder: Path, **sections: Any) -> Any:
+    """Write a capture; return its spec, which may have more sections."""
+    np.save(folder / "cube.npy", np.packbits(detected(seen_along(scene, true, shape), 7), axis=-1))
+    source = {"use": "packed-npy", "with": {"path": str(folder / "cube.npy")}}
+    return parse_spec({"version": 1, "source": source, **sections})

@@ -188,18 +188,22 @@ def _of_background(
     # A richer model may follow what is near, too, but then fits neither part: most patches agree with the right one.
     turning = {model: fit for model, fit in fits.items() if model.kind == "rotation"}
     rivals = dict.fromkeys([likeliest, *([_likeliest(turning, tied.frame_shape)] if turning else [])])
-    selected = {model: agreed for model in rivals if (agreed := _agreed(tied, model, fits[model]))}
+    telling = dict(fits)
+    if not turning:  # what a narrow model cannot follow need not move by itself
+        telling = _with_homographies(tied, start, fits)
+        rivals = dict.fromkeys(model for model in telling if model.kind == "homography") or rivals
+    selected = {model: agreed for model in rivals if (agreed := _agreed(tied, model, telling[model]))}
     if not selected:
         return tied, fits
     model = max(selected, key=lambda each: selected[each].share)
-    first, (background, fit, _) = fits[model].adjustment, selected[model]
+    first, (background, fit, _) = telling[model].adjustment, selected[model]
     found = layers(tied.pairs, tied.motions, first.beside(fit.state), len(tied.located))
     background = replace(background, layers=found)
     if isinstance(fit.state, Rotations):
         way_px = travelled(tied.pairs, tied.motions, first.beside(fit.state), found)
         background = replace(background, parallax=way_px / fit.state.camera.focal_px)
     others = [each for each in fits if each is not model]
-    return background, {each: _fitted(background, start, each) for each in others} | {model: fit}
+    return background, {each: _fitted(background, start, each) for each in others} | ({model: fit} if model in fits else {})
 
 
 class _Agreed(NamedTuple):
@@ -244,10 +248,7 @@ def _deviances(fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, float]:
 
 def _compared(tied: _Tied, start: FloatArray | None, fits: Mapping[MotionModel, _Fit], chosen: MotionModel) -> dict[str, Rival]:
     """Compare the models that were fitted, and homographies where one plane holds all frames."""
-    fits, shape = dict(fits), tied.frame_shape
-    if all(model.kind != "homography" for model in fits):
-        with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
-            fits[HOMOGRAPHIES] = _fitted(tied, start, HOMOGRAPHIES)
+    fits, shape = _with_homographies(tied, start, fits), tied.frame_shape
     deviances, taken = _deviances(fits), fits[chosen].homographies
     least, rivals = min(deviances.values()), {}
     for model, fit in fits.items():
@@ -256,6 +257,14 @@ def _compared(tied: _Tied, start: FloatArray | None, fits: Mapping[MotionModel, 
         chi2, unknowns = fit.adjustment.chi2(fit.norms, fit.kept), fit.adjustment.unknowns
         rivals[model.name] = Rival(chi2, unknowns, deviances[model] - least, apart_px)
     return rivals
+
+
+def _with_homographies(tied: _Tied, start: FloatArray | None, fits: Mapping[MotionModel, _Fit]) -> dict[MotionModel, _Fit]:
+    """Add homographies to the fits, unless they are among them, or no plane holds all frames."""
+    if all(model.kind != "homography" for model in fits):
+        with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
+            return {**fits, HOMOGRAPHIES: _fitted(tied, start, HOMOGRAPHIES)}
+    return dict(fits)
 
 
 def _freed(tied: _Tied, model: MotionModel, fit: _Fit) -> Freed | None:

@@ -21,7 +21,7 @@ from photonpano.motion.exposure_tasks import Pair
 from photonpano.motion.graph import GraphOptions, GraphSolution, Rival, components, solve
 from photonpano.motion.gyroscope import Gyroscope
 from photonpano.motion.level import FrameHomography, VirtualExposures
-from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
+from photonpano.motion.model import HOMOGRAPHIES, MotionModel
 from photonpano.motion.pairs import alike, excluded_pairs, instants_of, pairs_of
 from photonpano.motion.registration import Registrar
 from photonpano.motion.ties import TiedPair, tied_pairs, ties_of
@@ -32,7 +32,6 @@ from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Loc
 
 # A fallback contradicts the first locator beyond this fraction of the shorter side of a frame.
 _CONTRADICTION = 0.05
-TOO_NARROW = 3.0  # expected errors by which homographies that are likelier differ from what a model of the motion can hold
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -70,13 +69,6 @@ class LocatedLevel:
     def std_px(self) -> FloatArray:
         """The expected error of the corners of each located exposure, (N,); NaN for a single one."""
         return std_of(self.errors_px)
-
-    def narrow(self, std_px: float) -> float:
-        """Return how far homographies lie from a model that is less likely, in expected errors of `std_px`; 0 otherwise."""
-        model, rival = self.solution.model, self.rivals.get("homography")
-        if model.kind == "homography" or rival is None or not self.rivals[model.name].deviance:
-            return 0.0
-        return rival.apart_px / float(np.hypot(std_px, SAME_LENS_PX))
 
     @property
     def instants(self) -> FloatArray:

@@ -19,7 +19,7 @@ from photonpano.motion.adjustment import std_of
 from photonpano.motion.diagnosis import require_in_front
 from photonpano.motion.level import Level, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
-from photonpano.motion.model import MotionModel
+from photonpano.motion.model import SAME_LENS_PX, MotionModel
 from photonpano.motion.refined_motion import Knots, RefinedMotion
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
 from photonpano.motion.ties import require_agreement, ties_of
@@ -34,6 +34,8 @@ _AROUND, _LEAST_LEFT = 9, 0.05  # knots over which that is averaged, and least s
 _BESIDE = 33  # knots over which it is averaged how far they lie beside the motion
 _CENTRED = 2  # times that knots are moved to the instants of their exposures
 _SHRINKS = 0.75  # change of the motion by a level, over that by the level before, from which on it no longer converges
+
+TOO_NARROW = 3.0  # expected errors by which homographies that are likelier differ from what a model of the motion can hold
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +54,14 @@ class LevelResult:
     def change_px(self) -> float | None:
         """Mean displacement of the corners of the frames since the previous level, px of a frame; None at the first level."""
         return self.uncertainty.change_px
+
+    @property
+    def narrow(self) -> float:
+        """How far homographies lie from a model that is less likely, in expected errors; 0 otherwise."""
+        rivals, model = self.located.rivals, self.located.solution.model
+        if model.kind == "homography" or "homography" not in rivals or not rivals[model.name].deviance:
+            return 0.0
+        return rivals["homography"].apart_px / float(np.hypot(self.uncertainty.mean_px, SAME_LENS_PX))
 
     @property
     def converged(self) -> bool:

@@ -26,8 +26,7 @@ from photonpano.corrections.movers import find_background, without_layers
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import Camera, lenses_apart_px
 from photonpano.motion.diagnosis import UntiedError
-from photonpano.motion.locate import TOO_NARROW
-from photonpano.motion.loop import converges
+from photonpano.motion.loop import TOO_NARROW, converges
 from photonpano.motion.model import SAME_LENS_PX
 from photonpano.motion.timeline import UNCUT_JUMP, Cut
 from photonpano.pipeline.components import build_levels
@@ -264,8 +263,7 @@ def _uncertain(state: State) -> bool:
     """Return whether the motion may be wrong somewhere, where all of the background would differ from what is expected."""
     located = state.results[-1].located
     # What a freer motion explains does not move by itself.
-    narrow = located.narrow(float(located.std_px.mean())) > TOO_NARROW
-    return narrow or len(located.failures) > _FAILED * len(located.edges)
+    return state.results[-1].narrow > TOO_NARROW or len(located.failures) > _FAILED * len(located.edges)
 
 
 def again_without_movers(state: State) -> Proposal | None:

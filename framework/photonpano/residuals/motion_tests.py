@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from photonpano.geometry import corners, jacobian
-from photonpano.motion.locate import TOO_NARROW
+from photonpano.motion.loop import TOO_NARROW
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
 from photonpano.residuals.scene_tests import of_either_part
 from photonpano.residuals.tested_run import FIND_LENS, FREE, RIVAL, TestedRun, Tests
@@ -98,12 +98,10 @@ def contradictions(dropped: int, pairs: int) -> Reason | None:
 @MOTION_TESTS.doubtful_above(TOO_NARROW, NARROW, FREE)
 def _narrow(run: TestedRun) -> Found | None:
     """Homographies are likelier, and farther away than the motion is expected to err."""
-    if not run.levels:
+    if not run.levels or not (times := run.levels[-1].narrow):
         return None
     located, motion = run.levels[-1].located, run.explained.motion
     model = located.solution.model
-    if not (times := located.narrow(float(motion.std_px[motion.located].mean()))):
-        return None
     apart_px = located.rivals["homography"].apart_px
     where = f"times the expected error lie between {model.name} and any homographies, which are likelier: {apart_px:.2g} px"
     finds = model.kind == "rotation" and not (motion.camera is not None and motion.camera.distorts)

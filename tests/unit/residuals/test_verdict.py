@@ -11,6 +11,7 @@ import pytest
 from photonpano import FrameSpan
 from photonpano.geometry import Camera
 from photonpano.motion.graph import Freed, Rival
+from photonpano.motion.loop import LevelResult
 from photonpano.motion.model import SAME_LENS_PX, MotionModel
 from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED, UNCUT_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
@@ -243,7 +244,11 @@ def level_with(
     solution = SimpleNamespace(**known | of_solution)
     edges = (Edge(1, 0, motion),) * 30
     located = SimpleNamespace(ambiguity=ambiguity, rivals=rivals or {}, edges=edges, solution=solution, frame_shape=SHAPE)
-    return SimpleNamespace(level=SimpleNamespace(number=1), located=located, change_px=change_px)
+    level = SimpleNamespace(
+        level=SimpleNamespace(number=1), located=located, change_px=change_px, uncertainty=SimpleNamespace(mean_px=1.0)
+    )
+    level.narrow = LevelResult.narrow.fget(level)
+    return level
 
 
 @pytest.mark.parametrize(("times", "deviance", "doubtful"), [(9.0, 0.0, False), (2.0, 40.0, False), (9.0, 40.0, True)], ids=str)
@@ -251,8 +256,7 @@ def test_model_that_holds_less_than_the_motion_is_doubtful(
     explained: Explained, times: float, deviance: float, doubtful: bool
 ) -> None:
     """Homographies are likelier, and farther away than the motion is expected to err."""
-    std_px = float(np.hypot(explained.motion.std_px.mean(), SAME_LENS_PX))
-    rivals = {"homography": Rival(1.0, 232, 0.0, times * std_px), "affine": Rival(1.0, 88, deviance)}
+    rivals = {"homography": Rival(1.0, 232, 0.0, times * float(np.hypot(1, SAME_LENS_PX))), "affine": Rival(1.0, 88, deviance)}
     reasons = judge(explained, [level_with(None, rivals, model=MotionModel("affine"))]).reasons
     assert [(reason.what, pytest.approx(reason.figure)) for reason in reasons] == [(NARROW, times)] * doubtful
     assert all("affine" in reason.where for reason in reasons)
