@@ -24,13 +24,10 @@ _CLEARLY = 0.5  # a pixel clearly follows the motion that leaves less than half 
 
 
 class Follows(NamedTuple):
-    """What follows a motion.
+    """What follows a motion."""
 
-    Attributes:
-        difference: (H, W) float32, local variance of the difference of the aligned images relative to the sum of their
-            variances, from 0 to 1; NaN without enough texture.
-    """
-
+    # (H, W) float32, local variance of the difference of the aligned images relative to the sum of their variances, from 0 to
+    # 1; NaN without enough texture
     difference: NDArray[np.float32]
 
     @property

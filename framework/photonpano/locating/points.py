@@ -23,19 +23,12 @@ MIN_NOISE_PX = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """Matched points of two images.
+    """Matched points of two images."""
 
-    Attributes:
-        moving: (N, 2) points of the moving image; integers are pixel centres.
-        fixed: (N, 2) their partners.
-        guided: whether partners were searched near the position that a motion predicts, and not in the whole image.
-        sizes: (N,) diameters of the keypoints, None if all are equal.
-    """
-
-    moving: Points
-    fixed: Points
-    guided: bool
-    sizes: Points | None = None
+    moving: Points  # (N, 2) points of the moving image; integers are pixel centres
+    fixed: Points  # (N, 2) their partners
+    guided: bool  # whether partners were searched near the position that a motion predicts, and not in the whole image
+    sizes: Points | None = None  # (N,) diameters of the keypoints, None if all are equal
 
 
 def consensus_of(

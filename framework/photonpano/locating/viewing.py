@@ -22,19 +22,13 @@ _ALL_SEEN = 0.999  # an interpolated pixel is unmasked if its neighbours are, up
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """An exposure as an image for alignment.
+    """An exposure as an image for alignment."""
 
-    Attributes:
-        image: (H, W) float32, on the scale on which photon noise is uniform, blurred; 0 inside of masked areas.
-        weight: (H, W) float32, inverse noise variance of a pixel before the blur; 0 at masked pixels.
-        blur_px: standard deviation of the blur, in px of the exposure.
-        pixel: side of a pixel, in px of the exposure.
-    """
-
+    # (H, W) float32, on the scale on which photon noise is uniform, blurred; 0 inside of masked areas
     image: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    blur_px: float
-    pixel: int = 1
+    weight: NDArray[np.float32]  # (H, W) float32, inverse noise variance of a pixel before the blur; 0 at masked pixels
+    blur_px: float  # standard deviation of the blur, in px of the exposure
+    pixel: int = 1  # side of a pixel, in px of the exposure
 
     @property
     def shape(self) -> tuple[int, int]:

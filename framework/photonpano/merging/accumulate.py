@@ -33,17 +33,11 @@ _Visible = Sequence[tuple[Chunk, Footprint]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotonSum:
-    """Warped counts, and the number of frames in which each pixel was seen.
+    """Warped counts, and the number of frames in which each pixel was seen."""
 
-    Attributes:
-        counts: (H, W) float32.
-        weight: (H, W) float32, in frames; in changing light, the sum of their gains: in frames of mean light.
-        lit: frames and gains by the class of their light; None in steady light.
-    """
-
-    counts: FluxImage
-    weight: FluxImage
-    lit: LitFrames | None = None
+    counts: FluxImage  # (H, W) float32
+    weight: FluxImage  # (H, W) float32, in frames; in changing light, the sum of their gains: in frames of mean light
+    lit: LitFrames | None = None  # frames and gains by the class of their light; None in steady light
 
     def estimate(self, response: Response) -> tuple[FluxImage, FluxImage]:
         """Return the maximum-likelihood flux of each pixel (paper, equation 3) and its weight.

@@ -20,15 +20,11 @@ from photonpano.values import Counts, FrameSpan, Homography
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chunk:
-    """Frames that are summed before they are warped.
+    """Frames that are summed before they are warped."""
 
-    Attributes:
-        span: the frames.
-        homography: (3, 3), pixels of the frame at the centre of the span to pixels of the reference plane: that instant of
-            the trajectory. The identity where no motion is known.
-    """
-
-    span: FrameSpan
+    span: FrameSpan  # the frames
+    # (3, 3), pixels of the frame at the centre of the span to pixels of the reference plane: that instant of the trajectory.
+    # The identity where no motion is known.
     homography: Homography
 
 

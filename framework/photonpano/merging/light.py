@@ -32,15 +32,10 @@ def bytes_of_light(source: Source) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LitFrames:
-    """Frames and gains of the pixels of a grid, by the class of their light.
+    """Frames and gains of the pixels of a grid, by the class of their light."""
 
-    Attributes:
-        frames: (C, H, W) float32, number of frames of each class in which a pixel was seen.
-        gains: (C, H, W) float32, sum of the gains of the pixel in these frames.
-    """
-
-    frames: FluxImage
-    gains: FluxImage
+    frames: FluxImage  # (C, H, W) float32, number of frames of each class in which a pixel was seen
+    gains: FluxImage  # (C, H, W) float32, sum of the gains of the pixel in these frames
 
     @property
     def weight(self) -> FluxImage:
@@ -83,17 +78,11 @@ class LitFrames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightTerms:
-    """What chunks of frames add to the coverages of a grid: for each class of light, frames and the terms of their gains.
+    """What chunks of frames add to the coverages of a grid: for each class of light, frames and the terms of their gains."""
 
-    Attributes:
-        light: of the capture.
-        classes: (T,) class of each frame.
-        present: the classes of the frames that are summed, in order.
-    """
-
-    light: Light
-    classes: NDArray[np.int64]
-    present: tuple[int, ...]
+    light: Light  # of the capture
+    classes: NDArray[np.int64]  # (T,) class of each frame
+    present: tuple[int, ...]  # the classes of the frames that are summed, in order
 
     @classmethod
     def of(cls, light: Light, spans: Sequence[FrameSpan]) -> LightTerms:

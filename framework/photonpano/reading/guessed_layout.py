@@ -37,19 +37,12 @@ _MIN_LEAD = 4.0  # standard errors by which the correlation along the axis of th
 
 
 class Content(NamedTuple):
-    """What the values of an array are.
+    """What the values of an array are."""
 
-    Attributes:
-        holds: "bits" for a pixel to a value, of 0 and 1, or of 0 and 255; "sums" for counts.
-        lowest: the smallest value of the sample.
-        highest: the largest value of the sample.
-        n_values: values of the sample.
-    """
-
-    holds: Literal["bits", "sums"]
-    lowest: int
-    highest: int
-    n_values: int
+    holds: Literal["bits", "sums"]  # "bits" for a pixel to a value, of 0 and 1, or of 0 and 255; "sums" for counts
+    lowest: int  # the smallest value of the sample
+    highest: int  # the largest value of the sample
+    n_values: int  # values of the sample
 
 
 def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:

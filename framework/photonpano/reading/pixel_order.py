@@ -28,15 +28,10 @@ _FLOOR = 0.2  # units are weighted by their variance, plus this fraction of the 
 
 
 class PixelOrder(NamedTuple):
-    """The order of the pixels in packed frames.
+    """The order of the pixels in packed frames."""
 
-    Attributes:
-        packed_along: the direction of the eight pixels of a byte.
-        bit_order: "big" if the first of them is the highest bit, "little" if it is the lowest.
-    """
-
-    packed_along: Literal["width", "height"] = "width"
-    bit_order: BitOrder = "big"
+    packed_along: Literal["width", "height"] = "width"  # the direction of the eight pixels of a byte
+    bit_order: BitOrder = "big"  # "big" if the first of them is the highest bit, "little" if it is the lowest
 
 
 class OtherOrder(NamedTuple):
