@@ -22,15 +22,10 @@ SLOW = 2, 0.04
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Filtered:
-    """A series after a Wiener filter.
+    """A series after a Wiener filter."""
 
-    Attributes:
-        signal: (S,) what exceeds the noise.
-        std: (S,) the noise that the filter let through, as an expected error.
-    """
-
-    signal: FloatArray
-    std: FloatArray
+    signal: FloatArray  # (S,) what exceeds the noise
+    std: FloatArray  # (S,) the noise that the filter let through, as an expected error
 
 
 def gradient_of(image: NDArray[Any]) -> NDArray[Any]:

@@ -43,40 +43,29 @@ class Capture(Closing):
     itself: motion is estimated from the grey capture, and the panorama is rendered from those of `colours()`.
 
     It can be pickled for another process, where the source is opened anew: see `photonpano.execution`.
-
-    Attributes:
-        source: the source as its plugin gives it.
-        info: frames, size, rate; of the frames as they are seen here.
-        valid: (H, W) mask, False for pixels that must not be used in any frame.
-        masks: more of them, each for some frames.
-        first: the frame of the source that is frame 0 here.
-        gather: rearranges the pixels of frames; None for frames as they are read.
-        steps: take everything but the flux out of sums of frames, one after the other.
-        weight: (H, W) float32, not negative: statistical weight of a frame of each pixel; None for 1. That of the best pixel
-            behind a filter is 1, and that of a pixel of gain 1 of a sensor whose pixels differ in gain.
-        light: the gain of each frame; None for steady light. Frames are weighted by it, and predicted flux is multiplied by it.
-        camera: frames are warped through its lens, and homographies map ideal pixels; None if it is not known.
-        colour: its colours; None for a grey capture.
-        background: which parts of frames show the background; None if all do. Others are left out of merging, and of what is
-            compared with the panorama.
-        copies: (T,) True for frames that are copies of the one before; None if there are none.
-        decisions: what was decided because of what the frames show.
     """
 
-    source: PluginSource
-    info: StreamInfo
-    valid: BoolArray
-    masks: tuple[MaskedSpan, ...] = ()
-    first: int = 0
-    gather: Gather | None = None
+    source: PluginSource  # the source as its plugin gives it
+    info: StreamInfo  # frames, size, rate; of the frames as they are seen here
+    valid: BoolArray  # (H, W) mask, False for pixels that must not be used in any frame
+    masks: tuple[MaskedSpan, ...] = ()  # more of them, each for some frames
+    first: int = 0  # the frame of the source that is frame 0 here
+    gather: Gather | None = None  # rearranges the pixels of frames; None for frames as they are read
+    # take everything but the flux out of sums of frames, one after the other
     steps: tuple[Callable[[Any, int], FluxImage], ...] = ()
+    # (H, W) float32, not negative: statistical weight of a frame of each pixel; None for 1. That of the best pixel behind a
+    # filter is 1, and that of a pixel of gain 1 of a sensor whose pixels differ in gain.
     weight: FluxImage | None = None
+    # the gain of each frame; None for steady light. Frames are weighted by it, and predicted flux is multiplied by it.
     light: Light | None = None
+    # frames are warped through its lens, and homographies map ideal pixels; None if it is not known
     camera: Camera | None = None
-    colour: Colours | None = None
+    colour: Colours | None = None  # its colours; None for a grey capture
+    # which parts of frames show the background; None if all do. Others are left out of merging, and of what is compared with
+    # the panorama.
     background: Background | None = None
-    copies: BoolArray | None = None
-    decisions: tuple[Decision, ...] = ()
+    copies: BoolArray | None = None  # (T,) True for frames that are copies of the one before; None if there are none
+    decisions: tuple[Decision, ...] = ()  # what was decided because of what the frames show
 
     @property
     def response(self) -> Response:

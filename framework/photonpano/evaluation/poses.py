@@ -116,25 +116,38 @@ _RPE_SHARE = 0.01  # step of the relative error, as a fraction of the frames
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseScore:
-    """Errors of poses over the located frames, after the best similarity of their positions."""
+    """Errors of poses over the located frames, after the best similarity of their positions.
 
-    errors_m: FloatArray  # (T,) distance of each camera from its true position; NaN where not located
-    # (T,) angle between the found and the true rotation, after the same similarity; NaN where not located
+    Attributes:
+        errors_m: (T,) distance of each camera from its true position; NaN where not located.
+        errors_deg: (T,) angle between the found and the true rotation, after the same similarity; NaN where not located.
+        ate_m: absolute trajectory error: root mean square of `errors_m`.
+        ate_share: the same as a share of the length of the true path of the located frames.
+        rotation_deg: root mean square of `errors_deg`.
+        turns_deg: the same after the best common rotation instead. Positions near a line hardly tell how the world lies.
+        rpe_frames: frames over which relative errors are taken.
+        rpe_m: root mean square error of the motion over that many frames; None if no two located frames are that far apart.
+        rpe_deg: root mean square error of the turn over that many frames.
+        located_share: share of the located frames, 0 to 1.
+        honest_shares: shares of the located frames whose position error is within 1, 2 and 3 expected errors; None if the run
+            knows none.
+        std_ratio: root mean square of the errors of positions, in units of the expected ones; None if the run knows none.
+        focal_error: error of the focal length, relative to the true one; None if that is not known.
+    """
+
+    errors_m: FloatArray
     errors_deg: FloatArray
-    ate_m: float  # absolute trajectory error: root mean square of `errors_m`
-    ate_share: float  # the same as a share of the length of the true path of the located frames
-    rotation_deg: float  # root mean square of `errors_deg`
-    turns_deg: float  # the same after the best common rotation instead. Positions near a line hardly tell how the world lies.
-    rpe_frames: int  # frames over which relative errors are taken
-    # root mean square error of the motion over that many frames; None if no two located frames are that far apart
+    ate_m: float
+    ate_share: float
+    rotation_deg: float
+    turns_deg: float
+    rpe_frames: int
     rpe_m: float | None
-    rpe_deg: float | None  # root mean square error of the turn over that many frames
-    located_share: float  # share of the located frames, 0 to 1
-    # shares of the located frames whose position error is within 1, 2 and 3 expected errors; None if the run knows none
+    rpe_deg: float | None
+    located_share: float
     honest_shares: tuple[float, float, float] | None
-    # root mean square of the errors of positions, in units of the expected ones; None if the run knows none
     std_ratio: float | None
-    focal_error: float | None = None  # error of the focal length, relative to the true one; None if that is not known
+    focal_error: float | None = None
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the scores with their names, for people."""

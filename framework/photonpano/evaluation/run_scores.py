@@ -32,14 +32,22 @@ Render: TypeAlias = "Callable[[Trajectory, Canvas], Panorama]"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """Scores of a run."""
+    """Scores of a run.
 
-    trajectory: TrajectoryScore  # corner errors
-    honest_share: float  # share of the located frames whose corner error is at most three times the expected one, `std_px`
-    panorama: ImageScore | None = None  # the panorama against the true scene; None if the truth has no scene
-    oracle: ImageScore | None = None  # the panorama along the true motion, over the same pixels; None if it was not requested
-    white_flux: float | None = None  # flux that is white in the comparison, photons per pixel per frame; None without a scene
-    # errors of the rotations and of the focal length; None if the run, or the truth, knows none
+    Attributes:
+        trajectory: corner errors.
+        rotation: errors of the rotations and of the focal length; None if the run, or the truth, knows none.
+        honest_share: share of the located frames whose corner error is at most three times the expected one, `std_px`.
+        panorama: the panorama against the true scene; None if the truth has no scene.
+        oracle: the panorama along the true motion, over the same pixels; None if it was not requested.
+        white_flux: flux that is white in the comparison, photons per pixel per frame; None without a scene.
+    """
+
+    trajectory: TrajectoryScore
+    honest_share: float
+    panorama: ImageScore | None = None
+    oracle: ImageScore | None = None
+    white_flux: float | None = None
     rotation: RotationScore | None = None
 
     @property

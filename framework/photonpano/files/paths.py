@@ -24,12 +24,9 @@ class Url:
     """A file or folder on a server or in an object store, such as `s3://bucket/cube.npy`.
 
     As text, which messages and records contain, it has neither the user and password nor the query of `address`.
-
-    Attributes:
-        address: the whole URL, with its secrets.
     """
 
-    address: str = field(repr=False)
+    address: str = field(repr=False)  # the whole URL, with its secrets
 
     @property
     def scheme(self) -> str:

@@ -26,13 +26,10 @@ class Camera:
     Convention:
         Points are (x, y), integers are pixel centres. Ideal pixels are those that the camera would have without distortion:
         `matrix` maps directions (x right, y down, z ahead) to them, and `distorted` maps them to the pixels of a frame.
-
-    Attributes:
-        matrix: (3, 3), [[focal, 0, x], [0, focal, y], [0, 0, 1]], in px.
-        distortion: (4,) k1, k2, p1, p2 as OpenCV defines them: radial of second and fourth order, and tangential.
     """
 
-    matrix: FloatArray
+    matrix: FloatArray  # (3, 3), [[focal, 0, x], [0, focal, y], [0, 0, 1]], in px
+    # (4,) k1, k2, p1, p2 as OpenCV defines them: radial of second and fourth order, and tangential
     distortion: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     @classmethod

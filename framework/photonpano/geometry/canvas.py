@@ -22,17 +22,11 @@ ProjectionName: TypeAlias = Literal["planar", "cylindrical", "spherical"]
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """A projection.
+    """A projection."""
 
-    Attributes:
-        across: returns p and s for a.
-        down: returns q and r for b.
-        points: returns the points of (..., 3) rays: (..., 2).
-    """
-
-    across: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-    down: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-    points: Callable[[FloatArray], FloatArray]
+    across: Callable[[FloatArray], tuple[FloatArray, FloatArray]]  # returns p and s for a
+    down: Callable[[FloatArray], tuple[FloatArray, FloatArray]]  # returns q and r for b
+    points: Callable[[FloatArray], FloatArray]  # returns the points of (..., 3) rays: (..., 2)
 
     def rays(self, points: FloatArray) -> FloatArray:
         """Return the rays of (..., 2) points: (..., 3)."""
@@ -80,23 +74,16 @@ Extent: TypeAlias = Literal["panorama", "reference"] | Box  # what a canvas hold
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Canvas:
-    """The pixel grid of a panorama.
+    """The pixel grid of a panorama."""
 
-    Attributes:
-        height: rows.
-        width: columns.
-        transform: (3, 3), pixels of the reference plane to pixels of the canvas. If the canvas is not planar, it maps (a, b, 1)
-            to pixels, by a scale and a shift: see `PROJECTIONS`.
-        projection: name of the projection.
-        camera_matrix: (3, 3) of the reference camera; None for a planar canvas.
-        horizon: (3, 3) rotation from directions of the reference camera to those of which a and b are computed; None for none.
-    """
-
-    height: int
-    width: int
+    height: int  # rows
+    width: int  # columns
+    # (3, 3), pixels of the reference plane to pixels of the canvas. If the canvas is not planar, it maps (a, b, 1) to pixels,
+    # by a scale and a shift: see `PROJECTIONS`.
     transform: Homography
-    projection: str = "planar"
-    camera_matrix: FloatArray | None = None
+    projection: str = "planar"  # name of the projection
+    camera_matrix: FloatArray | None = None  # (3, 3) of the reference camera; None for a planar canvas
+    # (3, 3) rotation from directions of the reference camera to those of which a and b are computed; None for none
     horizon: FloatArray | None = None
 
     @property

@@ -21,15 +21,11 @@ _STRAIGHT_DOWN = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Covered:
-    """What frames cover of all directions, in radians.
+    """What frames cover of all directions, in radians."""
 
-    Attributes:
-        a: the first and the last a; `(-pi, pi)` for a full turn. The first may be below -pi, or the last above pi.
-        b: the first and the last b on the sphere, from -pi / 2 (up) to pi / 2.
-    """
-
+    # the first and the last a; `(-pi, pi)` for a full turn. The first may be below -pi, or the last above pi.
     a: tuple[float, float]
-    b: tuple[float, float]
+    b: tuple[float, float]  # the first and the last b on the sphere, from -pi / 2 (up) to pi / 2
 
     @property
     def full_turn(self) -> bool:

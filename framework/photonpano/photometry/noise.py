@@ -109,15 +109,10 @@ def saturated(flux: FluxImage, weight: FluxImage, response: Response) -> BoolArr
 
 @dataclass(frozen=True, slots=True)
 class FluxRange:
-    """A range of flux, in photons per pixel per frame.
+    """A range of flux, in photons per pixel per frame."""
 
-    Attributes:
-        low: the lowest flux.
-        high: the highest.
-    """
-
-    low: float
-    high: float
+    low: float  # the lowest flux
+    high: float  # the highest
 
     @property
     def decibels(self) -> float:

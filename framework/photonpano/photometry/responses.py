@@ -89,12 +89,9 @@ class BinarySumResponse(_BinarySums):
 
     Flux is photons per pixel per frame, where a frame is the sum. Each binary frame gets the n-th part of it, so that the mean
     count at flux `f` is `n (1 - exp(-f / n))`. Noise is that of `BinaryResponse` for n times as many frames.
-
-    Attributes:
-        n: number of binary frames in a sum.
     """
 
-    n: int
+    n: int  # number of binary frames in a sum
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,18 +103,12 @@ class IntensityResponse:
 
     The flux of a saturated pixel is that of the saturation level, a lower bound. Flux below the black level is negative, so
     that averages of many frames are unbiased in the dark.
-
-    Attributes:
-        photons_per_level: detected photons per grey level.
-        black_level: grey level without light; may be a fraction.
-        saturation_level: highest grey level.
-        read_noise: standard deviation of the read noise of a pixel in a frame, in photons.
     """
 
-    photons_per_level: float
-    black_level: float
-    saturation_level: float
-    read_noise: float
+    photons_per_level: float  # detected photons per grey level
+    black_level: float  # grey level without light; may be a fraction
+    saturation_level: float  # highest grey level
+    read_noise: float  # standard deviation of the read noise of a pixel in a frame, in photons
 
     def mean_count(self, flux: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the expected grey level of one frame, at most the saturation level."""

@@ -38,18 +38,13 @@ tapered = hann_window  # deprecated: use `hann_window`
 
 
 class Similarity(NamedTuple):
-    """Similarity of two aligned images.
+    """Similarity of two aligned images."""
 
-    Attributes:
-        correlation: correlation without noise: 1 for the same scene, around 0 for different ones, 0 where the variance of the
-            scene cannot be distinguished from that of the noise.
-        structures: effective number of independent samples.
-        score: significance of the observed correlation, in standard deviations of that of unrelated images.
-    """
-
+    # correlation without noise: 1 for the same scene, around 0 for different ones, 0 where the variance of the scene cannot be
+    # distinguished from that of the noise
     correlation: float
-    structures: float
-    score: float
+    structures: float  # effective number of independent samples
+    score: float  # significance of the observed correlation, in standard deviations of that of unrelated images
 
     @property
     def evidence(self) -> dict[str, float]:

@@ -31,14 +31,21 @@ BYTES_PER_FRAME = 1200  # memory of the motion of a frame, measured in benchmark
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """The expected time and memory of a run."""
+    """The expected time and memory of a run.
 
-    tried: FrameSpan  # the frames of the trial
-    threads: int  # the number of threads of the trial
-    seconds: dict[str, float]  # expected time of each level, and of the panorama
-    memory_bytes: int  # expected peak memory of the process
-    # (height, width) of the panorama if the camera keeps moving as in the trial and never returns; of a part of it
-    # (`render.extent`), that of the part
+    Attributes:
+        tried: the frames of the trial.
+        threads: the number of threads of the trial.
+        seconds: expected time of each level, and of the panorama.
+        memory_bytes: expected peak memory of the process.
+        canvas: (height, width) of the panorama if the camera keeps moving as in the trial and never returns; of a part of it
+            (`render.extent`), that of the part.
+    """
+
+    tried: FrameSpan
+    threads: int
+    seconds: dict[str, float]
+    memory_bytes: int
     canvas: tuple[int, int]
 
 

@@ -30,19 +30,12 @@ _CHANNELS = 3
 
 
 class NpyHeader(NamedTuple):
-    """The header of a .npy file.
+    """The header of a .npy file."""
 
-    Attributes:
-        shape: the shape of the array.
-        dtype: the type of its values.
-        fortran_order: whether the first index varies fastest.
-        offset: start of the data, in bytes.
-    """
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[np.generic]
-    fortran_order: bool
-    offset: int
+    shape: tuple[int, ...]  # the shape of the array
+    dtype: np.dtype[np.generic]  # the type of its values
+    fortran_order: bool  # whether the first index varies fastest
+    offset: int  # start of the data, in bytes
 
     @property
     def file_bytes(self) -> int:

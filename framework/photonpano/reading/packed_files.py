@@ -100,17 +100,11 @@ class Pieces:
 
 @dataclass(frozen=True, slots=True)
 class FrameFile:
-    """Consecutive frames in a file.
+    """Consecutive frames in a file."""
 
-    Attributes:
-        path: the file, or its URL.
-        n_frames: number of the frames.
-        offset: start of the first of them, in bytes.
-    """
-
-    path: Location
-    n_frames: int
-    offset: int = 0
+    path: Location  # the file, or its URL
+    n_frames: int  # number of the frames
+    offset: int = 0  # start of the first of them, in bytes
 
 
 class StoredFrames:

@@ -35,19 +35,13 @@ class FrameLayout:
     """The order of the pixels of a binary frame in its bytes.
 
     Pixels are reordered once in a sum of frames, and not in each frame.
-
-    Attributes:
-        frame_shape: (height, width) of the image.
-        stored_shape: the shape of the bytes of a frame: its packed rows, unless there is a `to_rows`.
-        bit_order: "big" if the first pixel is the highest bit of a byte, "little" if it is the lowest.
-        arranged: turns stored images into images; None if their rows are those of the image.
-        to_rows: turns (n, *stored_shape) into (n, rows, bytes of a row), packed along the width; None if frames are stored so.
     """
 
-    frame_shape: tuple[int, int]
-    stored_shape: tuple[int, ...]
-    bit_order: BitOrder = "big"
-    arranged: Arrangement | None = None
+    frame_shape: tuple[int, int]  # (height, width) of the image
+    stored_shape: tuple[int, ...]  # the shape of the bytes of a frame: its packed rows, unless there is a `to_rows`
+    bit_order: BitOrder = "big"  # "big" if the first pixel is the highest bit of a byte, "little" if it is the lowest
+    arranged: Arrangement | None = None  # turns stored images into images; None if their rows are those of the image
+    # turns (n, *stored_shape) into (n, rows, bytes of a row), packed along the width; None if frames are stored so
     to_rows: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None
 
     @property
@@ -169,13 +163,9 @@ def of_channel(values: NDArray[Any], channel: int | None) -> NDArray[Any]:
 
 
 class BlockSource(Closing, ABC):
-    """Sums and spans of frames of values. A subclass yields frames, and has what is missing for a `photonpano.Source`.
+    """Sums and spans of frames of values. A subclass yields frames, and has what is missing for a `photonpano.Source`."""
 
-    Attributes:
-        info: frames, size, rate; the subclass sets it.
-    """
-
-    info: StreamInfo
+    info: StreamInfo  # frames, size, rate; the subclass sets it
 
     @abstractmethod
     def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:

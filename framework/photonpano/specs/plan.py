@@ -53,54 +53,34 @@ class LevelPlan:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Everything a run needs.
+    """Everything a run needs."""
 
-    Attributes:
-        source: the capture.
-        corrections: the corrections of its frames, in order.
-        levels: one plan for each level, in order; none with `pose`, which has no refiners either.
-        refine: the refiners that correct the motion after the last level, in order.
-        until_converged: the loop ends when the motion has converged, at the latest after the last of `levels`, which are equal.
-        renderer: the component that renders the panorama.
-        formats: the exporters that write it as files of other formats.
-        motion: what the motion of the camera may be.
-        camera: what is known of the camera.
-        light: whether the light of the scene changes.
-        graph: which pairs are registered, and what happens when the graph is disconnected.
-        render: the panorama.
-        output: the run folder.
-        run: seed, threads, memory.
-        document: the resolved spec as plain data, defaults filled in; `run.json` records it, and it is a valid spec itself.
-        written: the values of `document` with their places, as far as they were written: see `place`.
-        file: the spec file, None for a spec that was built in Python.
-        observers: the plugins that watch the run.
-        decisions: choices that the spec leaves open and that reading it made: the source that recognises the capture.
-        corrects_itself: `corrections` is `auto`: the run masks what stands still, and divides by a vignette.
-        executor: works on the tasks of the run; None for threads of this process.
-        pose: the pose estimator, which takes the place of the levels, of refiners and of the panorama; None for a panorama.
-    """
-
-    source: Choice
-    corrections: tuple[Correction, ...]
-    levels: tuple[LevelPlan, ...]
-    refine: tuple[Choice, ...]
-    renderer: Choice
-    formats: tuple[Choice, ...]
-    executor: Choice | None
+    source: Choice  # the capture
+    corrections: tuple[Correction, ...]  # the corrections of its frames, in order
+    levels: tuple[LevelPlan, ...]  # one plan for each level, in order; none with `pose`, which has no refiners either
+    refine: tuple[Choice, ...]  # the refiners that correct the motion after the last level, in order
+    renderer: Choice  # the component that renders the panorama
+    formats: tuple[Choice, ...]  # the exporters that write it as files of other formats
+    executor: Choice | None  # works on the tasks of the run; None for threads of this process
+    # the loop ends when the motion has converged, at the latest after the last of `levels`, which are equal
     until_converged: bool
-    motion: MotionSettings
-    camera: CameraSettings
-    light: LightSettings
-    graph: GraphSettings
-    render: RenderSettings
-    output: OutputSettings
-    run: RunSettings
+    motion: MotionSettings  # what the motion of the camera may be
+    camera: CameraSettings  # what is known of the camera
+    light: LightSettings  # whether the light of the scene changes
+    graph: GraphSettings  # which pairs are registered, and what happens when the graph is disconnected
+    render: RenderSettings  # the panorama
+    output: OutputSettings  # the run folder
+    run: RunSettings  # seed, threads, memory
+    # the resolved spec as plain data, defaults filled in; `run.json` records it, and it is a valid spec itself
     document: Mapping[str, Any]
+    # the values of `document` with their places, as far as they were written: see `place`
     written: Written = field(default=Written({}), repr=False)
-    file: Path | None = None
-    observers: tuple[Observer, ...] = ()
+    file: Path | None = None  # the spec file, None for a spec that was built in Python
+    observers: tuple[Observer, ...] = ()  # the plugins that watch the run
+    # choices that the spec leaves open and that reading it made: the source that recognises the capture
     decisions: tuple[Decision, ...] = ()
-    corrects_itself: bool = False
+    corrects_itself: bool = False  # `corrections` is `auto`: the run masks what stands still, and divides by a vignette
+    # the pose estimator, which takes the place of the levels, of refiners and of the panorama; None for a panorama
     pose: Choice | None = None
 
     def having(self, section: str, **values: Any) -> Plan:

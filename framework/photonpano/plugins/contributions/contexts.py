@@ -13,15 +13,10 @@ from photonpano.values import CaptureSummary, DecisionValue, Response, StreamInf
 
 @dataclass(frozen=True, slots=True)
 class SourceContext:
-    """The run for which a source is built.
+    """The run for which a source is built."""
 
-    Attributes:
-        seed: the seed of the run; all randomness derives from it.
-        threads: the number of threads that the component may use.
-    """
-
-    seed: int = 0
-    threads: int = 1
+    seed: int = 0  # the seed of the run; all randomness derives from it
+    threads: int = 1  # the number of threads that the component may use
 
 
 def _unread() -> CaptureSummary:
@@ -34,43 +29,30 @@ def _not_recorded(what: str, value: DecisionValue, reason: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class StageContext:
-    """The run for which any component but a source is built.
+    """The run for which any component but a source is built."""
 
-    Attributes:
-        stream: the capture's frames, size and rate.
-        response: the camera's response.
-        seed: the seed of the run; all randomness derives from it.
-        threads: the number of threads that the component may use.
-        capture: returns the flux and the speed of the capture, which are measured at the first call. Raises
-            `CaptureUnreadError` where a spec is only explained: call it when the component works, not when it is built.
-        decide: records a choice that the spec leaves to the component: what was chosen, its value (a number, a text, true
-            or false), and a clause with the reason. `run.json` and the report list it.
-        in_order: calls a function with each of some items, several at once, and yields the results in order. Other processes
-            or machines may do the work: there the function is a copy, pickled with all that it holds.
-    """
-
-    stream: StreamInfo
-    response: Response
-    seed: int = 0
-    threads: int = 1
+    stream: StreamInfo  # the capture's frames, size and rate
+    response: Response  # the camera's response
+    seed: int = 0  # the seed of the run; all randomness derives from it
+    threads: int = 1  # the number of threads that the component may use
+    # returns the flux and the speed of the capture, which are measured at the first call. Raises `CaptureUnreadError` where a
+    # spec is only explained: call it when the component works, not when it is built.
     capture: Callable[[], CaptureSummary] = field(default=_unread, compare=False)
+    # records a choice that the spec leaves to the component: what was chosen, its value (a number, a text, true or false), and
+    # a clause with the reason. `run.json` and the report list it.
     decide: Callable[[str, DecisionValue, str], None] = field(default=_not_recorded, compare=False)
+    # calls a function with each of some items, several at once, and yields the results in order. Other processes or machines
+    # may do the work: there the function is a copy, pickled with all that it holds.
     in_order: InOrder = field(default=map, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
 class ExecutorContext:
-    """The run for which an executor is built.
+    """The run for which an executor is built."""
 
-    Attributes:
-        threads: the number of threads of the run.
-        capture: what stands for the capture in tasks of other processes.
-        here: what this process has of what the run needs, by name: versions of photonpano, of the plugins of the run and of
-            libraries, and a hash of the capture.
-        elsewhere: tells the same of another process, which must have the same; can be pickled.
-    """
-
-    threads: int
-    capture: CaptureElsewhere
+    threads: int  # the number of threads of the run
+    capture: CaptureElsewhere  # what stands for the capture in tasks of other processes
+    # what this process has of what the run needs, by name: versions of photonpano, of the plugins of the run and of libraries,
+    # and a hash of the capture
     here: Mapping[str, str]
-    elsewhere: Callable[[], Mapping[str, str]]
+    elsewhere: Callable[[], Mapping[str, str]]  # tells the same of another process, which must have the same; can be pickled

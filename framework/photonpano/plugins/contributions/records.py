@@ -38,15 +38,10 @@ API_VERSION = 1
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """A library that a component imports when it is built.
+    """A library that a component imports when it is built."""
 
-    Attributes:
-        module: the name to import, such as `kornia`.
-        install: what to pass to `pip install`, such as `photonpano[kornia]`.
-    """
-
-    module: str
-    install: str
+    module: str  # the name to import, such as `kornia`
+    install: str  # what to pass to `pip install`, such as `photonpano[kornia]`
 
 
 def install_command(requirements: Iterable[Requirement]) -> str:
@@ -67,27 +62,19 @@ _TAKEN_SUFFIXES = (".tiff", ".png")
 
 @dataclass(frozen=True, kw_only=True)
 class Contribution:
-    """One component that a plugin offers. Plugins yield the subclasses, one for each kind.
-
-    Attributes:
-        name: its name in specs, in kebab-case.
-        summary: one line for lists.
-        config: the closed, frozen model of the keys under `with`.
-        build: makes the component from an instance of `config` and the context; heavy libraries are imported here, not before.
-        check: finds problems of a config; see the subclasses.
-        requires: libraries that may be missing, and how to install them.
-        api_version: the version of the contract that the plugin was made for. A published plugin writes the number, so that a
-            photonpano with another contract refuses it with a clear message.
-    """
+    """One component that a plugin offers. Plugins yield the subclasses, one for each kind."""
 
     kind: ClassVar[str]
 
-    name: str
-    summary: str
-    config: type[Config]
+    name: str  # its name in specs, in kebab-case
+    summary: str  # one line for lists
+    config: type[Config]  # the closed, frozen model of the keys under `with`
+    # makes the component from an instance of `config` and the context; heavy libraries are imported here, not before
     build: Callable[[Any, Any], Any]
-    check: Callable[..., Sequence[str]] = no_problems
-    requires: tuple[Requirement, ...] = ()
+    check: Callable[..., Sequence[str]] = no_problems  # finds problems of a config; see the subclasses
+    requires: tuple[Requirement, ...] = ()  # libraries that may be missing, and how to install them
+    # the version of the contract that the plugin was made for. A published plugin writes the number, so that a photonpano with
+    # another contract refuses it with a clear message.
     api_version: int = API_VERSION
 
     def __init_subclass__(cls, kind: str = "", **row: Any) -> None:
@@ -114,15 +101,10 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True)
 class Recognised:
-    """The answer of a source that recognises a capture.
+    """The answer of a source that recognises a capture."""
 
-    Attributes:
-        keys: the keys that open it, the path among them, as a spec would have them under `with`.
-        because: the reason, as a clause after "it was recognised as ...: ", such as "8,388,608 bytes a file".
-    """
-
-    keys: Mapping[str, Any]
-    because: str
+    keys: Mapping[str, Any]  # the keys that open it, the path among them, as a spec would have them under `with`
+    because: str  # the reason, as a clause after "it was recognised as ...: ", such as "8,388,608 bytes a file"
 
 
 class PartOfCapture(Config):
@@ -157,27 +139,25 @@ class SourceContribution(Contribution, kind="source", section="source"):
     """Offers a source.
 
     The config gets one more key, `frames`: see `PartOfCapture`. The framework reads that part of what `build` returns.
-
-    Attributes:
-        check: finds problems of a config without reading the capture, such as a missing file.
-        recognise: returns the keys of a capture if it is one of this source, for specs that leave the choice to `auto`. It
-            reads names, sizes and a few megabytes at most, imports nothing heavy, and raises nothing.
-        write: writes binary frames as a capture that this source reads, for `photonpano convert` to a name with one of its
-            `suffixes`; None if it cannot.
-        recognises_urls: whether `recognise` also gets a `photonpano.Url`, which a path of the type `SpecLocation` may be.
-        suffixes: the endings of its files, in small letters, such as ".npy"; empty for any. If no source recognises a path,
-            the message has the problems of the sources with its ending.
-        arrived: opens what is there of a capture that is still being written, or says that it comes from a pipe, for
-            `photonpano run --follow`; None if this source cannot. It is called some fifty times a second. A file that is not
-            there yet is no error, one that will never be a capture is an `InputError`.
     """
 
     build: Callable[[Any, SourceContext], Source]
+    # finds problems of a config without reading the capture, such as a missing file
     check: Callable[[Any], Sequence[str]] = no_problems
+    # returns the keys of a capture if it is one of this source, for specs that leave the choice to `auto`. It reads names,
+    # sizes and a few megabytes at most, imports nothing heavy, and raises nothing.
     recognise: Callable[[Any], Recognised | None] = _not_ours
+    # writes binary frames as a capture that this source reads, for `photonpano convert` to a name with one of its `suffixes`;
+    # None if it cannot
     write: WriteFrames | None = None
+    # whether `recognise` also gets a `photonpano.Url`, which a path of the type `SpecLocation` may be
     recognises_urls: bool = False
+    # the endings of its files, in small letters, such as ".npy"; empty for any. If no source recognises a path, the message has
+    # the problems of the sources with its ending.
     suffixes: tuple[str, ...] = ()
+    # opens what is there of a capture that is still being written, or says that it comes from a pipe, for `photonpano run
+    # --follow`; None if this source cannot. It is called some fifty times a second. A file that is not there yet is no error,
+    # one that will never be a capture is an `InputError`.
     arrived: Callable[[Any], Arrived | Piped] | None = None
 
     def __post_init__(self) -> None:
@@ -192,12 +172,9 @@ class SourceContribution(Contribution, kind="source", section="source"):
 
 @dataclass(frozen=True, kw_only=True)
 class StageContribution(Contribution):
-    """Offers a component that is built for a capture: of a stage of the levels, a refiner, a renderer, or an exporter.
+    """Offers a component that is built for a capture: of a stage of the levels, a refiner, a renderer, or an exporter."""
 
-    Attributes:
-        check: finds problems of a config with a capture, from its description; reads no data, imports nothing heavy.
-    """
-
+    # finds problems of a config with a capture, from its description; reads no data, imports nothing heavy
     check: Callable[[Any, StreamInfo], Sequence[str]] = no_problems
 
 
@@ -210,18 +187,13 @@ class ResamplerContribution(StageContribution, kind="resampler", section="resamp
 
 @dataclass(frozen=True, kw_only=True)
 class MergerContribution(StageContribution, kind="merger", section="merge", default="photon-mle", of_level=True):
-    """Offers a merger.
-
-    Attributes:
-        accepts_corrected_sums: whether it merges corrected sums. The framework then divides the sums of frames by
-            a vignette that it finds.
-        handles_movers: whether it leaves out by itself what `Capture.masks` name, and what hides `Capture.background`, or
-            merges that sharply. Any other merger gets a capture in which the pixels are masked that are to be left out at any
-            time of the group.
-    """
+    """Offers a merger."""
 
     build: Callable[[Any, StageContext], Merger]
+    # whether it merges corrected sums. The framework then divides the sums of frames by a vignette that it finds.
     accepts_corrected_sums: bool = True
+    # whether it leaves out by itself what `Capture.masks` name, and what hides `Capture.background`, or merges that sharply.
+    # Any other merger gets a capture in which the pixels are masked that are to be left out at any time of the group.
     handles_movers: bool = False
 
 
@@ -257,20 +229,17 @@ class RefinerContribution(
 
 @dataclass(frozen=True, kw_only=True)
 class RendererContribution(StageContribution, kind="renderer", section="render", default="merge"):
-    """Offers a renderer.
-
-    Attributes:
-        bytes_per_pixel: peak memory of rendering for a pixel of the canvas. The framework renders a canvas that exceeds the
-            memory of the run in tiles.
-        divides_by_light: whether it divides by the gains of a `LitSource`, as `photonpano.merging.accumulate` does. If not, a
-            run in changing light warns that the panorama shows the light of the moment.
-        renders_on_any_canvas: whether it renders on a canvas of any projection, and a `LensedSource` through its lens, as
-            `photonpano.merging.accumulate` does. If not, a run that needs it is refused.
-    """
+    """Offers a renderer."""
 
     build: Callable[[Any, StageContext], Renderer]
+    # peak memory of rendering for a pixel of the canvas. The framework renders a canvas that exceeds the memory of the run in
+    # tiles.
     bytes_per_pixel: int = 40
+    # whether it divides by the gains of a `LitSource`, as `photonpano.merging.accumulate` does. If not, a run in changing light
+    # warns that the panorama shows the light of the moment.
     divides_by_light: bool = False
+    # whether it renders on a canvas of any projection, and a `LensedSource` through its lens, as
+    # `photonpano.merging.accumulate` does. If not, a run that needs it is refused.
     renders_on_any_canvas: bool = False
 
     def __post_init__(self) -> None:
@@ -287,14 +256,10 @@ class ExporterContribution(
     several=True,
     meaning="further files of the panorama, beside panorama.tiff and panorama.png: one or a list, each a name or {use, with}",
 ):
-    """Offers an exporter.
-
-    Attributes:
-        suffix: the ending of its file or folder, in small letters, such as ".exr": the run folder gets `panorama.exr`.
-    """
+    """Offers an exporter."""
 
     build: Callable[[Any, StageContext], Exporter]
-    suffix: str
+    suffix: str  # the ending of its file or folder, in small letters, such as ".exr": the run folder gets `panorama.exr`
 
     def __post_init__(self) -> None:
         StageContribution.__post_init__(self)

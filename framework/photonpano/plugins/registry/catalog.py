@@ -100,19 +100,12 @@ class Observer:
 
 @dataclass(frozen=True, slots=True)
 class Catalog:
-    """What can be chosen in a spec. `discover()` makes one from the installed plugins; `Catalog()` is empty.
+    """What can be chosen in a spec. `discover()` makes one from the installed plugins; `Catalog()` is empty."""
 
-    Attributes:
-        rows: every component on offer, ordered by kind and name.
-        broken: the plugins that failed; none of their components is on offer.
-        disabled: the plugins that were not imported, so that their components are not known.
-        observers: the plugins that watch runs.
-    """
-
-    rows: tuple[Entry, ...] = ()
-    broken: tuple[BrokenPlugin, ...] = ()
-    disabled: tuple[DisabledPlugin, ...] = ()
-    observers: tuple[Observer, ...] = ()
+    rows: tuple[Entry, ...] = ()  # every component on offer, ordered by kind and name
+    broken: tuple[BrokenPlugin, ...] = ()  # the plugins that failed; none of their components is on offer
+    disabled: tuple[DisabledPlugin, ...] = ()  # the plugins that were not imported, so that their components are not known
+    observers: tuple[Observer, ...] = ()  # the plugins that watch runs
 
     def names(self, kind: str) -> tuple[str, ...]:
         """Return the names on offer for a kind, such as "locator", in alphabetical order."""
