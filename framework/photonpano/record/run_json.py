@@ -27,6 +27,7 @@ from photonpano.record.run_warnings import (
 )
 from photonpano.record.schema import (
     CameraRecord,
+    CutRecord,
     DecisionRecord,
     FailureRecord,
     LevelRecord,
@@ -40,6 +41,7 @@ from photonpano.record.schema import (
     RunRecord,
     VerdictRecord,
 )
+from photonpano.residuals.halves import Halves
 from photonpano.residuals.refinement import Explained, Refinement
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, PoseEstimate, Reason, StreamInfo, Verdict
@@ -64,6 +66,7 @@ def record_of(
         "panorama": panorama_record(plan, panorama, rendered),
         "motion": motion_record(motion.std_px),
         "refinements": [refinement_record(each) for each in explained.refinements],
+        "halves": halves_record(explained.halves),
         "verdict": verdict_record(verdict),
         "warnings": [
             *time_warnings(started["decisions"]),
@@ -100,6 +103,7 @@ def started_record(
         "panorama": None,
         "motion": None,
         "refinements": [],
+        "halves": [],
         "verdict": None,
         "warnings": [],
         "seconds": round(seconds, 3),
@@ -253,6 +257,21 @@ def refinement_record(refinement: Refinement) -> RefinementRecord:
         "change_px": refinement.change_px,
         "kept_out": refinement.kept_out or None,
     }
+
+
+def halves_record(halves: Halves) -> list[CutRecord]:
+    """Describe how the halves of a capture agree."""
+    columns = halves.cuts, halves.coherence, halves.std_coherence, halves.std_px, halves.angles_deg
+    return [
+        {
+            "frame": int(cut),
+            "coherence": _number(coherence),
+            "std_coherence": _number(std_coherence),
+            "std_px": std_px.tolist(),
+            "angle_deg": _number(angle),
+        }
+        for cut, coherence, std_coherence, std_px, angle in zip(*columns, strict=True)
+    ]
 
 
 def levels_decision(results: Sequence[LevelResult]) -> Decision:

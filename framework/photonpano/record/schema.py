@@ -163,6 +163,16 @@ class RefinementRecord(TypedDict):
     kept_out: str | None
 
 
+class CutRecord(TypedDict):
+    """How the frames before a frame, and those from it on, agree: see `Halves`; None where they share nothing."""
+
+    frame: int
+    coherence: float | None
+    std_coherence: float | None
+    std_px: Sequence[float]
+    angle_deg: float | None
+
+
 class ReasonRecord(TypedDict):
     """Why a run is doubtful: the number that decided, the largest that is trusted, where, and what to do."""
 
@@ -248,6 +258,7 @@ class RunRecord(TypedDict):
     levels: Sequence[LevelRecord]
     motion: MotionRecord | None
     refinements: Sequence[RefinementRecord]
+    halves: Sequence[CutRecord]
     verdict: VerdictRecord | None
     panorama: PanoramaRecord | None
     warnings: Sequence[str]

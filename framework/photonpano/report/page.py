@@ -88,6 +88,7 @@ def _unexplained(record: RunRecord, explained: Explained, panorama: RenderedPano
         "over_sensor": residual_figures.over_sensor(residuals),
         "shifts_are_drawn": residual_figures.significant_shifts(residuals) is not None,
         "shifts_over_time": residual_figures.shifts_over_time(residuals, record["source"]["frame_rate_hz"]),
+        "halves_over_time": residual_figures.halves_over_time(explained.halves, residuals.spans[-1].stop),
         "light_over_time": residual_figures.light_over_time(residuals),
         "span_frames": int(np.median([len(span) for span in residuals.spans])),
     }

@@ -28,6 +28,7 @@ from photonpano.report.drawing import (
     svg_of,
 )
 from photonpano.residuals.block_sums import BLOCK_PX, M, R
+from photonpano.residuals.halves import Halves
 from photonpano.residuals.measure import Residuals
 from photonpano.values import FloatArray, Light, SpanResiduals
 
@@ -119,6 +120,26 @@ def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
         time.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, handletextpad=0.2, columnspacing=1.2)
         _draw_spectrum(spectrum, residuals, frame_rate_hz)
         return svg_of(figure, "shifts")
+
+
+def halves_over_time(halves: Halves, n_frames: int) -> str | None:
+    """Draw how the frames before and after each instant agree, and how well they are tied; None for short captures."""
+    if not len(halves.cuts):
+        return None
+    with plain_figure(WIDTH_IN, 4.4) as figure:
+        agree, tie = add_axes(figure, Margins(top=0.35), rows=(1, 1), gap_in=0.6)
+        band = 2 * halves.std_coherence
+        agree.fill_between(halves.cuts, halves.coherence - band, halves.coherence + band, color=MUTED, alpha=0.25, linewidth=0)
+        agree.axhline(1, color=MUTED, linewidth=1, linestyle="--")
+        agree.plot(halves.cuts, halves.coherence, "o-", color=SERIES[0], markersize=4)
+        agree.set_ylabel("coherence")
+        for values, name, colour in zip(halves.std_px.T[::-1], ("least known direction", "best known"), SERIES, strict=False):
+            tie.semilogy(halves.cuts, values, color=colour, label=name)
+        tie.set_ylabel("error across (px)")
+        tie.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, columnspacing=1.2)
+        for axes in (agree, tie):
+            mark_frames(axes, 0, n_frames)
+        return svg_of(figure, "halves")
 
 
 def light_over_time(residuals: Residuals) -> str | None:

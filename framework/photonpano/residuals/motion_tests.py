@@ -6,12 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from photonpano.geometry import corners, jacobian
 from photonpano.motion.loop import TOO_NARROW
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
 from photonpano.residuals.scene_tests import of_either_part
 from photonpano.residuals.tested_run import FIND_LENS, FREE, RIVAL, TestedRun, Tests
-from photonpano.values import Located, Reason
+from photonpano.values import Reason
 from photonpano.values.verdict import Found
 
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
@@ -31,30 +30,20 @@ def _unknown(run: TestedRun) -> Found | None:
 
 
 @MOTION_TESTS.doubtful_above(
-    2.0,
+    _UNCERTAIN_PX,
     "the image says nothing of motion along one direction",
     "the motion may be wrong by any distance along it, which this panorama does not show; keep other structures in view",
 )
 def _one_direction(run: TestedRun) -> Found | None:
-    located = run.levels[-1].located if run.levels else None
-    pairs = [] if located is None else [edge.motion for edge in located.edges if isinstance(edge.motion, Located)]
-    informed = [pair for pair in pairs if pair.information is not None]
-    if located is None or not informed:
+    halves = run.explained.halves
+    if not len(halves.cuts):
         return None
-    middle = corners(located.frame_shape).mean(axis=0)[None]
-    # Where nothing but shift and roll moves the image, the other parameters are known.
-    solution = located.solution
-    free = slice(0, 8) if solution.walks_px or solution.rotations is not None else slice(4, 6)
-    slopes = np.array([jacobian(pair.homography, middle)[0][:, free] for pair in informed])
-    information = np.array([pair.information for pair in informed])[:, free, free]
-    covariances = slopes @ np.linalg.pinv(information) @ slopes.transpose(0, 2, 1)
-    variances, directions = np.linalg.eigh(np.median(covariances, axis=0))
-    strong, weak = np.sqrt(np.maximum(variances, 0)).tolist()
+    weakest = int(np.argmax(halves.std_px[:, 1]))
+    (strong, weak), angle = halves.std_px[weakest].tolist(), halves.angles_deg[weakest]
     if weak < _ASLANT * strong:
         return None
-    x, y = directions[:, 1]
-    angle = round(np.degrees(np.arctan2(y, x))) % 180
-    return Found(weak, f"px, the error of a pair at {angle} degrees from x towards y; {strong:.2g} px across")
+    where = f"px between the frames before and after {halves.cuts[weakest]:.0f}, at {angle:.0f} degrees from x towards y"
+    return Found(weak, f"{where}; {strong:.2g} px across")
 
 
 @MOTION_TESTS.doubtful_above(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -21,6 +21,7 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.light import bytes_of_light
 from photonpano.merging.panorama import render
 from photonpano.motion.frame_motion import FrameMotion, view_of
+from photonpano.residuals.halves import Halves, halves_of
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.prediction import Predictions
 from photonpano.values import FloatArray, Panorama
@@ -152,6 +153,7 @@ class Explained:
     canvas: Canvas  # of the panorama that the residuals were measured against
     residuals: Residuals  # observed minus predicted photons
     ratio: float  # see `residual_ratio`
+    halves: Halves  # how well the frames before and after cuts agree
     refinements: tuple[Refinement, ...]  # what each refiner did
 
 
@@ -211,8 +213,11 @@ class MotionFit:
         """Return the motion with an expected error that covers the residuals, and what else a verdict needs."""
         std_px, residuals = self.motion.std_px, self.residuals
         std_px = np.hypot(bounded_std_px(std_px, residuals), unexplained_px(residuals, len(std_px)))
-        motion = replace(self.motion, std_px=std_px)
-        return Explained(motion, self.canvas, residuals, self.ratio, tuple(refinements))
+        compared = partial(halves_of, self._source, self.motion, self.canvas, self._context)
+        halves = self._context.checkpoints.once("halves", compared, self.motion.homographies, self.motion.span)
+        # Two frames know no more of each other than the weakest cut between them lets through.
+        motion = replace(self.motion, std_px=np.maximum(std_px, halves.tied_px(self.motion.located)))
+        return Explained(motion, self.canvas, residuals, self.ratio, halves, tuple(refinements))
 
     def moved(self, motion: FrameMotion) -> MotionFit:
         """Return the fit of a motion that differs by a small fraction of a pixel, to first order, from the same panorama.

@@ -21,6 +21,7 @@ from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.report import render_report
 from photonpano.report.viewer import shared_instant
+from photonpano.residuals.halves import Halves
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained, bounded_std_px, residual_ratio, unexplained_px
 from photonpano_core.configs import ShortSpansConfig
@@ -44,7 +45,7 @@ class End:
 
     @property
     def explained(self) -> Explained:
-        return Explained(self.motion, self.panorama.canvas, self.residuals, 1.0, ())
+        return Explained(self.motion, self.panorama.canvas, self.residuals, 1.0, Halves.none(), ())
 
     def refined(self) -> Refined | None:
         refiner = ShortSpansRefiner(ShortSpansConfig(), self.motion.frame_shape, 96_800.0)

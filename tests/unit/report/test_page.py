@@ -23,7 +23,7 @@ def no_figures(monkeypatch):
     """Leave out the figures, whose drawing takes a second, where a test is about the words."""
     for name in ("path_over_time", "path_on_panorama", "coverage_map", "stage_times"):
         monkeypatch.setattr(figures, name, lambda *_: "")
-    for name in ("chi2_over_panorama", "over_sensor", "shifts_over_time"):
+    for name in ("chi2_over_panorama", "over_sensor", "shifts_over_time", "halves_over_time"):
         monkeypatch.setattr(residual_figures, name, lambda *_: "")
 
 
@@ -74,7 +74,7 @@ def test_page_is_self_contained_and_deterministic(record, explained, panorama):
     check_self_contained(page)
     assert "http" not in page
     assert page.count("data:image/jpeg") == 1
-    assert page.count("<svg") == 7
+    assert page.count("<svg") == 8
 
 
 @pytest.mark.parametrize(("share", "end"), [(0.0, ""), (0.012, "; 1.2 % of the pixels are saturated")])

@@ -7,6 +7,7 @@ from photonpano import FrameSpan
 from photonpano.geometry import Canvas, FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.residuals.block_sums import GXX, GYY, N_SUMS, M, R, V, n_blocks
+from photonpano.residuals.halves import Halves
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.shaking import Shaking
@@ -60,4 +61,4 @@ def explained(noise: Residuals) -> Explained:
         N_FRAMES // 2,
         SHAPE,
     )
-    return Explained(motion, Canvas(*SHAPE, np.eye(3)), noise, 1.05, ())
+    return Explained(motion, Canvas(*SHAPE, np.eye(3)), noise, 1.05, Halves.none(), ())

@@ -15,6 +15,7 @@ from photonpano.motion.loop import LevelResult
 from photonpano.motion.model import SAME_LENS_PX, MotionModel
 from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED, UNCUT_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
+from photonpano.residuals.halves import Halves
 from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.motion_tests import NARROW, contradictions
@@ -329,17 +330,15 @@ def test_camera_that_pairs_contradict_by_ten_expected_errors_is_doubtful(
     assert [reason.where for reason in reasons] == ([] if says is None else [says])
 
 
-@pytest.mark.parametrize(("along", "doubtful"), [(6.0, True), (1.5, False), (0.1, False)])
+@pytest.mark.parametrize(("along", "doubtful"), [(6.0, True), (0.8, False), (0.1, False)])
 @pytest.mark.parametrize("angle", [0, 37, 90])
 def test_motion_along_an_edge_is_doubtful(explained: Explained, angle: int, along: float, doubtful: bool) -> None:
-    """Pairs know the motion across it to 0.1 px, and little of that along it."""
-    x, y = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
-    turned = np.array([[x, -y], [y, x]])
-    information = np.diag([1e6] * 4 + [0.0] * 2 + [1e12] * 2)
-    information[4:6, 4:6] = turned @ np.diag([along**-2, 0.1**-2]) @ turned.T
-    reasons = judge(explained, [level_with(motion=Located(np.eye(3), information))]).reasons
-    assert [reason.figure for reason in reasons] == [pytest.approx(along, rel=0.1)] * doubtful
-    assert all(f"at {angle} degrees" in reason.where for reason in reasons)
+    """Across one of two cuts, the photons tell of the motion across the edge to 0.1 px, and little of that along it."""
+    cuts, one = np.array([500.0, 1500.0]), np.ones(2)
+    halves = Halves(cuts, one, 0.01 * one, np.array([[0.05, 0.06], [0.1, along]]), np.array([12.0, angle]))
+    reasons = judge(replace(explained, halves=halves), []).reasons
+    assert [reason.figure for reason in reasons] == [pytest.approx(along)] * doubtful
+    assert all(f"frames before and after 1500, at {angle} degrees" in reason.where for reason in reasons)
 
 
 @pytest.mark.parametrize(("n_pairs", "where"), [(2, []), (3, ["3 of 30 pairs of level 1, 40 px away"])])

@@ -1,0 +1,215 @@
+"""What the photons say of a motion: at each cut in time, the frames before it against the frames after it.
+
+Both halves are merged along the motion, each in two parts whose frames alternate. The noise of the four pictures is
+independent, so that products of their gradients are unbiased by it: those of the parts of a half, and those of the halves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, minimum_filter
+
+from photonpano.capture import capture_of
+from photonpano.contracts.protocols import Source
+from photonpano.execution.context import Context
+from photonpano.geometry import Canvas, rescaling
+from photonpano.merging.colour import channels_of, in_colours
+from photonpano.merging.footprints import footprints_of
+from photonpano.merging.panorama import MergeRenderer
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.photometry import frame_variance
+from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Panorama, Response
+
+_CUTS = 32
+_TOLERANCE_PX = 1.0  # motion within which frames are summed: pictures are smoothed by more
+# Standard deviations of the Gaussian that smooths the pictures, the first that shows how they are tied: the finest structure is
+# mostly noise.
+_BLURS_PX = 1.0, 2.0, 4.0
+_MARGIN_PX = 4  # around the places of frames that were looked at, for those between them
+_FEWEST_FRAMES = 4  # of a picture, that saw a pixel
+_MOST_PIXELS = 4e6  # of the canvas; a larger one is reduced
+_SAMPLED = 5  # frames of a block at which it is looked where they lie
+_SQUARE_PX = 16  # squares whose noise is independent, for each pixel by which pictures are smoothed
+_DARKEST = 1e-4  # least flux of which the noise is taken
+_ERRORS = 2.0  # standard errors that are taken off the information
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Halves:
+    """How the frames before each of C cuts, and those after it, agree."""
+
+    cuts: FloatArray  # (C,) the first frame after each
+    # (C,) correlation of the gradients of the halves without their noise: 1 if the motion is right, and nothing else changes;
+    # NaN where the halves show too little in common
+    coherence: FloatArray
+    std_coherence: FloatArray  # (C,) by photon noise
+    # (C, 2) errors of the shift of one half against the other that photon noise lets expect, in px of a frame: along the
+    # direction that is known best, and least; half of the longer side of a frame where nothing is known
+    std_px: FloatArray
+    angles_deg: FloatArray  # (C,) of the direction that is known least, from x towards y on the panorama, 0 to 180
+
+    @classmethod
+    def none(cls) -> Halves:
+        """Return those of a capture that is too short for a cut."""
+        none = np.zeros(0)
+        return cls(none, none, none, np.zeros((0, 2)), none)
+
+    def tied_px(self, located: BoolArray) -> FloatArray:
+        """Return how far frames may lie beside others that only a weak cut ties them to: (T,), given which are located.
+
+        Of a displacement across a cut, the best alignment of the planes gives each side the share of the frames of the other.
+        """
+        frames, number = np.arange(len(located)), np.cumsum(located)
+        earlier = number[self.cuts.astype(int) - 1] / max(int(number[-1]), 1)
+        shares = np.where(frames[:, None] < self.cuts, 1 - earlier, earlier)
+        return np.asarray((shares * self.std_px[:, 1]).max(axis=1, initial=0.0))
+
+
+class _Block(NamedTuple):
+    """The picture of some frames on a part of the canvas, as sums over frames: (h, w, C) each."""
+
+    part: tuple[slice, slice]
+    lit: FluxImage  # flux times weight
+    weight: FluxImage  # in frames
+
+
+class _Agreement(NamedTuple):
+    """How two halves agree: what `Halves` has of one cut."""
+
+    coherence: float
+    std_coherence: float
+    std_px: tuple[float, float]  # in px of the canvas
+    angle_deg: float
+
+
+def halves_of(source: Source, motion: FrameMotion, canvas: Canvas, context: Context) -> Halves:
+    """Compare the halves of a capture along a motion across up to 32 cuts, on a canvas of any projection."""
+    span, canvas = motion.span, _reduced(canvas)
+    number = 2 * min(_CUTS + 1, len(span) // (2 * _FEWEST_FRAMES))
+    if number < 4:
+        return Halves.none()
+    starts = np.linspace(span.start, span.stop, number + 1).round().astype(int).tolist()
+    with context.progress.stage("halves", len(span) * channels_of(source), "frames") as advance:
+        blocks = [_block(source, motion, FrameSpan(*ends), canvas, context, advance) for ends in pairwise(starts)]
+    scale = canvas.transform[0, 0] / (1 if canvas.camera_matrix is None else canvas.camera_matrix[0, 0])
+    widest_px = max(motion.frame_shape) / 2 * scale
+    # Of the two parts of the first half, and of the second: flux times weight, and weight.
+    sums = np.zeros((4, 2, *canvas.shape, channels_of(source)), np.float32)
+    for index, block in enumerate(blocks):
+        _add(sums[2 + index % 2], block, 1)
+    found = []
+    for pair in zip(blocks[:-2:2], blocks[1:-2:2], strict=True):
+        for part, block in enumerate(pair):
+            _add(sums[part], block, 1)
+            _add(sums[2 + part], block, -1)
+        found.append(_compared(sums, source.response, widest_px))
+    coherence, std_coherence, std_px, angles = (np.array(column, dtype=np.float64) for column in zip(*found, strict=True))
+    return Halves(np.array(starts[2:-1:2], dtype=np.float64), coherence, std_coherence, std_px / scale, angles)
+
+
+def _reduced(canvas: Canvas) -> Canvas:
+    factor = float(np.sqrt(_MOST_PIXELS / (canvas.height * canvas.width)))
+    if factor >= 1:
+        return canvas
+    height, width = (max(int(factor * each), 1) for each in canvas.shape)
+    return replace(canvas, height=height, width=width, transform=rescaling(factor) @ canvas.transform)
+
+
+def _block(
+    source: Source, motion: FrameMotion, block: FrameSpan, canvas: Canvas, context: Context, advance: Callable[[int], None]
+) -> _Block:
+    """Merge the frames of a block on the part of the canvas that they cover."""
+    along = motion.trajectory.at(np.linspace(block.start, block.stop - 1, _SAMPLED).round())
+    footprints = footprints_of(canvas, capture_of(source).camera, along, motion.frame_shape)
+    rows = _around([each.rows for each in footprints], canvas.height)
+    # A frame across the seam of a full turn has two ranges of columns.
+    columns = _around(
+        [range(each.columns[0].start, each.columns[-1].stop) for each in footprints if each.columns], canvas.width
+    )
+    part = canvas.part(columns.start, rows.start, rows.stop - rows.start, columns.stop - columns.start)
+
+    def of_colour(each: Source) -> Panorama:
+        return MergeRenderer(context.in_order).render(each, motion.trajectory, block, part, _TOLERANCE_PX, advance)
+
+    picture = in_colours(source, of_colour)
+    flux, weight = (each.reshape(*part.shape, -1) for each in (picture.flux, picture.weight))
+    return _Block((rows, columns), np.where(weight > 0, flux * weight, np.float32(0)), weight)
+
+
+def _around(ranges: Iterable[range], length: int) -> slice:
+    """Return what holds ranges of rows or columns, and a margin for frames between those that were looked at."""
+    seen = [each for each in ranges if each] or [range(1)]
+    low, high = min(each.start for each in seen), max(each.stop for each in seen)
+    return slice(max(low - _MARGIN_PX, 0), min(high + _MARGIN_PX, length))
+
+
+def _add(sums: FluxImage, block: _Block, sign: int) -> None:
+    for total, values in zip(sums, (block.lit, block.weight), strict=True):
+        total[block.part] += sign * values
+
+
+def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreement:
+    """Compare two halves, of two parts each, (4, 2, H, W, C) sums of flux and weight, that are off by at most `widest_px`.
+
+    Where noise hides what fine structure ties, as before a scene that is blurred, coarser structure is compared.
+    """
+    found = _Agreement(np.nan, np.nan, (widest_px, widest_px), np.nan)
+    seen = np.asarray((sums[:, 1] >= _FEWEST_FRAMES / 2).all(axis=(0, -1)))
+    if not seen.any():
+        return found
+    (top, bottom), (left, right) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]] for axis in (1, 0))
+    part = slice(top, bottom + 1), slice(left, right + 1)
+    lit, weight = sums[:, 0][:, *part], np.maximum(sums[:, 1][:, *part], np.float32(1e-6))
+    known, noise = seen[part][..., None].astype(np.float32), np.float32(0)
+    inner = minimum_filter(known, (3, 3, 1), mode="constant")  # where gradients are known
+    for first in (0, 2):  # of the mean of the parts of a half
+        whole = np.maximum(lit[first : first + 2].sum(axis=0) / weight[first : first + 2].sum(axis=0), _DARKEST)
+        noise = noise + frame_variance(whole, response) / weight[first : first + 2].sum(axis=0)
+    for number, blur_px in enumerate(_BLURS_PX):
+        within = np.maximum(gaussian_filter(known, (blur_px, blur_px, 0)), np.float32(1e-6))
+        smooth = gaussian_filter(lit / weight * known, (0, blur_px, blur_px, 0)) / within
+        along_x, along_y = (np.asarray(np.gradient(smooth, axis=axis)) for axis in (2, 1))
+        gradients = np.stack([along_x, along_y], axis=1) * inner / np.sqrt(noise)
+        coarser = _agreement(gradients, widest_px, round(_SQUARE_PX * blur_px))
+        strong, weak = (min(pair) for pair in zip(found.std_px, coarser.std_px, strict=True))
+        found = (found if number else coarser)._replace(std_px=(strong, weak))
+        if weak < widest_px:
+            break
+    return found
+
+
+def _agreement(gradients: FluxImage, widest_px: float, square_px: int) -> _Agreement:
+    """Compare the gradients of four pictures, in units of their noise: (4, 2, h, w, C)."""
+    (first, of_first), (second, of_second) = (
+        ((gradients[i] + gradients[i + 1]) / 2, (gradients[i] - gradients[i + 1]) / 2) for i in (0, 2)
+    )
+    between = _of_squares(first, second, square_px)
+    information = between.sum(axis=0)
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    # Products of one part with the difference of others have noise, and no signal.
+    errors = [_of_squares(*each, square_px) for each in ((first, of_second), (of_first, second), (of_first, of_second))]
+    squares = [np.square(np.einsum("is,nij,js->ns", vectors, each, vectors)).sum(axis=0) for each in errors]
+    std = np.sqrt(np.maximum(squares[0] + squares[1] - squares[2], 0))
+    weak, strong = (1 / np.sqrt(np.maximum(values - _ERRORS * std, 0) + 1 / widest_px**2)).tolist()
+    angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])) % 180)
+    own = [np.trace(_of_squares(gradients[i], gradients[i + 1], square_px), axis1=1, axis2=2) for i in (0, 2)]
+    across, (before, after) = np.trace(between, axis1=1, axis2=2), (each.sum() for each in own)
+    if min(before, after) <= 0:
+        return _Agreement(np.nan, np.nan, (strong, weak), angle)
+    coherence = across.sum() / np.sqrt(before * after)
+    # Where the motion is right, each square has the same coherence but for its noise.
+    left = across - coherence / 2 * (own[0] * np.sqrt(after / before) + own[1] * np.sqrt(before / after))
+    return _Agreement(float(coherence), float(np.sqrt((left**2).sum() / (before * after))), (strong, weak), angle)
+
+
+def _of_squares(first: FluxImage, second: FluxImage, square_px: int) -> FloatArray:
+    """Return the sums of products of gradients, (2, h, w, C), over squares: (N, 2, 2)."""
+    products = np.einsum("ihwc,jhwc->ijhw", first, second)
+    starts = [np.arange(0, length, square_px) for length in products.shape[2:]]
+    sums = np.add.reduceat(np.add.reduceat(products, starts[0], axis=2), starts[1], axis=3)
+    return sums.astype(np.float64).reshape(2, 2, -1).transpose(2, 0, 1)

@@ -1,0 +1,97 @@
+"""Halves of captures across cuts: their coherence, its noise, and how well they are tied."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from photonpano import FrameSpan
+from photonpano.execution.context import Context
+from photonpano.geometry import FrameTrajectory, canvas_of, translation
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.residuals.halves import Halves, halves_of
+from photonpano.testing.scenes import detected, seen_along, textured
+
+SHAPE, N_FRAMES = (64, 96), 400
+PAN = np.array([translation(10 + 0.25 * frame, 20) for frame in range(N_FRAMES)])
+
+
+@pytest.fixture
+def halves(memory_source: type) -> Callable[..., Halves]:
+    def halves(scene: np.ndarray, true: np.ndarray = PAN, found: np.ndarray | None = None, seed: int = 0) -> Halves:
+        """Compare the halves of a capture along a motion, by default the true one."""
+        source = memory_source(detected(seen_along(scene, true, SHAPE), seed))
+        homographies = np.linalg.inv(true[N_FRAMES // 2]) @ (true if found is None else found)
+        everywhere, std_px = np.ones(N_FRAMES, dtype=bool), np.full(N_FRAMES, 0.05)
+        trajectory, span = FrameTrajectory(homographies), FrameSpan(0, N_FRAMES)
+        motion = FrameMotion(trajectory, span, homographies, everywhere, std_px, N_FRAMES // 2, SHAPE)
+        return halves_of(source, motion, canvas_of(homographies, SHAPE, 1.0), Context())
+
+    return halves
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    return textured((110, 230), 1.0, seed=3).astype(np.float32)
+
+
+@pytest.mark.parametrize("flux", [0.3, 0.02])
+def test_coherence_along_the_true_motion_is_one_but_for_its_noise(halves: Callable, scene: np.ndarray, flux: float) -> None:
+    found = [halves(flux * scene, seed=seed) for seed in range(12)]
+    inner = slice(4, -4)  # at the ends, a half is a few frames
+    scores = np.array([((each.coherence - 1) / each.std_coherence)[inner] for each in found])
+    assert 0.7 < np.sqrt(np.mean(scores**2)) < 1.4
+    assert abs(scores.mean()) < 0.5
+
+
+@pytest.mark.parametrize("flux", [0.3, 0.02])
+def test_error_of_the_shift_across_a_cut_is_that_of_photon_noise(halves: Callable, scene: np.ndarray, flux: float) -> None:
+    """At a fifteenth of the light, it is about four times as large."""
+    std_px = halves(flux * scene).std_px[len(PAN) // 25]
+    lit = halves(0.3 * scene).std_px[len(PAN) // 25]
+    expected = np.sqrt(0.3 / flux)
+    np.testing.assert_allclose(std_px / lit, expected, rtol=0.4)
+    assert (std_px >= lit).all()
+
+
+def test_motion_that_is_wrong_after_a_cut_is_seen_there(halves: Callable, scene: np.ndarray) -> None:
+    """A jump of 1 px that the motion lacks: halves across it are displaced."""
+    found = PAN.copy()
+    found[N_FRAMES // 2 :] = found[N_FRAMES // 2 :] @ translation(0, 1)
+    wrong = halves(0.3 * scene, found=found)
+    sigmas = (1 - wrong.coherence) / wrong.std_coherence
+    assert wrong.coherence[len(wrong.cuts) // 2] < 0.97
+    assert sigmas[len(wrong.cuts) // 2] > 5
+    assert abs(wrong.cuts[np.nanargmin(wrong.coherence)] - N_FRAMES // 2) < 0.2 * N_FRAMES
+
+
+@pytest.mark.parametrize(("along", "angle"), [(0, 90), (1, 0)], ids=["vertical edges", "horizontal edges"])
+def test_bare_edges_tie_nothing_along_them(halves: Callable, scene: np.ndarray, along: int, angle: int) -> None:
+    """Before a wall with one edge, half of the longer side of a frame is all that is known."""
+    wall = np.full_like(scene, 0.3)
+    wall[(slice(None), slice(115, None)) if along == 0 else (slice(50, None), slice(None))] = 0.6
+    found = halves(wall)
+    middle = len(found.cuts) // 2
+    strong, weak = found.std_px[middle]
+    assert strong < 0.1
+    assert weak > 5
+    assert min(abs(found.angles_deg[middle] - angle), abs(found.angles_deg[middle] - angle - 180)) < 3
+
+
+def test_short_captures_have_no_cuts(halves: Callable, memory_source: type, scene: np.ndarray) -> None:
+    source, homographies = memory_source(detected(seen_along(0.3 * scene, PAN[:10], SHAPE), 0)), PAN[:10]
+    located = np.ones(10, dtype=bool)
+    motion = FrameMotion(FrameTrajectory(homographies), FrameSpan(0, 10), homographies, located, np.full(10, 0.1), 5, SHAPE)
+    found = halves_of(source, motion, canvas_of(homographies, SHAPE, 1.0), Context())
+    assert not len(found.cuts)
+    np.testing.assert_array_equal(found.tied_px(located), np.zeros(10))
+
+
+def test_each_side_of_a_weak_cut_lies_off_by_the_share_of_the_other() -> None:
+    """Of 10 px between 20 and 60 frames, 7.5 are an error of the 20, and 2.5 of the 60."""
+    one = np.ones(2)
+    found = Halves(np.array([20.0, 50.0]), one, 0.01 * one, np.array([[0.1, 10.0], [0.1, 0.2]]), 90 * one)
+    tied_px = found.tied_px(np.ones(80, dtype=bool))
+    np.testing.assert_allclose(tied_px[[0, 19, 20, 79]], [7.5, 7.5, 2.5, 2.5])
