@@ -55,6 +55,23 @@ def test_frames_of_few_rows_are_located(tmp_path: Path, outcome_of: Callable[...
     assert within_3 >= WITHIN_3
 
 
+def test_pan_past_a_wall_with_one_line_is_not_trusted(tmp_path: Path, outcome_of: Callable[..., Any]) -> None:
+    """For a while, frames see nothing but a line along which they move: pairs of them err, and claim to know."""
+    true = np.tile(np.eye(3), (700, 1, 1))
+    true[:, 0, 2], true[:, 1, 2] = 10 + np.linspace(0, 280, 700), 15 + 6 * np.sin(np.linspace(0, 2 * np.pi, 700))
+    scene = textured((140, 450), FLUX, seed=2).astype(np.float32)
+    scene[:, 110:250], scene[62:64, 110:250] = FLUX, 0.6 * FLUX
+    outcome = outcome_of(spec_of(true, scene, SHAPE, tmp_path))
+    found = load_run_trajectory(outcome.directory)
+    [reason] = [each for each in outcome.record["verdict"]["reasons"] if "along one direction" in each["what"]]
+    weakest = max(outcome.record["halves"], key=lambda cut: cut["std_px"][1])
+    assert f"frames before and after {weakest['frame']}, at {weakest['angle_deg']:.0f} degrees" in reason["where"]
+    assert min(weakest["angle_deg"], 180 - weakest["angle_deg"]) < 5
+    assert 230 < weakest["frame"] < 400
+    score = corner_errors(found.homographies, true, SHAPE, found.located)
+    assert np.mean(score.errors_px <= 3 * found.std_px) >= WITHIN_3
+
+
 def test_what_a_freer_motion_explains_does_not_move_by_itself(tmp_path: Path, outcome_of: Callable[..., Any]) -> None:
     """Shifts and rolls of a camera that zooms leave much that looks as if it moved by itself."""
     true = motion_paths.path_of(motion_paths.MOTIONS["zoom"], SHAPE, N_FRAMES, SCENE_SHAPE, 5)
