@@ -58,6 +58,10 @@ class UntiedError(LocationError):
         return self.signal_to_noise is not None and self.signal_to_noise >= _NOISY
 
 
+# Frames of 24x24 and 8x512 px were located, and none of 16x16, 4x256 and 1x512.
+_FEWEST_ROWS, _FEWEST_PIXELS = 8, 500
+
+
 def contrast_of(exposure: VirtualExposure) -> Contrast:
     """Measure the contrast of an exposure."""
     longest = exposure.weight.max()
@@ -83,6 +87,7 @@ def require_tied(
     disconnected: Literal["error", "largest"],
     merged: Callable[[int], VirtualExposure] | None = None,
     foreseen: BoolArray | None = None,
+    frame_shape: tuple[int, int] | None = None,
 ) -> None:
     """Raise an `UntiedError` for a level where too many exposures are not tied to the others.
 
@@ -120,6 +125,10 @@ def require_tied(
             *lines,
             "To go on with the largest part alone, set graph.disconnected to largest.",
         ]
+    if frame_shape is not None and (min(frame_shape) < _FEWEST_ROWS or np.prod(frame_shape) < _FEWEST_PIXELS):
+        height, width = frame_shape
+        small = f"Frames of {height}x{width} px are too small for most scenes: use {_FEWEST_ROWS} rows and columns or more, and"
+        lines = [lines[0], f"{small} {_FEWEST_PIXELS} pixels or more."]
     raise UntiedError("\n".join(lines), level, groups, edges, parts, ratio, merged)
 
 

@@ -149,7 +149,7 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
             labels = components(len(groups), edges)
             foreseen = np.array([exposures.is_foreseen(index) for index in range(len(groups))])
             tied = level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged, foreseen
-            require_tied(*tied)
+            require_tied(*tied, frame_shape=shape)
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
             to_plane = registrar.to_plane

@@ -201,3 +201,16 @@ def test_graph_that_cannot_be_solved_is_a_location_error() -> None:
         "level 1: the located pairs contradict each other so much that no homographies fit them (Singular matrix); try other "
         "groups, or another locator"
     )
+
+
+@pytest.mark.parametrize(("shape", "small"), [((8, 24), True), ((1, 512), True), ((24, 24), False), ((8, 512), False)])
+def test_frames_that_are_too_small_are_the_cause(shape: tuple[int, int], small: bool) -> None:
+    groups, parts = GROUPS[:2], np.array([0, 1])
+    with pytest.raises(LocationError) as caught:
+        require_tied(1, groups, [Edge(1, 0, NotLocated("lost"))], parts, {0: CLEAR, 1: CLEAR}, "error", frame_shape=shape)
+    height, width = shape
+    sentence = (
+        f"Frames of {height}x{width} px are too small for most scenes: use 8 rows and columns or more, and 500 pixels or more."
+    )
+    assert (str(caught.value).splitlines()[1] == sentence) == small
+    assert ("lost" in str(caught.value)) == (not small)
