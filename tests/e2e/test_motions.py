@@ -12,6 +12,7 @@ import pytest
 
 from photonpano import parse_spec
 from photonpano.evaluation import corner_errors, load_run_trajectory
+from photonpano.geometry import corner_displacements
 from photonpano.residuals.motion_tests import NARROW
 from photonpano.testing.scenes import detected, seen_along, textured
 
@@ -70,6 +71,19 @@ def test_pan_past_a_wall_with_one_line_is_not_trusted(tmp_path: Path, outcome_of
     assert 230 < weakest["frame"] < 400
     score = corner_errors(found.homographies, true, SHAPE, found.located)
     assert np.mean(score.errors_px <= 3 * found.std_px) >= WITHIN_3
+
+
+def test_error_of_the_reference_frame_is_that_of_all(tmp_path: Path, outcome_of: Callable[..., Any]) -> None:
+    """The camera turns back within the middle frame, which the interpolated motion passes by: all frames lie beside it."""
+    true = np.tile(np.eye(3), (N_FRAMES, 1, 1))
+    true[:, 0, 2] = 20 + 0.4 * np.minimum(np.arange(N_FRAMES), N_FRAMES - 1 - np.arange(N_FRAMES))
+    true[:, 1, 2] = 40 + 3 * np.sin(np.arange(N_FRAMES) / 90)
+    scene = textured((150, 360), FLUX, seed=4).astype(np.float32)
+    found = load_run_trajectory(outcome_of(spec_of(true, scene, SHAPE, tmp_path)).directory)
+    to_reference = np.linalg.inv(true[N_FRAMES // 2]) @ true
+    errors_px = corner_displacements(np.linalg.inv(to_reference) @ found.homographies, np.eye(3), SHAPE).mean(axis=-1)
+    assert errors_px.mean() > 0.2
+    assert np.mean(errors_px <= 3 * found.std_px) >= WITHIN_3
 
 
 def test_what_a_freer_motion_explains_does_not_move_by_itself(tmp_path: Path, outcome_of: Callable[..., Any]) -> None:

@@ -211,12 +211,15 @@ class MotionFit:
 
     def explained(self, refinements: Sequence[Refinement] = ()) -> Explained:
         """Return the motion with an expected error that covers the residuals, and what else a verdict needs."""
-        std_px, residuals = self.motion.std_px, self.residuals
-        std_px = np.hypot(bounded_std_px(std_px, residuals), unexplained_px(residuals, len(std_px)))
+        std_px, located, residuals = self.motion.std_px, self.motion.located, self.residuals
+        beyond_px2 = unexplained_px(residuals, len(std_px)) ** 2
+        # All motions are to the reference frame: what is wrong there, as where the camera turns back within it, is wrong of all.
+        of_reference_px2 = max(float(beyond_px2[self.motion.reference] - np.median(beyond_px2[located])), 0.0)
+        std_px = np.sqrt(bounded_std_px(std_px, residuals) ** 2 + beyond_px2 + of_reference_px2)
         compared = partial(halves_of, self._source, self.motion, self.canvas, self._context)
         halves = self._context.checkpoints.once("halves", compared, self.motion.homographies, self.motion.span)
         # Two frames know no more of each other than the weakest cut between them lets through.
-        motion = replace(self.motion, std_px=np.maximum(std_px, halves.tied_px(self.motion.located)))
+        motion = replace(self.motion, std_px=np.maximum(std_px, halves.tied_px(located)))
         return Explained(motion, self.canvas, residuals, self.ratio, halves, tuple(refinements))
 
     def moved(self, motion: FrameMotion) -> MotionFit:
