@@ -12,7 +12,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, minimum_filter
+from scipy.ndimage import gaussian_filter
 
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source
@@ -159,14 +159,13 @@ def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreeme
     Where noise hides what fine structure ties, as before a scene that is blurred, coarser structure is compared.
     """
     found = _Agreement(np.nan, np.nan, (widest_px, widest_px), np.nan)
-    seen = np.asarray((sums[:, 1] >= _FEWEST_FRAMES / 2).all(axis=(0, -1)))
+    seen = np.asarray((sums[:, 1] >= _FEWEST_FRAMES / 2).all(axis=0))
     if not seen.any():
         return found
-    (top, bottom), (left, right) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]] for axis in (1, 0))
+    (top, bottom), (left, right) = (np.flatnonzero(seen.any(axis=(axis, 2)))[[0, -1]] for axis in (1, 0))
     part = slice(top, bottom + 1), slice(left, right + 1)
     lit, weight = sums[:, 0][:, *part], np.maximum(sums[:, 1][:, *part], np.float32(1e-6))
-    known, noise = seen[part][..., None].astype(np.float32), np.float32(0)
-    inner = minimum_filter(known, (3, 3, 1), mode="constant")  # where gradients are known
+    known, noise = seen[part].astype(np.float32), np.float32(0)
     for first in (0, 2):  # of the mean of the parts of a half
         whole = np.maximum(lit[first : first + 2].sum(axis=0) / weight[first : first + 2].sum(axis=0), _DARKEST)
         noise = noise + frame_variance(whole, response) / weight[first : first + 2].sum(axis=0)
@@ -174,7 +173,7 @@ def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreeme
         within = np.maximum(gaussian_filter(known, (blur_px, blur_px, 0)), np.float32(1e-6))
         smooth = gaussian_filter(lit / weight * known, (0, blur_px, blur_px, 0)) / within
         along_x, along_y = (np.asarray(np.gradient(smooth, axis=axis)) for axis in (2, 1))
-        gradients = np.stack([along_x, along_y], axis=1) * inner / np.sqrt(noise)
+        gradients = np.stack([along_x, along_y], axis=1) * known / np.sqrt(noise)
         coarser = _agreement(gradients, widest_px, round(_SQUARE_PX * blur_px))
         strong, weak = (min(pair) for pair in zip(found.std_px, coarser.std_px, strict=True))
         found = (found if number else coarser)._replace(std_px=(strong, weak))

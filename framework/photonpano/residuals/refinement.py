@@ -213,7 +213,7 @@ class MotionFit:
         """Return the motion with an expected error that covers the residuals, and what else a verdict needs."""
         std_px, located, residuals = self.motion.std_px, self.motion.located, self.residuals
         beyond_px2 = unexplained_px(residuals, len(std_px)) ** 2
-        # All motions are to the reference frame: what is wrong there, as where the camera turns back within it, is wrong of all.
+        # All motions are to the reference frame: what is wrong there, as where the camera turns back in it, is wrong of all.
         of_reference_px2 = max(float(beyond_px2[self.motion.reference] - np.median(beyond_px2[located])), 0.0)
         std_px = np.sqrt(bounded_std_px(std_px, residuals) ** 2 + beyond_px2 + of_reference_px2)
         compared = partial(halves_of, self._source, self.motion, self.canvas, self._context)
