@@ -126,11 +126,9 @@ def _block(
     """Merge the frames of a block on the part of the canvas that they cover."""
     along = motion.trajectory.at(np.linspace(block.start, block.stop - 1, _SAMPLED).round())
     footprints = footprints_of(canvas, capture_of(source).camera, along, motion.frame_shape)
-    rows = _around([each.rows for each in footprints], canvas.height)
-    # A frame across the seam of a full turn has two ranges of columns.
-    columns = _around(
-        [range(each.columns[0].start, each.columns[-1].stop) for each in footprints if each.columns], canvas.width
-    )
+    rows = _around((each.rows for each in footprints), canvas.height)
+    # Where a frame crosses the seam of a full turn, the part is as wide as the canvas.
+    columns = _around((each for footprint in footprints for each in footprint.columns), canvas.width)
     part = canvas.part(columns.start, rows.start, rows.stop - rows.start, columns.stop - columns.start)
 
     def of_colour(each: Source) -> Panorama:
