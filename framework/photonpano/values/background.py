@@ -15,20 +15,14 @@ CELL_PX = 8  # side of the cells of a frame that are told from the background, i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """Which cells of the frames show the background, which moves as the camera does; others show what moves by itself.
+    """Which cells of the frames show the background, which moves as the camera does; others show what moves by itself."""
 
-    Attributes:
-        instants: (S,) in order, in frames, S of 1 or more.
-        shown: (S, h, w) bool, the cells, of 8 px a side, that show the background at each instant.
-        filled: (S, h, w) bool, these cells, and those that show least of something else at places whose background is never
-            seen: every place is shown by some.
-        frame_shape: (height, width) of a frame.
-    """
-
-    instants: FloatArray
-    shown: BoolArray
+    instants: FloatArray  # (S,) in order, in frames, S of 1 or more
+    shown: BoolArray  # (S, h, w) bool, the cells, of 8 px a side, that show the background at each instant
+    # (S, h, w) bool, these cells, and those that show least of something else at places whose background is never seen: every
+    # place is shown by some
     filled: BoolArray
-    frame_shape: tuple[int, int]
+    frame_shape: tuple[int, int]  # (height, width) of a frame
 
     def cells(self, span: FrameSpan) -> BoolArray:
         """Return the cells that show the background at all instants in a span of frames, and at the ones next to it: (h, w)."""
