@@ -43,7 +43,7 @@ def _one_direction(run: TestedRun) -> Found | None:
     if weak < _ASLANT * strong:
         return None
     where = f"px between the frames before and after {halves.cuts[weakest]:.0f}, at {angle:.0f} degrees from x towards y"
-    return Found(weak, f"{where}; {strong:.2g} px across")
+    return Found(weak, f"{where}; {strong:.2g} px across it")
 
 
 @MOTION_TESTS.doubtful_above(
@@ -54,9 +54,9 @@ def _one_direction(run: TestedRun) -> Found | None:
 def _uncertain(run: TestedRun) -> Found | None:
     motion = run.explained.motion
     known = motion.std_px[motion.located]
-    # Where two motions are possible, no light tells which.
+    # Where two motions are possible, or a direction is not seen, no light tells which.
     alternatives = {RIVAL, UNCUT_JUMP} & {each.what for each in run.decisions}
-    if not len(known) or not np.isfinite(known).all() or alternatives:
+    if not len(known) or not np.isfinite(known).all() or alternatives or _one_direction.judged(run):
         return None
     worst = int(np.argmax(np.where(motion.located, motion.std_px, 0)))
     where, change_px = f"px on average, most at frame {worst}", run.levels[-1].change_px if run.levels else None
