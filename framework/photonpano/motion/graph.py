@@ -186,12 +186,11 @@ def _of_background(
     if not (likeliest.layered or contradicted):
         return tied, fits
     # A richer model may follow what is near, too, but then fits neither part: most patches agree with the right one.
+    # What a narrow planar model cannot follow need not move by itself: homographies tell.
     turning = {model: fit for model, fit in fits.items() if model.kind == "rotation"}
-    rivals = dict.fromkeys([likeliest, *([_likeliest(turning, tied.frame_shape)] if turning else [])])
-    telling = dict(fits)
-    if not turning:  # what a narrow model cannot follow need not move by itself
-        telling = _with_homographies(tied, start, fits)
-        rivals = dict.fromkeys(model for model in telling if model.kind == "homography") or rivals
+    telling = fits if turning else _with_homographies(tied, start, fits)
+    planar = [model for model in telling if model.kind == "homography"]
+    rivals = dict.fromkeys([likeliest, _likeliest(turning, tied.frame_shape)] if turning else planar)
     selected = {model: agreed for model in rivals if (agreed := _agreed(tied, model, telling[model]))}
     if not selected:
         return tied, fits

@@ -14,7 +14,7 @@ from photonpano.errors import PluginError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import thread_pool
 from photonpano.geometry import corner_displacements, corners, inverse, transform_points, translation
-from photonpano.motion.adjustment import std_of
+from photonpano.motion.adjustment import Assessment
 from photonpano.motion.closures import MIN_SIMILARITY, closure_candidates, exposure_similarity
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.exposure_tasks import Pair
@@ -55,20 +55,20 @@ class LocatedLevel:
     edges: tuple[Edge, ...]  # every pair that was tried, with its motion or the reason why there is none
     closures: tuple[Edge, ...]  # the candidates for loop closures among them, which stand at the end
     solution: GraphSolution  # one homography for each exposure
-    # (N, 8, 8) inverse covariances of p1..p8 of each located exposure while the others are held, or (N, 3, 3) of its rotation
-    # vector for a camera that only turns; None for a single exposure
-    information: FloatArray | None
-    errors_px: FloatArray  # (N, 8, S) errors of the corners of each located exposure that were drawn; NaN for a single one
-    shared_px: FloatArray  # (N, 8, S) the part of them that all exposures share, see `Assessment`
+    assessed: Assessment  # how well the located exposures are determined
     frame_shape: tuple[int, int]  # (height, width) of a frame
-    std_camera: FloatArray  # (5,) expected errors of the camera, see `Assessment`
     rivals: Mapping[str, Rival]  # how well models of the motion explain the pairs, by their names
     ambiguity: Ambiguity | None = None  # pairs that fit the scene at more than one place; None where there are none
 
     @property
     def std_px(self) -> FloatArray:
         """The expected error of the corners of each located exposure, (N,); NaN for a single one."""
-        return std_of(self.errors_px)
+        return self.assessed.std_px
+
+    @property
+    def information(self) -> FloatArray | None:
+        """That of the assessment; None for a single exposure."""
+        return self.assessed.information if len(self.assessed.information) > 1 else None
 
     @property
     def instants(self) -> FloatArray:
@@ -176,11 +176,8 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
         edges + closures,
         closures,
         solution,
-        assessed.information if len(assessed.errors_px) > 1 else None,
-        assessed.errors_px,
-        assessed.shared_px,
+        assessed,
         shape,
-        assessed.std_camera,
         rivals,
         _ambiguity(level.number, registrar.alternatives_px, edges, shape),
     )

@@ -175,7 +175,8 @@ def interpolate(
             knots = measured.moved(smooth * displaced + (1 - smooth) * np.eye(3))
             trajectory = _through(knots, exposures, located, timeline, reference, refined)
         # No interpolator smooths what all exposures share, such as the error of a focal length.
-        own_px, std_px, shared_px = located.errors_px - located.shared_px, located.std_px, std_of(located.shared_px)
+        std_px, shared_px = located.std_px, std_of(located.assessed.shared_px)
+        own_px = located.assessed.errors_px - located.assessed.shared_px
         if len(std_px) < _FEWEST_KNOTS:
             return Interpolated(trajectory, std_px, np.zeros(len(std_px)))
         products, here, known = np.zeros((2, len(std_px))), corners(located.frame_shape), trajectory.at(located.instants)

@@ -54,7 +54,8 @@ class Uncertainty:
         trajectory = interpolated.trajectory
         turned, before = located.solution.rotations, camera_of_motion(previous)
         # A single exposure tells nothing of its camera.
-        self.std_camera = located.std_camera if len(located.std_camera) else None
+        std_camera = located.assessed.std_camera
+        self.std_camera = std_camera if len(std_camera) else None
         if self.std_camera is not None and turned is not None and before is not None:
             change = turned.camera.numbers - before.numbers
             self.std_camera = np.hypot(self.std_camera, REMAINING_SHARE * change)

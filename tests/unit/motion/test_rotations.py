@@ -116,8 +116,7 @@ def test_interpolators_leave_the_error_of_the_focal_length(make_level: Callable,
     for focal_px in (FOCAL_PX, None):
         solution = solve(groups, edges, 20, SHAPE, model=MotionModel("rotation", focal_px=focal_px))
         assessed = solution.assess()
-        of_errors = assessed.information, assessed.errors_px, assessed.shared_px
-        located = LocatedLevel(groups, edges, (), solution, *of_errors, SHAPE, assessed.std_camera, {})
+        located = LocatedLevel(groups, edges, (), solution, assessed, SHAPE, {})
         variances.append(interpolate(exposures, located, Timeline.regular(n_frames), 200).std_px ** 2)
         shared.append(std_of(assessed.shared_px) ** 2)
     assert not shared[0].any()
