@@ -145,17 +145,17 @@ def solve(
 
 
 def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[MotionModel, _Fit]:
-    """Fit a model; for "auto", homographies, and rotations if perspective changes with the shift as for a camera that turns."""
+    """Fit a model; for "auto", homographies, and rotations if perspective follows the shift."""
     if model.kind != "auto":
         return {model: _fitted(tied, start, model)}
     fits: dict[MotionModel, _Fit] = {}
     # No plane holds all frames of a camera that turns far.
     with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
         plane = replace(model, kind="homography")
-        fit = _fitted(tied, start, plane)
-        if _in_front(fit.state.homographies, tied.frame_shape):
-            fits[plane] = fit
-            if isinstance(fit.adjustment, PlanarAdjustment) and not fit.adjustment.turning_px(fit.state):
+        free = _planar(tied, start, "homography")
+        if _in_front(free.homographies, tied.frame_shape):
+            fits[plane] = _nearer(tied, start, free)
+            if not free.adjustment.is_coupled:
                 return fits
     for rotation in model.rotations:
         if fits:
@@ -288,30 +288,40 @@ def _freed(tied: _Tied, model: MotionModel, fit: _Fit) -> Freed | None:
 
 def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel, fits: Sequence[_Fit] = ()) -> _Fit:
     """Fit a model; rotations through a lens begin with those without, if these are among the `fits`."""
-    problem, shape = tied.problem, tied.frame_shape
-    given = None if start is None else inverse(start[tied.anchor]) @ start[tied.located]
+    if model.kind != "rotation":
+        fit = _planar(tied, start, model.planar)
+        return _nearer(tied, start, fit) if model.planar == "homography" else fit
+    shape, given = tied.frame_shape, tied.given(start)
     adjustment = tied.adjustment(model)
-    if isinstance(adjustment, PlanarAdjustment):
-        fit = _planar(tied, given, model.planar)
-        if model.planar != "homography" or fit.adjustment.unknowns <= 3 * len(problem.instants):
-            return fit
-        # Along a long chain, homographies without walks may be too far from those with walks to be found from there.
-        still = _planar(tied, given, "euclidean")
-        return min((fit, still), key=lambda each: each.adjustment.deviance(each.state, fit.weights))
     state = next((fit.state for fit in fits if isinstance(fit.state, Rotations)), None)
     if state is None:
         camera = model.camera(shape)
         if model.focal_px is None and model.known is None:
             camera = adjustment.likeliest_camera(camera)
-        rotations = likely_rotations(camera, problem.observed if given is None else given, shape)
+        rotations = likely_rotations(camera, tied.problem.observed if given is None else given, shape)
         state = Rotations(tied.composed(rotations) if given is None else rotations, camera)
     return tied.fit(adjustment, state)
 
 
-def _planar(tied: _Tied, given: FloatArray | None, model: PlanarName) -> _Fit:
+def _planar(tied: _Tied, start: FloatArray | None, model: PlanarName) -> _Fit:
+    given = tied.given(start)
     found = nearest(model, tied.problem.observed if given is None else given, tied.frame_shape)
     adjustment = PlanarAdjustment(tied.problem, model)
     return tied.fit(adjustment, Plane(tied.composed(found) if given is None else found))
+
+
+def _nearer(tied: _Tied, start: FloatArray | None, fit: _Fit) -> _Fit:
+    """Return homographies, or shifts and rolls if those are likelier, or all that is left.
+
+    Along a long chain, homographies without walks may be too far from those with walks to be found from there; and where all
+    that they have is that perspective follows the shift, they are rotations.
+    """
+    if fit.adjustment.unknowns <= 3 * len(tied.problem.instants):
+        return fit
+    still = _planar(tied, start, "euclidean")
+    if not fit.adjustment.walks_px:
+        return still
+    return min((fit, still), key=lambda each: each.adjustment.deviance(each.state, fit.weights))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -385,6 +395,10 @@ class _Tied:
         return Problem(
             self.compact_pairs, anchor, self.motions, self.frame_shape, self.instants[self.located], spans, self.shown
         )
+
+    def given(self, start: FloatArray | None) -> FloatArray | None:
+        """Return the maps of the tied nodes to the anchor by a start: (L, 3, 3); None without one."""
+        return None if start is None else inverse(start[self.anchor]) @ start[self.located]
 
     def adjustment(self, model: MotionModel) -> PlanarAdjustment | RotationAdjustment:
         """Return the least-squares problem of a model."""

@@ -9,6 +9,7 @@ too, and the walk is what perspective does beyond it.
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -16,8 +17,8 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
 from photonpano.geometry import corners, generators, inverse, parameters, scaled_ahead, transform_points, unit_coordinates
-from photonpano.motion.adjustment import Adjustment, Prior, Problem, factorised
-from photonpano.values import FloatArray, Homography
+from photonpano.motion.adjustment import SAMPLES, Adjustment, Assessment, Prior, Problem, factorised
+from photonpano.values import BoolArray, FloatArray, Homography
 
 PlanarName = Literal["translation", "euclidean", "similarity", "affine", "homography"]
 
@@ -45,6 +46,7 @@ _FEWEST_STEPS = 3  # that tell how wide the walks are
 _ROUNDS, _MOST, _SETTLED = 12, 6.0, 0.1  # rounds; most change of the logarithm of a variance in one, and least that counts
 # By how much a walk must lower the deviance: as the prior of a number does whose square is twice its variance (Akaike 1974).
 _WORTH = 1 - float(np.log(2))
+_BEND = 1e-6  # coupling by whose effect its derivative is taken
 _DRAWS = 24  # by which the variances' degrees of freedom are estimated
 
 
@@ -158,11 +160,12 @@ class PlanarAdjustment(Adjustment[Plane]):
         variances: of the prior, in squares of unit coordinates: of each walk per frame, (w,), and then of the coupling.
     """
 
-    def __init__(self, problem: Problem, model: PlanarName) -> None:
-        """Set up the problem."""
-        self._problem, self._basis = problem, basis_of(model)
+    def __init__(self, problem: Problem, model: PlanarName, *, bends: bool = False) -> None:
+        """Set up the problem; `bends` has a model without perspective share the coupling, too."""
+        self._problem, self._model, self._basis = problem, model, basis_of(model)
         self._n_walks = max(self._basis.shape[1] - _FREE, 0)
-        super().__init__(problem, n_shared=int(model == "homography"))
+        self._bends = bends
+        super().__init__(problem, n_shared=int(model == "homography" or bends))
         # Nodes are in order of time; those of one instant make no step.
         self._times = np.maximum(np.diff(problem.instants), 1.0)
         self._durations = np.array([max(float(self._times.sum()), 1.0)] * self._n_walks + [1.0] * self._n_shared)
@@ -269,6 +272,49 @@ class PlanarAdjustment(Adjustment[Plane]):
         squares = [sparse.csr_array(part.slopes.T @ part.slopes) for part in parts]
         return _Around(jacobians.T @ jacobians, np.column_stack([jacobians.T @ residuals, drawn]), parts, squares, sides)
 
+    def assess(self, state: Plane, norms: FloatArray, kept: BoolArray) -> Assessment:
+        """Assess a solution; a model without perspective may miss that of a camera that turns, which bends a long path.
+
+        As many of the drawn errors as it is likely that perspective follows the shift (weights of Akaike) are those with it.
+        """
+        own = super().assess(state, norms, kept)
+        if self._n_shared:
+            return own
+        bent = PlanarAdjustment(self._problem, self._model, bends=True)
+        bent._noise_norm, bent.variances = self._noise_norm, np.append(self.variances, np.inf)
+        jacobians, residuals = bent._linearised(state, bent.weights(norms, kept))
+        free = bent._free(state)
+        normal, changes = (jacobians.T @ jacobians)[free][:, free], np.zeros((len(free), 2))
+        right = np.column_stack([-jacobians.T @ residuals, np.eye(len(free))[:, -1]])
+        changes[free] = factorised(normal).solve(right[free])
+        (coupling, variance), likely = changes[-1], bent.assess(state, norms, kept)
+        drawn = round(SAMPLES / (1 + float(np.exp(1 - coupling**2 / variance / 2))))
+        away = bent._corner_errors_px(state, changes[:, :1])
+        for mine, theirs in ((own.errors_px, likely.errors_px), (own.shared_px, likely.shared_px)):
+            mine[..., :drawn] = theirs[..., :drawn] + away
+        return own
+
+    def shared_slopes(self, state: Plane) -> FloatArray:
+        """Return the derivatives of the corners that each edge maps by the coupling, which the path follows."""
+        if not self._bends:
+            return super().shared_slopes(state)
+        there = self.mapped_corners(Plane(self._bent(state))) - self.mapped_corners(state)
+        return np.asarray(there.reshape(-1, 8, 1) / _BEND)
+
+    def shared_errors(self, state: Plane) -> FloatArray:
+        """Return the derivatives of the corners of each node's frame by the coupling."""
+        if not self._bends:
+            return super().shared_errors(state)
+        there = transform_points(inverse(state.homographies) @ self._bent(state), self._corners) - self._corners
+        return np.asarray(there.reshape(-1, 8, 1) / _BEND)
+
+    def _bent(self, state: Plane) -> Homography:
+        """Return the homographies of a path of the same shifts and rolls, along which perspective follows the shift."""
+        relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
+        perspective = _BEND * logarithms(relative, self._frame_shape)[:, 4:6]
+        steps = moved(relative, perspective, basis_of("homography")[:, -2:], self._frame_shape)
+        return np.stack(list(accumulate(steps, lambda before, step: scaled_ahead(before @ step), initial=np.eye(3))))
+
     def narrowed(self, state: Plane) -> tuple[PlanarAdjustment, Plane]:
         """Return the problem without walks that are none, and the nearest state that it holds."""
         there = self.variances > _NONE**2 / self._durations
@@ -280,10 +326,14 @@ class PlanarAdjustment(Adjustment[Plane]):
         narrow.variances, narrow._noise_norm = self.variances[: narrow._n_walks], self._noise_norm
         return narrow, Plane(nearest(model, state.homographies, self._frame_shape))
 
+    @property
+    def is_coupled(self) -> bool:
+        """Whether perspective follows the shift (Schwarz 1978), as that of a camera that turns, or has a lens."""
+        return bool(self._n_shared and self.variances[-1] > self._of_coupling * self.price)
+
     def turning_px(self, state: Plane) -> float | None:
-        """Return the focal length of a camera that turns; None unless perspective follows the shift (Schwarz 1978)."""
-        turns = self._n_shared and state.coupling < 0 and self.variances[-1] > self._of_coupling * self.price
-        return self._half / float(np.sqrt(-state.coupling)) if turns else None
+        """Return the focal length of a camera that turns; None unless perspective follows the shift."""
+        return self._half / float(np.sqrt(-state.coupling)) if self.is_coupled and state.coupling < 0 else None
 
     def _components(self, state: Plane) -> list[Prior]:
         """Return the steps of each walk beyond the coupling, over the roots of their times; and the coupling."""

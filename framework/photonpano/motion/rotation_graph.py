@@ -24,7 +24,8 @@ from photonpano.values import FloatArray
 _FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # tried first, in sides of a frame
 # Prior of the focal length, in sides of a frame, and the standard deviation of its logarithm.
 _PRIOR_FOCAL, _PRIOR_STD = 3.0, 2.0
-_PRIOR_DISTORTION = np.array([0.3, 0.3, 0.03, 0.03])  # prior standard deviations of k1, k2, p1 and p2, as lenses have them
+# Prior standard deviations of the shifts of a corner by k1, k2, p1 and p2, as shares of its distance from the middle.
+_PRIOR_DISTORTION = np.array([0.1, 0.1, 0.01, 0.01])
 _STEP = 1e-5  # step of numerical derivatives
 _MOST_TRIED = 400  # edges by which the first focal length is chosen
 # A rotation of a camera that turns by more, in radians, is another one seen from the other side: its vector cannot be scaled.
@@ -164,10 +165,10 @@ class RotationAdjustment(Adjustment[Rotations]):
     def prior(self, state: Rotations) -> Prior:
         """Return what is known before: a focal length of some sides of a frame, a small distortion, and where patches lie."""
         units = self._units(state.camera)
-        away = [_away(state.camera, index, 2 * self._half) for index in self._unknown]
+        away = np.array([_away(state.camera, index, 2 * self._half) for index in self._unknown])
         stds = np.array([_PRIOR_STD, *_PRIOR_DISTORTION])[list(self._unknown)]
-        known, of_known = np.asarray(away / stds), np.diag(units / stds)
-        log_variances = 2 * float(np.log(stds / units).sum())
+        known, of_known = away / units / stds, np.diag(1 / stds)
+        log_variances = 2 * float(np.log(stds).sum())
         if self._finds_lens:
             left = self._unexplained(state)
             of_left = np.stack([(self._unexplained(each) - left) / _STEP for each in self._nearby(state)], axis=-1)
