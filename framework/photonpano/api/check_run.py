@@ -14,9 +14,8 @@ from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.motion.timeline import REPEATED
 from photonpano.pipeline.obstacles import timeline_of
 from photonpano.plugins.registry import Catalog
-from photonpano.residuals.motion_tests import NARROW, REPEATS, contradictions
 from photonpano.residuals.refinement import MotionFit
-from photonpano.residuals.verdict import judge
+from photonpano.residuals.verdict import NARROW, REPEATS, judge
 from photonpano.values import Decision, Reason, Verdict
 
 
@@ -77,14 +76,6 @@ def check_run(
     reasons, unknown = list(verdict.reasons), []
     if not opened.has_std_px:
         unknown.append("trajectory.npz has no std_px, as it is of an older version: the expected error is not judged")
-    try:
-        last = record["levels"][-1]
-        pairs = len(last["contradictions"]), int(last["pairs"])
-    except (KeyError, IndexError, TypeError, ValueError):
-        unknown.append("run.json does not list contradicting pairs, as it is of an older version: they are not judged")
-    else:
-        if (reason := contradictions(*pairs)) is not None:
-            reasons.append(reason)
     recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
     reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NARROW)]
     judged = Verdict.of(reasons, verdict.residual_ratio, verdict.untested, verdict.notes)

@@ -155,7 +155,7 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
         free = _planar(tied, start, "homography")
         if _in_front(free.homographies, tied.frame_shape):
             fits[plane] = _nearer(tied, start, free)
-            if not free.adjustment.is_coupled:
+            if isinstance(free.adjustment, PlanarAdjustment) and not free.adjustment.is_coupled:
                 return fits
     for rotation in model.rotations:
         if fits:
@@ -292,7 +292,7 @@ def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel, fits: Seq
         fit = _planar(tied, start, model.planar)
         return _nearer(tied, start, fit) if model.planar == "homography" else fit
     shape, given = tied.frame_shape, tied.given(start)
-    adjustment = tied.adjustment(model)
+    adjustment = RotationAdjustment(tied.problem, model.seen_by(shape), model.unknown)
     state = next((fit.state for fit in fits if isinstance(fit.state, Rotations)), None)
     if state is None:
         camera = model.camera(shape)
@@ -319,7 +319,7 @@ def _nearer(tied: _Tied, start: FloatArray | None, fit: _Fit) -> _Fit:
     if fit.adjustment.unknowns <= 3 * len(tied.problem.instants):
         return fit
     still = _planar(tied, start, "euclidean")
-    if not fit.adjustment.walks_px:
+    if isinstance(fit.adjustment, PlanarAdjustment) and not fit.adjustment.walks_px:
         return still
     return min((fit, still), key=lambda each: each.adjustment.deviance(each.state, fit.weights))
 

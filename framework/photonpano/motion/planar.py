@@ -281,7 +281,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         if self._n_shared:
             return own
         bent = PlanarAdjustment(self._problem, self._model, bends=True)
-        bent._noise_norm, bent.variances = self._noise_norm, np.append(self.variances, np.inf)
+        bent._noise_norm, bent.variances = self._noise_norm, self.variances
         jacobians, residuals = bent._linearised(state, bent.weights(norms, kept))
         free = bent._free(state)
         normal, changes = (jacobians.T @ jacobians)[free][:, free], np.zeros((len(free), 2))
@@ -340,6 +340,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         n_steps, k, w = len(self._times), self._n_node, self._n_walks
         if not w:
             return []
+        perspective = self._model == "homography"
         relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
         motions = logarithms(relative, self._frame_shape)
         back = np.linalg.pinv(self._basis)[_FREE:]  # from p1..p8 to the walks
@@ -348,7 +349,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         by_nodes = np.stack([-back @ np.swapaxes(earlier, 1, 2), np.broadcast_to(back, (n_steps, w, 8))], axis=2) @ self._basis
         steps, roots = motions @ back.T, 1 / np.sqrt(self._times)
         by_coupling = np.zeros((n_steps, w))
-        if self._n_shared:
+        if perspective:
             by_coupling[:, _PERSPECTIVE] = -motions[:, 4:6]
             steps += state.coupling * by_coupling
             shifts = np.eye(8)[4:6]
@@ -363,7 +364,7 @@ class PlanarAdjustment(Adjustment[Plane]):
             if self._n_shared:
                 slopes = sparse.csr_array(sparse.hstack([slopes, sparse.csr_array(by_coupling[:, [walk]] * roots[:, None])]))
             parts.append(Prior(steps[:, walk] * roots, slopes))
-        if self._n_shared:
+        if perspective:
             parts.append(Prior(np.array([state.coupling]), self._of_shared(np.ones((1, 1)))))
         return parts
 

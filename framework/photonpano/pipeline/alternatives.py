@@ -13,11 +13,10 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import UNCUT_JUMP
 from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
-from photonpano.residuals.motion_tests import second_place_px
+from photonpano.residuals.causes import changing_places, distorting_lens
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.residual_tests import changing_places, distorting_lens
-from photonpano.residuals.scene_tests import MUCH, of_either_part
 from photonpano.residuals.tested_run import RIVAL, TestedRun
+from photonpano.residuals.verdict import MUCH, of_either_part, second_place_px
 from photonpano.values import Decision, FloatArray
 
 _MISFIT = 1.5  # reduced chi-square from which the motion does not explain a block of the sensor
@@ -30,13 +29,15 @@ def beside_alternatives(state: State, explained: Explained, decisions: Sequence[
     """Let the expected error of a motion contain the distance to others, where the frames do not tell which one is right.
 
     These are a motion that jumps where the image seems to, one that a lens does not bend, one along a second place of a scene
-    that repeats, and that of parts of the frame which the motion does not explain. Where such a part is large and its motion is
-    not found, the error is infinite: not known.
+    that repeats, homographies that are likelier than the model of the spec, and that of parts of the frame which the motion
+    does not explain. Where such a part is large and its motion is not found, the error is infinite: not known.
     """
     run = TestedRun(explained, state.results, decisions)
     n_frames, located = len(explained.motion.std_px), np.flatnonzero(explained.motion.located)
     jumps_px = sum(float(each.value) for each in decisions if each.what == UNCUT_JUMP)
-    explained = _apart(explained, np.full(n_frames, np.hypot(jumps_px, second_place_px(run))))
+    last = state.results[-1]
+    freer_px = last.located.rivals["homography"].apart_px if last.narrow else 0.0
+    explained = _apart(explained, np.full(n_frames, np.linalg.norm([jumps_px, second_place_px(run), freer_px])))
     if (lens := distorting_lens(explained)) is not None:
         frames = np.linspace(located[0], located[-1], len(lens.bend_px))
         explained = _apart(explained, np.interp(np.arange(n_frames), frames, abs(lens.k1) * lens.bend_px))

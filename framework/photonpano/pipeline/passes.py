@@ -33,9 +33,9 @@ from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.shots import ApartError, shots_of
 from photonpano.pipeline.state import State, within
 from photonpano.plugins.contributions import MergerContribution
+from photonpano.residuals.causes import changing_places
 from photonpano.residuals.cuts import SMALLEST_PX, find_cuts
 from photonpano.residuals.refinement import MotionFit
-from photonpano.residuals.residual_tests import changing_places
 from photonpano.specs.plan import Plan
 from photonpano.values import Background, Decision, Light
 

@@ -36,6 +36,7 @@ _MOST_PIXELS = 4e6  # of the canvas; a larger one is reduced
 _SAMPLED = 5  # frames of a block at which it is looked where they lie
 _SQUARE_PX = 16  # squares whose noise is independent, for each pixel by which pictures are smoothed
 _DARKEST = 1e-4  # least flux of which the noise is taken
+_INTERPOLATED = 0.001  # what coherence lacks by interpolation alone
 _ERRORS = 2.0  # standard errors that are taken off the information
 
 
@@ -58,6 +59,11 @@ class Halves:
         """Return those of a capture that is too short for a cut."""
         none = np.zeros(0)
         return cls(none, none, none, np.zeros((0, 2)), none)
+
+    @property
+    def disagreement(self) -> float:
+        """By how many standard errors coherence is below 1: the median over the cuts at which it is known."""
+        return float(np.nanmedian((1 - self.coherence) / np.hypot(self.std_coherence, _INTERPOLATED)))
 
     def tied_px(self, located: BoolArray) -> FloatArray:
         """Return how far frames may lie beside others that only a weak cut ties them to: (T,), given which are located.

@@ -25,23 +25,16 @@ class TestedRun:
     decisions: Sequence[Decision]
 
     @property
-    def pairs(self) -> tuple[int, int] | None:
-        """Number of contradicting pairs of the last level, and of all its pairs."""
-        if not self.levels:
-            return None
-        located = self.levels[-1].located
-        return len(located.solution.outliers), len(located.edges)
-
-    @property
     def freer_model(self) -> str:
         """What to do if a planar model that was written may hold less than the motion; "" for those that hold any."""
         kind = self.levels[-1].located.solution.model.kind if self.levels else "homography"
         return "" if kind in ("homography", "rotation") else f"{FREE}, as {kind} may hold less than the motion"
 
-    def decided(self, what: str, meaning: str = "") -> Found | None:
+    def decided(self, name: str, meaning: str = "", *, what: str = "", what_to_do: str = "") -> Found | None:
         """Return the figure of the last decision of a name, with its reason if no meaning is given; None if there is none."""
-        found = [each for each in self.decisions if each.what == what]
-        return Found(float(found[-1].value), meaning or found[-1].reason) if found else None
+        found = [each for each in self.decisions if each.what == name]
+        where = meaning or found[-1].reason if found else ""
+        return Found(float(found[-1].value), where, what=what, what_to_do=what_to_do) if found else None
 
 
 _Finder: TypeAlias = Callable[[TestedRun], Found | None]
@@ -50,11 +43,15 @@ _Finder: TypeAlias = Callable[[TestedRun], Found | None]
 class Tests(list[Test[TestedRun]]):
     """A table of tests; those that are added first are listed first."""
 
+    def __init__(self, *, decides: bool = True) -> None:
+        super().__init__()
+        self._decides = decides
+
     def doubtful_above(self, threshold: float, what: str, what_to_do: str) -> Callable[[_Finder], Test[TestedRun]]:
         """Add the decorated function as a test."""
 
         def added(find: _Finder) -> Test[TestedRun]:
-            self.append(Test(what, threshold, what_to_do, find))
+            self.append(Test(what, threshold, what_to_do, find, self._decides))
             return self[-1]
 
         return added

@@ -1,6 +1,7 @@
-"""The verdict on a run: a table of tests, each with a known rate of false alarms.
+"""The verdict on a run: whether motion and panorama explain the photons, as a table of tests judges.
 
-A test is a function under `Tests.doubtful_above`; `judge` makes a `Reason` of what it found if that exceeds the threshold.
+Few tests decide: the halves of the capture agree, the photons are as the panorama predicts, the motion is known to a pixel, no
+freer motion is likelier, and it is that of the scene. What else is found names the cause of a doubt, or is a note.
 """
 
 from __future__ import annotations
@@ -9,21 +10,251 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
-from photonpano.motion.loop import LevelResult
-from photonpano.residuals.motion_tests import MOTION_TESTS
-from photonpano.residuals.refinement import Explained
-from photonpano.residuals.residual_tests import RESIDUAL_TESTS
-from photonpano.residuals.scene_tests import SCENE_TESTS
-from photonpano.residuals.tested_run import TestedRun
+from photonpano.geometry import corners, transform_points
+from photonpano.motion.loop import TOO_NARROW, LevelResult
+from photonpano.motion.timeline import DARK_JUMP, SHOTS, UNCUT_JUMP
+from photonpano.residuals.block_sums import M, V
+from photonpano.residuals.causes import CAUSES, changing_places
+from photonpano.residuals.measure import FEWEST_FRAMES
+from photonpano.residuals.refinement import FEWEST_SPANS, Explained
+from photonpano.residuals.tested_run import FIND_LENS, FREE, RIVAL, TestedRun, Tests
 from photonpano.values import Decision, Verdict
-from photonpano.values.verdict import Test, judged
+from photonpano.values.verdict import Found, Test, judged
 
-TESTS: tuple[Test[TestedRun], ...] = (*SCENE_TESTS, *RESIDUAL_TESTS, *MOTION_TESTS)  # the most telling first
+NARROW = "the camera moves by more than the model of its motion holds"
+REPEATS = "the scene repeats, and pairs of exposures fit at several places"
+MUCH = 0.25  # share of the panorama that changes, beyond which what is left out may be the scene
+MAX_CONTRAST = 0.05  # up to this share of the light, what the panorama does not explain does not matter
+_UNCERTAIN_PX = 1.0
+_ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
+_AMBIGUOUS = 0.05  # share of the pairs of a level that fit at several places; one or two may be by their noise
+_STILL_PX = 1.0  # an image that moves by less over the capture stands still
+_SMOOTH_PX = 8.0  # standard deviation of the Gaussian that takes the light of the scene out of its image
+_FINE, _COARSE = (0.35, 0.5), (0.1, 0.17)  # cycles per pixel
+
+JUDGES = Tests()
 
 
 def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
     """Test the result of a run; `levels` are empty if they are not known, `decisions` hold the share that stands still."""
     figures = explained.ratio, float(explained.residuals.reduced_chi2.mean())
     ratio, reduced_chi2 = (each if np.isfinite(each) else None for each in figures)
-    return replace(judged(TESTS, TestedRun(explained, levels, decisions), ratio), reduced_chi2=reduced_chi2)
+    tests: tuple[Test[TestedRun], ...] = (*JUDGES, *CAUSES)
+    return replace(judged(tests, TestedRun(explained, levels, decisions), ratio), reduced_chi2=reduced_chi2)
+
+
+@JUDGES.doubtful_above(
+    1,
+    "the capture holds shots that no pair of exposures ties together, and the panorama is of the longest alone",
+    "look at the panoramas of the others beside the run folder: DIR.panorama-2 and so on",
+)
+def _shots(run: TestedRun) -> Found | None:
+    shots = next((str(each.value) for each in run.decisions if each.what == SHOTS), "")
+    return Found(shots.count("frame"), shots) if shots else None
+
+
+@JUDGES.doubtful_above(
+    0,
+    "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
+    "leave these frames out, or keep the light on",
+)
+def _jump_in_the_dark(run: TestedRun) -> Found:
+    found = [str(each.value) for each in run.decisions if each.what == DARK_JUMP]
+    return Found(len(found), ", ".join(found))
+
+
+@JUDGES.doubtful_above(
+    0,
+    "no test of the motion can be made, since the capture is too short",
+    "record more frames, or compare the panorama with what you know of the scene",
+)
+def _untested_motion(run: TestedRun) -> Found:
+    residuals, ratio = run.explained.residuals, run.explained.ratio
+    known = np.isfinite(ratio) or max(map(len, residuals.spans)) >= FEWEST_FRAMES
+    where = f"spans that are missing: the scatter of shifts needs {FEWEST_SPANS} spans, and {len(residuals.spans)} are there"
+    return Found(0 if known else max(FEWEST_SPANS - len(residuals.spans), 1), where)
+
+
+@JUDGES.doubtful_above(
+    10,
+    "the photons contradict the focal length or the lens that the spec gives",
+    "write camera: {focal_px: find}, and distortion: {k1: find} if the lens distorts, or calibrate the camera anew",
+)
+def _given_camera(run: TestedRun) -> Found | None:
+    freed = run.levels[-1].located.solution.freed() if run.levels else None
+    if freed is None:
+        return None
+    what, unit = [("a focal length", " px"), ("k1", "")][freed.number]
+    where = f"{what} of {freed.found:.4g} ± {freed.std:.2g}{unit} fits, {freed.given:.4g}{unit} is given; in expected errors"
+    return Found(abs(freed.found - freed.given) / freed.std, where)
+
+
+@JUDGES.doubtful_above(TOO_NARROW, NARROW, FREE)
+def _narrow(run: TestedRun) -> Found | None:
+    """Homographies are likelier, and farther away than the motion is expected to err."""
+    if not run.levels or not (times := run.levels[-1].narrow):
+        return None
+    located, motion = run.levels[-1].located, run.explained.motion
+    model = located.solution.model
+    apart_px = located.rivals["homography"].apart_px
+    where = f"times the expected error lie between {model.name} and any homographies, which are likelier: {apart_px:.2g} px"
+    finds = model.kind == "rotation" and not (motion.camera is not None and motion.camera.distorts)
+    what_to_do = f"{FREE}, or {FIND_LENS}" if finds else ""
+    return Found(times, where, what_to_do=what_to_do)
+
+
+@JUDGES.doubtful_above(
+    3.0,
+    "the frames before and after an instant do not agree along the motion that was found",
+    "look at the halves and the path in the report; the motion may be wrong, or the scene changes",
+)
+def _halves(run: TestedRun) -> Found | None:
+    halves = run.explained.halves
+    if not np.isfinite(halves.coherence).any():
+        return None
+    least = int(np.nanargmin(halves.coherence))
+    where = (
+        f"standard errors are missing to a coherence of 1, half of the time; least is {halves.coherence[least]:.3g}, at frame "
+    )
+    return Found(halves.disagreement, f"{where}{halves.cuts[least]:.0f}", what_to_do=run.freer_model)
+
+
+@JUDGES.doubtful_above(
+    1.1,
+    "the panorama does not explain the photons: they differ from its prediction by more than their noise",
+    "look at the maps of the report; the motion may be wrong, or the scene changes",
+)
+def _photons(run: TestedRun) -> Found | None:
+    residuals = run.explained.residuals
+    reduced_chi2 = float(residuals.reduced_chi2.mean())
+    sums = residuals.blocks.sum(axis=(0, 1))
+    per_span = sums / max(len(residuals.spans), 1)
+    n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
+    # The squared residual of a block beyond its variance, as a part of its photons.
+    contrast = float(np.sqrt(max(reduced_chi2 - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
+    return Found(reduced_chi2, f"on average by {contrast:.0%} of the light") if contrast > MAX_CONTRAST else None
+
+
+@JUDGES.doubtful_above(
+    _UNCERTAIN_PX,
+    "the expected error of the motion is large",
+    "use more light; where few pairs tie parts together, more of them (graph.skips, graph.tie)",
+)
+def _uncertain(run: TestedRun) -> Found | None:
+    """The motion is not known to a pixel: where two are possible, a direction is not seen, or there is too little light."""
+    motion, levels = run.explained.motion, run.levels
+    known = motion.std_px[motion.located]
+    if not len(known) or not np.isfinite(known).all():
+        alone = Found(0.0, "a single exposure was located", doubtful=True, what="no motion is known")
+        return None if of_either_part(run) else alone._replace(what_to_do="use smaller groups, or more light")
+    for found in (_two_motions(run), _uncut_jump(run), _ambiguous(run), _one_direction(run)):
+        if found is not None and found.figure > _UNCERTAIN_PX:
+            return found
+    where = f"px on average, most at frame {np.argmax(np.where(motion.located, motion.std_px, 0))}"
+    change_px = levels[-1].change_px if levels else None
+    if change_px is not None and change_px > _UNCERTAIN_PX:
+        where += f"; the last level changed the motion by {change_px:.2g} px"
+        return Found(float(known.mean()), where, what_to_do="let it converge: use smaller groups, or levels: until-converged")
+    return Found(float(known.mean()), where)
+
+
+def _two_motions(run: TestedRun) -> Found | None:
+    what = "parts of the frame follow another motion than the one that was found"
+    what_to_do = "mask what does not belong to the scene (corrections: mask); the motion may be that of either part"
+    return run.decided(RIVAL, what=what, what_to_do=what_to_do)
+
+
+def _uncut_jump(run: TestedRun) -> Found | None:
+    what = "the image seems to jump, but the photons contradict a cut of the motion there"
+    what_to_do = "look at the path in the report around this frame; use a slower motion, or smaller groups"
+    return run.decided(UNCUT_JUMP, what=what, what_to_do=what_to_do)
+
+
+def _ambiguous(run: TestedRun) -> Found | None:
+    for result in run.levels:
+        ambiguity, n_edges = result.located.ambiguity, len(result.located.edges)
+        if ambiguity is not None and len(ambiguity.pairs) > max(2, _AMBIGUOUS * n_edges):
+            where = f"px to the second place; {len(ambiguity.pairs)} of {n_edges} pairs of level {result.level.number}"
+            what_to_do = "look at the path in the report; a slower motion tells the places apart"
+            return Found(ambiguity.alternative_px, where, what=REPEATS, what_to_do=what_to_do)
+    return None
+
+
+def second_place_px(run: TestedRun) -> float:
+    """Return how far away the second place of a scene that repeats is, in px; 0 where pairs fit at one place."""
+    return 0.0 if (found := _ambiguous(run)) is None else found.figure
+
+
+def _one_direction(run: TestedRun) -> Found | None:
+    halves = run.explained.halves
+    if not len(halves.cuts):
+        return None
+    weakest = int(np.argmax(halves.std_px[:, 1]))
+    (strong, weak), angle = halves.std_px[weakest].tolist(), halves.angles_deg[weakest]
+    if weak < _ASLANT * strong:
+        return None
+    where = f"px between the frames before and after {halves.cuts[weakest]:.0f}, at {angle:.0f} degrees from x towards y"
+    what_to_do = (
+        "the motion may be wrong by any distance along it, which this panorama does not show; keep other structures in view"
+    )
+    what = "the image says nothing of motion along one direction"
+    return Found(weak, f"{where}; {strong:.2g} px across it", what=what, what_to_do=what_to_do)
+
+
+@JUDGES.doubtful_above(
+    0.5,
+    "the image stands still, and has the fine grain of a sensor whose pixels differ",
+    "divide by a flat field (corrections: flat-field); what was found to stand still may be the sensor, and not the scene",
+)
+def _grain(run: TestedRun) -> Found | None:
+    residuals, motion = run.explained.residuals, run.explained.motion
+    middle = corners(residuals.frame_shape).mean(axis=0)
+    places = transform_points(motion.homographies[motion.located], middle[None])[:, 0]
+    if np.ptp(places, axis=0).max() > _STILL_PX:
+        return None
+    # A lens blurs what it images, so that waves of two or three pixels are weak; the grain of pixels is white.
+    counts = np.nan_to_num(residuals.pixel_gain * residuals.pixel_mean)
+    image = counts / np.maximum(ndimage.gaussian_filter(counts, _SMOOTH_PX), 1e-9)
+    window = np.outer(*(np.hanning(size + 2)[1:-1] for size in image.shape))
+    power = np.abs(np.fft.rfft2(window * (image - np.average(image, weights=window)))) ** 2 / (window**2).sum()
+    sums = residuals.blocks[..., [V, M]].sum(axis=(0, 1))
+    noise = sums[0] / max(sums[1], 1e-9) / max(float(counts.mean()), 1e-9)
+    cycles = np.hypot(np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1]))
+    fine, coarse = (float(power[(low < cycles) & (cycles < high)].mean()) - noise for low, high in (_FINE, _COARSE))
+    return Found(max(fine, 0.0) / max(coarse, 1e-9), "power of waves of 2 to 3 px, relative to those of 6 to 10 px")
+
+
+@JUDGES.doubtful_above(
+    0.5,
+    "more than half of the frame stands still while the rest moves",
+    "mask what stands in the frame (corrections: mask); the motion may be that of either part",
+)
+def _standing(run: TestedRun) -> Found | None:
+    return run.decided("standing_share", "share of the parts that show motion or rest")
+
+
+@JUDGES.doubtful_above(
+    0.5,
+    "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
+    "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
+)
+def _layers(run: TestedRun) -> Found | None:
+    # Later levels leave out what is near.
+    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
+    where = "share of the frames that is left out, on average"
+    if parallax:
+        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
+    if (found := run.decided("movers", where)) is None:
+        return None
+    # Where little is left out, but much changes that is not, what is left out may be the scene.
+    changing_share, _ = changing_places(run.explained.residuals)
+    if min(found.figure, changing_share) <= MUCH:
+        return found
+    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
+
+
+def of_either_part(run: TestedRun) -> bool:
+    """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
+    return any(test.judged(run) for test in (_grain, _standing, _layers))

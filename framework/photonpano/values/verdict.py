@@ -76,25 +76,29 @@ class Verdict:
 class Found(NamedTuple):
     """Figure of a test and where it occurs.
 
-    `doubtful` overrides the threshold, `what_to_do` the advice of the test; `harmless` makes a note of a doubt. Where the test
-    could not be made, the figure is NaN, and `where` says why.
+    `doubtful` overrides the threshold, `what` and `what_to_do` the words of the test. Where the test could not be made, the
+    figure is NaN, and `where` says why.
     """
 
     figure: float
     where: str = ""
     doubtful: bool = False
-    harmless: bool = False
+    what: str = ""
     what_to_do: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Test(Generic[Facts]):
-    """A row of a table of tests: `find` returns what it found, or None where nothing is to be found."""
+    """A row of a table of tests: `find` returns what it found, or None where nothing is to be found.
+
+    One that does not decide names a cause of what others doubt; what it finds is a note where none does.
+    """
 
     what: str
     threshold: float
     what_to_do: str
     find: Callable[[Facts], Found | None]
+    decides: bool = True
 
     def untested(self, found: Found | None) -> str | None:
         """Return a clause on what was not tested, and why; None if it was."""
@@ -104,7 +108,8 @@ class Test(Generic[Facts]):
         """Judge what was found; None if it is trusted, or not known."""
         if found is None or not (found.doubtful or found.figure > self.threshold):
             return None
-        return Reason(self.what, found.figure, self.threshold, found.where, found.what_to_do or self.what_to_do)
+        words = found.what or self.what, found.what_to_do or self.what_to_do
+        return Reason(words[0], found.figure, self.threshold, found.where, words[1])
 
     def judged(self, facts: Facts) -> Reason | None:
         """Make the test; None if what it finds is trusted, or not known."""
@@ -114,8 +119,8 @@ class Test(Generic[Facts]):
 def judged(tests: Iterable[Test[Facts]], facts: Facts, residual_ratio: float | None, doubts: Iterable[Reason] = ()) -> Verdict:
     """Return the verdict of a table of tests, in its order, after the doubts that are there already."""
     found = [(test, test.find(facts)) for test in tests]
-    reasons = [(reason, each) for test, each in found if (reason := test.reason(each)) is not None]
+    reasons = [(test, reason) for test, each in found if (reason := test.reason(each)) is not None]
     untested = (clause for test, each in found if (clause := test.untested(each)) is not None)
-    notes = (reason for reason, each in reasons if each is not None and each.harmless)
-    doubted = (reason for reason, each in reasons if each is None or not each.harmless)
-    return Verdict.of((*doubts, *doubted), residual_ratio, untested, notes)
+    doubts = [*doubts, *(reason for test, reason in reasons if test.decides)]
+    others = [reason for test, reason in reasons if not test.decides]
+    return Verdict.of([*others, *doubts] if doubts else [], residual_ratio, untested, [] if doubts else others)

@@ -1,4 +1,4 @@
-"""Tests of the residuals: what the photons show that the motion and the panorama do not explain."""
+"""What may be wrong beside the motion: names for what the judges of a verdict doubt, and notes on a run that they trust."""
 
 from __future__ import annotations
 
@@ -12,41 +12,34 @@ from photonpano.residuals.tested_run import FIND_LENS, TestedRun, Tests
 from photonpano.values import BoolArray
 from photonpano.values.verdict import Found
 
-# Contrast of the residuals, as a share of the light, beyond which a large reduced chi-square counts.
-MAX_CONTRAST = 0.02
-# Up to these, what is found is a note: what a change of the light moves is less than photon noise does.
-_HARMLESS_CONTRAST, _HARMLESS_SHARE = 0.05, 0.1
-LEAST_K1 = 0.002  # radial distortion from which a run is doubtful
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
+_WITHOUT_LENS = "undistort the frames before, or use their middle only (corrections: crop)"
 
-RESIDUAL_TESTS = Tests()
+CAUSES = Tests(decides=False)
 
 
-@RESIDUAL_TESTS.doubtful_above(
-    0,
-    "no test of the motion can be made, since the capture is too short",
-    "record more frames, or compare the panorama with what you know of the scene",
+@CAUSES.doubtful_above(
+    0.35,
+    "the background of much of the panorama was never seen, as where one thing fills the middle of all frames",
+    "record so that each place is seen without what hides it; the motion may be that of what fills the frames",
 )
-def _untested_motion(run: TestedRun) -> Found:
-    residuals, ratio = run.explained.residuals, run.explained.ratio
-    known = np.isfinite(ratio) or max(map(len, residuals.spans)) >= FEWEST_FRAMES
-    where = f"spans that are missing: the scatter of shifts needs {FEWEST_SPANS} spans, and {len(residuals.spans)} are there"
-    return Found(0 if known else max(FEWEST_SPANS - len(residuals.spans), 1), where)
+def _never_seen(run: TestedRun) -> Found | None:
+    return run.decided("background_never_seen", "share of the panorama")
 
 
-@RESIDUAL_TESTS.doubtful_above(
+@CAUSES.doubtful_above(
     2.0,
     "the image moves within groups by more than the motion that was found",
     "use the refiner short-spans, or smaller groups (resample.with.group_size)",
 )
-def _fast_motion(run: TestedRun) -> Found:
+def _fast_motion(run: TestedRun) -> Found | None:
     if not np.isfinite(run.explained.ratio):
         return Found(np.nan, f"{len(run.explained.residuals.spans)} spans are too few: {FEWEST_SPANS} are needed")
     return Found(run.explained.ratio, "scatter of the shifts of short spans over their noise")
 
 
-@RESIDUAL_TESTS.doubtful_above(
+@CAUSES.doubtful_above(
     0.1,
     "frames shake faster than the motion that was found can follow",
     "use the refiner short-spans; if it was used, the photons do not carry this motion: use more light, or damp what shakes",
@@ -68,7 +61,7 @@ def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
     return float(changing.sum() / max(counted.sum(), 1)), changing
 
 
-@RESIDUAL_TESTS.doubtful_above(
+@CAUSES.doubtful_above(
     0.03,
     "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
     "mask what moves (corrections: mask), or divide by a flat field if the corners are dark (corrections: flat-field); the "
@@ -78,10 +71,17 @@ def _moving(run: TestedRun) -> Found | None:
     if run.explained.residuals.cell_count.max(initial=0) < _MIN_BLOCKS:
         return Found(np.nan, f"no place was seen {_MIN_BLOCKS} times")
     share, changing = changing_places(run.explained.residuals)
-    return Found(share, _box(changing, "px of the panorama"), harmless=share <= _HARMLESS_SHARE) if share else None
+    return Found(share, _box(changing, "px of the panorama")) if share else None
 
 
-@RESIDUAL_TESTS.doubtful_above(
+def _box(cells: BoolArray, unit: str) -> str:
+    y, x = np.nonzero(cells)
+    low, high = (int(np.quantile(y, q) * BLOCK_PX) for q in (0.05, 0.95))
+    left, right = (int(np.quantile(x, q) * BLOCK_PX) for q in (0.05, 0.95))
+    return f"mostly x {left} to {right + BLOCK_PX}, y {low} to {high + BLOCK_PX} in {unit}"
+
+
+@CAUSES.doubtful_above(
     0.03,
     "the light changes over time",
     "write light: auto if the spec says that it is steady; otherwise keep it steady, or shorten the capture",
@@ -94,7 +94,7 @@ def _light(run: TestedRun) -> Found:
     return Found(change, f"most at {residuals.spans[int(np.argmax(np.abs(gains) / np.maximum(stds, 1e-9)))]}")
 
 
-@RESIDUAL_TESTS.doubtful_above(
+@CAUSES.doubtful_above(
     0.03,
     "parts of the sensor count more or fewer photons than others, as with a vignette, dirt or a window in front of it",
     "mask these pixels (corrections: mask), or divide by a flat field (corrections: flat-field)",
@@ -111,7 +111,7 @@ def _sensor(run: TestedRun) -> Found | None:
     return Found(change, f"most at pixel ({x}, {y}) of the frame")
 
 
-@RESIDUAL_TESTS.doubtful_above(
+@CAUSES.doubtful_above(
     0.005,
     "single pixels count far more, or far fewer, photons than the panorama predicts",
     "mask them (corrections: hot-pixels)",
@@ -124,9 +124,6 @@ def _hot_pixels(run: TestedRun) -> Found:
     return Found(float(outlier.sum() / max(known.sum(), 1)), f"{int(outlier.sum())} pixels")
 
 
-_WITHOUT_LENS = "undistort the frames before, or use their middle only (corrections: crop)"
-
-
 def distorting_lens(explained: Explained) -> LensDistortion | None:
     """Return the distortion that the residuals of a run show; None if it is not significant."""
     residuals, motion = explained.residuals, explained.motion
@@ -136,9 +133,8 @@ def distorting_lens(explained: Explained) -> LensDistortion | None:
     return None if found is None or found.sigmas <= 5 * misfit else found
 
 
-@RESIDUAL_TESTS.doubtful_above(
-    # Half of this is seen without a lens; even a small distortion bends a long path.
-    LEAST_K1,
+@CAUSES.doubtful_above(
+    0.002,  # half of this is seen without a lens
     "the lens distorts the frames, which bends the motion",
     f"write motion: {{model: rotation}} and {FIND_LENS} for a camera that only turns; or {_WITHOUT_LENS}",
 )
@@ -153,7 +149,7 @@ def _lens(run: TestedRun) -> Found | None:
     return Found(abs(found.k1), f"about {found.k1:.1%} at the corners", what_to_do=what_to_do)
 
 
-@RESIDUAL_TESTS.doubtful_above(
+@CAUSES.doubtful_above(
     0.05,
     "frames are deformed as no motion of the whole frame explains",
     "look at the arrows in the report; correct the lens or the rolling shutter before",
@@ -163,26 +159,13 @@ def _deformation(run: TestedRun) -> Found | None:
     return None if size is None else Found(size, "px, over the frame", what_to_do=run.freer_model)
 
 
-# After those that name a cause.
-@RESIDUAL_TESTS.doubtful_above(
-    1.1,
-    "the panorama does not explain the photons: they differ from its prediction by more than their noise",
-    "look at the maps of the report; the motion may be wrong, or the scene changes",
+@CAUSES.doubtful_above(
+    0.1,
+    "pairs of exposures contradict each other, as where a scene repeats",
+    "look at the path in the report; use a slower motion, or smaller groups",
 )
-def _photons(run: TestedRun) -> Found | None:
-    residuals = run.explained.residuals
-    reduced_chi2 = float(residuals.reduced_chi2.mean())
-    sums = residuals.blocks.sum(axis=(0, 1))
-    per_span = sums / max(len(residuals.spans), 1)
-    n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
-    # The squared residual of a block beyond its variance, as a part of its photons.
-    contrast = float(np.sqrt(max(reduced_chi2 - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
-    where, harmless = f"on average by {contrast:.0%} of the light", contrast <= _HARMLESS_CONTRAST
-    return Found(reduced_chi2, where, harmless=harmless) if contrast > MAX_CONTRAST else None
-
-
-def _box(cells: BoolArray, unit: str) -> str:
-    y, x = np.nonzero(cells)
-    low, high = (int(np.quantile(y, q) * BLOCK_PX) for q in (0.05, 0.95))
-    left, right = (int(np.quantile(x, q) * BLOCK_PX) for q in (0.05, 0.95))
-    return f"mostly x {left} to {right + BLOCK_PX}, y {low} to {high + BLOCK_PX} in {unit}"
+def _contradictions(run: TestedRun) -> Found | None:
+    if not run.levels:
+        return None
+    dropped, pairs = len(run.levels[-1].located.solution.outliers), len(run.levels[-1].located.edges)
+    return Found(dropped / max(pairs, 1), f"{dropped} of {pairs} pairs of the last level")
