@@ -19,7 +19,7 @@ from photonpano.evaluation.comparison import motion_difference, on_canvas
 from photonpano.geometry import Canvas, translation
 from photonpano.pipeline.run import RunResult
 from photonpano.reading.npy import unpacked
-from photonpano.residuals.motion_tests import REPEATS
+from photonpano.residuals.verdict import REPEATS
 
 
 @pytest.fixture

@@ -11,11 +11,10 @@ from photonpano.residuals.verdict import judge
 from photonpano.values import Decision
 
 
-@pytest.mark.parametrize(("what", "most"), [("movers", 0.5), ("background_never_seen", 0.35)])
-def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained, what: str, most: float) -> None:
+def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained) -> None:
     """A thing that fills the middle of all frames passes for the scene, and what is seen beside it for what hides that."""
-    found = [judge(explained, (), [Decision(what, share, "")]).reasons for share in (most - 0.02, most + 0.02)]
-    assert [[reason.figure for reason in reasons] for reasons in found] == [[], [most + 0.02]]
+    found = [judge(explained, (), [Decision("movers", share, "")]).reasons for share in (0.48, 0.52)]
+    assert [[reason.figure for reason in reasons] for reasons in found] == [[], [0.52]]
 
 
 def test_a_third_that_is_left_out_may_be_the_scene_if_as_much_of_the_rest_changes(explained: Explained) -> None:

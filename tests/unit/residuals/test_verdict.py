@@ -13,16 +13,16 @@ from photonpano.geometry import Camera
 from photonpano.motion.graph import Freed, Rival
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.model import SAME_LENS_PX, MotionModel
-from photonpano.motion.timeline import DARK_JUMP, INTERLACED, SHUFFLED, UNCUT_JUMP
+from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
+from photonpano.residuals import tested_run
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
 from photonpano.residuals.halves import Halves
 from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals
-from photonpano.residuals.motion_tests import NARROW, contradictions
 from photonpano.residuals.refinement import Explained, residual_ratio
 from photonpano.residuals.shaking import Shaking
 from photonpano.residuals.tested_run import RIVAL
-from photonpano.residuals.verdict import TESTS, judge
+from photonpano.residuals.verdict import NARROW, judge, second_place_px
 from photonpano.values import Ambiguity, Decision, Edge, Located, Reason
 
 SHAPE, N_SPANS, SPAN = (128, 192), 200, 10
@@ -84,14 +84,6 @@ def left_of_radial(shape: tuple[int, ...]) -> float:
     ("change", "what", "figure", "where"),
     [
         pytest.param(
-            # 2 variances of 100 photons beyond the noise: sqrt(200) of 100 photons.
-            lambda found: {"reduced_chi2": found.reduced_chi2 + 2},
-            "the panorama does not explain the photons",
-            pytest.approx(3, abs=0.05),
-            "on average by 14% of the light",
-            id="reduced chi-square",
-        ),
-        pytest.param(
             lambda found: squares(found, cell_chi2=9),
             "parts of the panorama change over time",
             pytest.approx(48 / 300),
@@ -135,17 +127,28 @@ def left_of_radial(shape: tuple[int, ...]) -> float:
         ),
     ],
 )
-def test_residuals_beyond_noise_are_the_only_reason(
+def test_what_residuals_show_is_a_note_and_the_cause_of_a_doubt(
     explained: Explained, change: Callable[[Residuals], Made], what: str, figure: Any, where: str
 ) -> None:
     found = replace(explained, residuals=replace(explained.residuals, **change(explained.residuals)))
     verdict = judge(found, ())
-    assert verdict.status == "doubtful"
-    [reason] = verdict.reasons
-    assert reason.what.startswith(what)
-    assert (reason.figure, reason.where) == (figure, where)
-    assert reason.figure > reason.threshold
-    assert reason.what_to_do
+    assert (verdict.status, verdict.reasons) == ("trusted", ())
+    [note] = verdict.notes
+    assert note.what.startswith(what)
+    assert (note.figure, note.where) == (figure, where)
+    assert note.figure > note.threshold
+    assert note.what_to_do
+    doubted = judge(replace(found, motion=replace(found.motion, std_px=found.motion.std_px + 3)), ())
+    assert [reason.what for reason in doubted.reasons] == [note.what, "the expected error of the motion is large"]
+    assert (doubted.status, doubted.notes) == ("doubtful", ())
+
+
+def test_photons_that_the_panorama_does_not_explain_are_doubtful(explained: Explained) -> None:
+    """2 variances of 100 photons beyond the noise are sqrt(200) of 100 photons."""
+    residuals = replace(explained.residuals, reduced_chi2=explained.residuals.reduced_chi2 + 2)
+    [reason] = judge(replace(explained, residuals=residuals), ()).reasons
+    assert reason.what.startswith("the panorama does not explain the photons")
+    assert (reason.figure, reason.where) == (pytest.approx(3, abs=0.05), "on average by 14% of the light")
 
 
 @pytest.mark.parametrize(
@@ -167,12 +170,12 @@ def test_residuals_beyond_noise_are_the_only_reason(
 )
 def test_residuals_like_noise_are_trusted(explained: Explained, change: Callable[[Residuals], Made]) -> None:
     verdict = judge(replace(explained, residuals=replace(explained.residuals, **change(explained.residuals))), ())
-    assert (verdict.status, verdict.reasons, verdict.residual_ratio) == ("trusted", (), 1.05)
+    assert (verdict.status, verdict.reasons, verdict.notes, verdict.residual_ratio) == ("trusted", (), (), 1.05)
 
 
-def test_scatter_of_shifts_beyond_noise_is_doubtful_and_an_unknown_one_is_not(explained: Explained) -> None:
-    [reason] = judge(replace(explained, ratio=24.0), ()).reasons
-    assert (reason.what, reason.figure) == ("the image moves within groups by more than the motion that was found", 24)
+def test_scatter_of_shifts_beyond_noise_is_a_note_and_an_unknown_one_is_not(explained: Explained) -> None:
+    [note] = judge(replace(explained, ratio=24.0), ()).notes
+    assert (note.what, note.figure) == ("the image moves within groups by more than the motion that was found", 24)
     verdict = judge(replace(explained, ratio=float("nan")), ())
     assert (verdict.status, verdict.residual_ratio) == ("trusted", None)
 
@@ -288,7 +291,7 @@ def test_advice_is_not_what_the_run_does_already(
     explained: Explained, monkeypatch: pytest.MonkeyPatch, camera: Camera | None, lens: str, turn: str
 ) -> None:
     monkeypatch.setattr(
-        "photonpano.residuals.residual_tests.distorting_lens", lambda _: LensDistortion(-0.1, 0.005, np.zeros((1, 2)))
+        "photonpano.residuals.causes.distorting_lens", lambda _: LensDistortion(-0.1, 0.005, np.zeros((1, 2)))
     )
     rivals = {"homography": Rival(1.0, 232, 0.0, 9.0), "rotation": Rival(25.0, 88, 3.0)}
     run = replace(explained, motion=replace(explained.motion, camera=camera))
@@ -296,16 +299,23 @@ def test_advice_is_not_what_the_run_does_already(
     assert found == {"the lens distorts the frames, which bends the motion": lens, NARROW: turn}
 
 
-def test_little_that_changes_or_differs_is_a_note(explained: Explained) -> None:
-    residuals = explained.residuals
-    cells = residuals.cell_chi2.copy()
-    cells[2:6, 10:16] = 9
-    found = replace(residuals, cell_chi2=cells, reduced_chi2=residuals.reduced_chi2 + 0.2)
-    verdict = judge(replace(explained, residuals=found), ())
-    assert (verdict.status, verdict.reasons) == ("trusted", ())
-    moving, photons = verdict.notes
-    assert photons.finding.endswith("than their noise (on average by 4% of the light): 1.2")
-    assert moving.finding.endswith("(mostly x 160 to 256, y 32 to 96 in px of the panorama): 0.08")
+def test_photons_that_differ_by_little_light_are_trusted(explained: Explained) -> None:
+    """0.2 variances of 100 photons are 4 % of the light."""
+    residuals = replace(explained.residuals, reduced_chi2=explained.residuals.reduced_chi2 + 0.2)
+    assert judge(replace(explained, residuals=residuals), ()).status == "trusted"
+
+
+@pytest.mark.parametrize(("lacks", "doubtful"), [(2.5, False), (3.5, True)])
+def test_halves_that_do_not_agree_for_half_of_the_time_are_doubtful(
+    explained: Explained, lacks: float, doubtful: bool
+) -> None:
+    """One cut is far off, as where something passes; the median counts. Cuts that show too little say nothing."""
+    stds = np.array([0.01, 0.004, 0.01, np.nan])
+    coherence = 1 - np.hypot(stds, 0.001) * [lacks, 20.0, 0.0, np.nan]
+    halves = Halves(np.array([500.0, 1000.0, 1500.0, 1900.0]), coherence, stds, np.full((4, 2), 0.1), np.zeros(4))
+    verdict = judge(replace(explained, halves=halves), ())
+    assert [reason.figure for reason in verdict.reasons] == [pytest.approx(lacks)] * doubtful
+    assert all("least is 0.918, before frame 1000" in reason.where for reason in verdict.reasons)
 
 
 def test_things_that_pass_the_background_tell_how_far_the_camera_travels(explained: Explained) -> None:
@@ -336,14 +346,18 @@ def test_motion_along_an_edge_is_doubtful(explained: Explained, angle: int, alon
     """Across one of two cuts, the photons tell of the motion across the edge to 0.1 px, and little of that along it."""
     cuts, one = np.array([500.0, 1500.0]), np.ones(2)
     halves = Halves(cuts, one, 0.01 * one, np.array([[0.05, 0.06], [0.1, along]]), np.array([12.0, angle]))
-    reasons = judge(replace(explained, halves=halves), []).reasons
+    motion = replace(explained.motion, std_px=np.hypot(explained.motion.std_px, along))
+    reasons = judge(replace(explained, halves=halves, motion=motion), []).reasons
     assert [reason.figure for reason in reasons] == [pytest.approx(along)] * doubtful
     assert all(f"frames before and after 1500, at {angle} degrees" in reason.where for reason in reasons)
 
 
-@pytest.mark.parametrize(("n_pairs", "where"), [(2, []), (3, ["3 of 30 pairs of level 1, 40 px away"])])
+@pytest.mark.parametrize(("n_pairs", "where"), [(2, []), (3, ["px to the second place; 3 of 30 pairs of level 1"])])
 def test_level_is_ambiguous_from_three_pairs_on(explained: Explained, n_pairs: int, where: list[str]) -> None:
-    assert [reason.where for reason in judge(explained, [level_with(n_ambiguous=n_pairs)]).reasons] == where
+    levels = [level_with(n_ambiguous=n_pairs)]
+    assert second_place_px(tested_run.TestedRun(explained, levels, ())) == 40 * len(where)
+    uncertain = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + 40 * len(where)))
+    assert [reason.where for reason in judge(uncertain, levels).reasons] == where
 
 
 @pytest.mark.parametrize(
@@ -358,21 +372,10 @@ def test_error_of_motion_that_has_not_converged_is_not_for_want_of_light(
     assert ("changed the motion by 6.4 px" in reason.where) == (change_px == 6.4)
 
 
-def test_contradicting_pairs_are_doubtful_above_a_tenth() -> None:
-    assert contradictions(10, 100) is None
-    reason = contradictions(11, 100)
-    assert reason is not None
-    assert reason.where == "11 of 100 pairs of the last level"
-
-
 @pytest.mark.parametrize(
     ("decisions", "figure", "where"),
     [
         ([Decision("standing_share", 0.6, "")], 0.6, "share of the parts that show motion or rest"),
-        ([Decision(RIVAL, 40.0, "px between both")], 40, "px between both"),
-        ([Decision(UNCUT_JUMP, 5.0, "px before frame 3")], 5, "px before frame 3"),
-        ([Decision(INTERLACED, 0.7, "")], 0.7, "share of the image in which they differ"),
-        ([Decision(SHUFFLED, 0.2, "")], 0.2, "share of the width of a frame, the median of the jumps"),
         (
             [Decision(DARK_JUMP, "frames 3 to 5", ""), Decision(DARK_JUMP, "frames 9 to 12", "")],
             2,
@@ -386,13 +389,14 @@ def test_decisions_are_doubtful(explained: Explained, decisions: list[Decision],
     assert not judge(explained, (), [Decision("standing_share", 0.4, "")]).reasons
 
 
-def test_several_reasons_are_listed_in_the_order_of_the_table(explained: Explained) -> None:
-    residuals = replace(
-        explained.residuals, pixel_gain=explained.residuals.pixel_gain + 7, reduced_chi2=explained.residuals.reduced_chi2 + 2
-    )
-    found = [reason.what for reason in judge(replace(explained, residuals=residuals, ratio=5.0), ()).reasons]
-    assert [what.split()[0] for what in found] == ["the", "single", "the"]
-    assert found == [test.what for test in TESTS if test.what in found]
+@pytest.mark.parametrize("decision", [Decision(RIVAL, 40.0, "px between both"), Decision(UNCUT_JUMP, 5.0, "px before frame 3")])
+def test_why_the_motion_is_not_known_is_named(explained: Explained, decision: Decision) -> None:
+    """Their distances are in the expected errors."""
+    assert not judge(explained, (), [replace(decision, value=0.5)]).reasons
+    uncertain = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + float(decision.value)))
+    [reason] = judge(uncertain, (), [decision]).reasons
+    assert (reason.figure, reason.where) == (decision.value, decision.reason)
+    assert reason.what != "the expected error of the motion is large"
 
 
 def test_reason_is_a_sentence() -> None:
