@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion
 from photonpano.geometry import (
@@ -19,7 +18,6 @@ from photonpano.geometry import (
     normalised,
     rotation_matrices,
     rotation_vectors,
-    transform_points,
 )
 from photonpano.merging.canvas_plan import View
 from photonpano.motion.loop import LevelResult
@@ -27,8 +25,6 @@ from photonpano.values import BoolArray, FloatArray, FrameSpan, Homography, Stre
 
 _REACH = 3.0  # instants up to this many standard deviations away count
 _MOST_INSTANTS = 400
-_SMOOTH_FRAMES = 65  # over which the motion is averaged, to see frames jump back and forth beside it
-_BACK, _ALONG = 0.25, 4.0  # share of the frames that go backwards, and ratio of what they move along and across the motion
 _NEAR = 0.5  # a frame counts if its corners have more than this part of the depth of the instant's; others look elsewhere
 
 
@@ -80,28 +76,6 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     trajectory = FrameTrajectory(homographies)
     camera = camera_of_motion(last.trajectory)
     return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, camera, remaining_px)
-
-
-def frames_displaced(motion: FrameMotion) -> float:
-    """Return by how many frames on average frames seem to be out of order; 0 if they are not.
-
-    Shuffled frames jump back and forth along the motion only: tremor has other directions, too.
-    """
-    if len(motion.span) < 2 * _SMOOTH_FRAMES:
-        return 0.0
-    middle = corners(motion.frame_shape).mean(axis=0)[None]
-    path = transform_points(motion.homographies[motion.span.start : motion.span.stop], middle)[:, 0]
-    smooth = uniform_filter1d(path, _SMOOTH_FRAMES, axis=0, mode="nearest")
-    inner = slice(_SMOOTH_FRAMES // 2, -_SMOOTH_FRAMES // 2)
-    velocity, beside = np.gradient(smooth, axis=0)[inner], (path - smooth)[inner]
-    speed = np.linalg.norm(velocity, axis=1)
-    x, y = (velocity / np.maximum(speed, 1e-9)[:, None]).T
-    turned = beside[:, 0] * x + beside[:, 1] * y, beside[:, 0] * y - beside[:, 1] * x
-    along, across = (float(np.sqrt(np.mean(each**2))) for each in turned)
-    back = float(np.mean((np.diff(path, axis=0, prepend=path[:1])[inner] * velocity).sum(axis=1) < 0))
-    displaced = along / max(float(np.median(speed)), 1e-9)
-    noise_px = float(np.median(motion.std_px[motion.located]))
-    return displaced if back >= _BACK and displaced >= 1 and along >= max(_ALONG * across, 2 * noise_px) else 0.0
 
 
 def smooth_view(motion: FrameMotion, instant: float, std: float) -> Homography:

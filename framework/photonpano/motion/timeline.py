@@ -17,7 +17,6 @@ from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, Group
 # Names of decisions in a record.
 CUT, DARK_FRAMES, DARK_JUMP, REPEATED = "cut", "dark_frames", "jump_in_the_dark", "repeated_frames"
 SHOTS, UNCUT_JUMP = "shots", "uncut_jump"
-INTERLACED, SHUFFLED = "interlaced", "shuffled"
 # Frames of the shortest part of a group that is kept beside a cut.
 _SHORTEST_PART = 4
 

@@ -18,7 +18,7 @@ from photonpano.execution.context import Context
 from photonpano.locating.phase import correlation_peaks
 from photonpano.merging import binned_mean, binning_of
 from photonpano.merging.accumulate import weights_of
-from photonpano.motion.timeline import INTERLACED, SHUFFLED, Timeline
+from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking.spans import DARK
 from photonpano.reading import other_order, sampled_spans
 from photonpano.robust import robust_std
@@ -71,19 +71,8 @@ def naming_obstacles(source: Source, decisions: Sequence[Decision]) -> Iterator[
 
 
 def obstacles(source: Source, decisions: Sequence[Decision]) -> list[str]:
-    """Return sentences about what makes a capture hard to locate; `decisions` hold what is known of it."""
-    return [*_out_of_order(decisions), *_standing(decisions), *_repeating(source)]
-
-
-def _out_of_order(decisions: Sequence[Decision]) -> Iterator[str]:
-    found = {each.what: each.value for each in decisions}
-    if INTERLACED in found:
-        yield "Odd and even frames show two different images, as where two captures are interlaced: write each to its own file."
-    if SHUFFLED in found:
-        yield (
-            f"From one frame to the next, the image jumps back and forth by {float(found[SHUFFLED]):.0%} of the width of a "
-            "frame, as where frames are out of order: sort them by the time at which they were taken."
-        )
+    """Return sentences about what makes a capture hard to locate; `decisions` hold the share of the frame that stands still."""
+    return [*_standing(decisions), *_repeating(source)]
 
 
 def _standing(decisions: Sequence[Decision]) -> Iterator[str]:

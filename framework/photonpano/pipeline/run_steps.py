@@ -22,7 +22,6 @@ from photonpano.motion.loop import LevelResult
 from photonpano.pipeline.checkpoints.fingerprint import finished_run, run_fingerprint
 from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, work_folder
 from photonpano.pipeline.components import open_source
-from photonpano.pipeline.frame_order import interlaced, shuffled
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.obstacles import order_warning
 from photonpano.pipeline.run_folder import RunFolder, run_folder
@@ -122,7 +121,7 @@ def first_decisions(plan: Plan, source: Source) -> list[Decision]:
     """Return what was decided while the capture was opened; warn if its pixels seem to be in another order."""
     if warning := order_warning(source):
         logger.warning(warning)
-    return [*plan.decisions, *capture_of(source).decisions, *(interlaced(source) or shuffled(source))]
+    return [*plan.decisions, *capture_of(source).decisions]
 
 
 def failure_path(directory: Path) -> Path:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from photonpano.motion.frame_motion import FrameMotion, frames_displaced
+from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import Timeline
 from photonpano.record.schema import DecisionRecord
@@ -93,24 +93,13 @@ def timeline_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
 
 
 def motion_warnings(motion: FrameMotion, timeline: Timeline | None = None) -> list[str]:
-    """Warn of frames whose motion is uncertain, that seem to be out of order, or that show the scene and are left out."""
-    warnings = [*uncertain_frames(motion), *_out_of_order(motion)]
+    """Warn of frames whose motion is uncertain, or that show the scene and are left out."""
+    warnings = uncertain_frames(motion)
     lost = ~motion.located if timeline is None else ~motion.located & timeline.shown
     if lost.any():
         n_left_out, n_frames = int(np.sum(lost)), len(lost)
         warnings.append(f"{n_left_out} of {n_frames} frames lie outside the located exposures and are left out")
     return warnings
-
-
-def _out_of_order(motion: FrameMotion) -> list[str]:
-    displaced = frames_displaced(motion)
-    if not displaced:
-        return []
-    return [
-        f"the image jumps back and forth along its motion, and hardly across it: frames seem to be out of order, by "
-        f"{displaced:.2g} frames on average, unless the camera vibrates along its motion. Sort them by the time at which they "
-        "were taken"
-    ]
 
 
 def uncertain_frames(motion: FrameMotion) -> list[str]:

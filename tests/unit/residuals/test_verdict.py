@@ -290,9 +290,7 @@ WITHOUT_LENS = "or undistort the frames before, or use their middle only (correc
 def test_advice_is_not_what_the_run_does_already(
     explained: Explained, monkeypatch: pytest.MonkeyPatch, camera: Camera | None, lens: str, turn: str
 ) -> None:
-    monkeypatch.setattr(
-        "photonpano.residuals.causes.distorting_lens", lambda _: LensDistortion(-0.1, 0.005, np.zeros((1, 2)))
-    )
+    monkeypatch.setattr("photonpano.residuals.causes.distorting_lens", lambda _: LensDistortion(-0.1, 0.005, np.zeros((1, 2))))
     rivals = {"homography": Rival(1.0, 232, 0.0, 9.0), "rotation": Rival(25.0, 88, 3.0)}
     run = replace(explained, motion=replace(explained.motion, camera=camera))
     found = {reason.what: reason.what_to_do for reason in judge(run, [level_with(object(), rivals)]).reasons}
@@ -306,9 +304,7 @@ def test_photons_that_differ_by_little_light_are_trusted(explained: Explained) -
 
 
 @pytest.mark.parametrize(("lacks", "doubtful"), [(2.5, False), (3.5, True)])
-def test_halves_that_do_not_agree_for_half_of_the_time_are_doubtful(
-    explained: Explained, lacks: float, doubtful: bool
-) -> None:
+def test_halves_that_do_not_agree_for_half_of_the_time_are_doubtful(explained: Explained, lacks: float, doubtful: bool) -> None:
     """One cut is far off, as where something passes; the median counts. Cuts that show too little say nothing."""
     stds = np.array([0.01, 0.004, 0.01, np.nan])
     coherence = 1 - np.hypot(stds, 0.001) * [lacks, 20.0, 0.0, np.nan]

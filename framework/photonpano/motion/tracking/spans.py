@@ -52,8 +52,8 @@ def spectra_of(images: Sequence[FluxImage] | FluxImage, weight: FluxImage | None
 
 
 def shifts_between(moving: Spectrum, fixed: Spectrum, shape: tuple[int, ...]) -> list[FloatArray | None]:
-    """Return the shift (x, y) of each pair of spectra, in binned pixels; None without texture. The longer list is cut off."""
-    pairs = zip(moving, fixed, strict=False)
+    """Return the shift (x, y) of each pair of spectra, in binned pixels; None without texture."""
+    pairs = zip(moving, fixed, strict=True)
     return [shift_of_spectra(before, after, shape, PEAK_PX, gaussian_peak=False) for before, after in pairs]
 
 

@@ -1,4 +1,4 @@
-"""Captures whose frames occur twice, are interlaced with others, or are too few: what a run says of them."""
+"""Captures whose frames occur twice, or are too few: what a run says of them."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -33,12 +33,6 @@ def test_capture_in_which_each_frame_occurs_twice_is_trusted_with_a_warning(run_
     assert result.verdict.status == "trusted"
     assert result.record["warnings"][0].startswith("160 of 320 frames are copies of the frame before")
     assert check_run(result.directory, Quiet()).verdict.status == "trusted"
-
-
-def test_capture_that_is_interlaced_with_another_is_doubtful(run_of: Callable[..., RunResult]) -> None:
-    """The other one shows the scene upside down."""
-    result = run_of(lambda frames: np.where(np.arange(160)[:, None, None] % 2 == 1, frames[:, ::-1], frames))
-    assert result.verdict.reasons[0].what.startswith("odd and even frames show two different images")
 
 
 def test_run_of_20_frames_is_doubtful_and_lists_what_was_not_tested(run_of: Callable[..., RunResult]) -> None:
