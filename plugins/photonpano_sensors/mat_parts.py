@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
-from photonpano.reading import BinarySource, FrameLayout, look_first, objections, read_json, require_readable
-from photonpano_sensors.looks import spread
-from photonpano_sensors.matlab import MatFrames, is_hdf
+from photonpano.reading import BinarySource, FrameLayout, objections, read_json, require_readable
+from photonpano_sensors.matlab import MatFrames
 
 _NAME = re.compile(r"part_([1-9][0-9]*)\.mat")
 _INFO = "info.json"
@@ -43,7 +42,6 @@ class MatPartsSource(BinarySource):
 
     def __init__(self, config: MatPartsConfig) -> None:
         self._paths = _parts(config.path)
-        look_first(spread([path for path in self._paths if is_hdf(path)]), "photonpano_sensors.looks:matlab")
         shapes = [MatFrames(path).shape for path in self._paths]
         for path, shape in zip(self._paths, shapes, strict=True):
             if shape[1:] != shapes[0][1:]:

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from photonpano import Bayer, Config, InputError, Recognised, Requirement, SourceContribution, SpecPath, StreamInfo
 from photonpano.photometry import BinarySumResponse
-from photonpano.reading import SingleFrameSource, look_first, missing_file, read_start, reading
+from photonpano.reading import SingleFrameSource, missing_file, read_start, reading
 
 _SUFFIX = ".ubi.h5"
 _HDF = b"\x89HDF\r\n\x1a\n"
@@ -39,7 +39,6 @@ class UbiceptSource(SingleFrameSource):
         import h5py
 
         self._path = config.path
-        look_first(self._path, "photonpano_sensors.looks:ubicept")
         with reading(self._path, _DAMAGED):
             self._file = h5py.File(self._path)
         try:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano import InputError
 from photonpano.photometry import srgb_to_linear
-from photonpano.reading import look_first, read_picture
+from photonpano.reading import read_picture
 from photonpano_simulator.config import Lamp, NightScene, PhotoScene, StreetScene
 from photonpano_simulator.drawing import Drawing, pictures_of, read_scene
 
@@ -110,7 +110,6 @@ def photograph(path: Path, width: int | None = None, in_colour: bool = False) ->
     Raises an `InputError` if the file is no image of 8 or 16 bits, or it is too large.
     """
     otherwise = "is not an image that OpenCV reads; save it as PNG or JPEG"
-    look_first(path, "cv2:imread")
     image = read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path} holds {image.dtype} values; a photograph has 8 or 16 bits: save it as PNG")

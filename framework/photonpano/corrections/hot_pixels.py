@@ -12,7 +12,7 @@ from photonpano.corrections.dark import DARK_FILE, read_dark
 from photonpano.corrections.pixels import Correction
 from photonpano.errors import InputError
 from photonpano.plugins.contributions import FrameRange, SpecPath
-from photonpano.reading import look_first, read_array, read_picture
+from photonpano.reading import read_array, read_picture
 from photonpano.robust import robust_std
 from photonpano.values import FrameSpan
 
@@ -198,5 +198,4 @@ def _read_picture(path: Path, otherwise: str) -> BoolArray:
     """Return which pixels of a picture of 8 or 16 bits are not black: (H, W)."""
     import cv2
 
-    look_first(path, "cv2:imread")
     return np.asarray(read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH).any(axis=-1))

@@ -17,7 +17,6 @@ from .files import reading as reading
 from .files import require_readable as require_readable
 from .files import require_there as require_there
 from .files import size_of as size_of
-from .first_look import look_first as look_first
 from .guessed_layout import Content as Content
 from .guessed_layout import frames_are_last as frames_are_last
 from .guessed_layout import packed_frames_are_last as packed_frames_are_last

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from photonpano.errors import InputError
 from photonpano.reading.files import reading
-from photonpano.reading.first_look import look_first
 from photonpano.values import Bayer
 
 COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "clear": (255, 255, 255)}
@@ -95,7 +94,6 @@ def read_filter_array(path: Path) -> NDArray[np.int8]:
     if path.suffix.lower() == ".png":
         import cv2
 
-        look_first(path, "cv2:imread")
         picture = read_picture(path, f"is not {_WHAT}: it is no picture that can be read", cv2.IMREAD_COLOR)
         pattern = np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
     else:

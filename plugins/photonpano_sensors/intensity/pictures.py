@@ -14,10 +14,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from photonpano import FrameSpan, InputError
-from photonpano.reading import look_first, read_picture, reading, require_readable
+from photonpano.reading import read_picture, reading, require_readable
 from photonpano_sensors.intensity.contributions import ImageFolderConfig, pictures_in
 from photonpano_sensors.intensity.source import Encoding, IntensitySource, Levels
-from photonpano_sensors.looks import spread
 
 Image = NDArray[np.generic]
 
@@ -64,7 +63,6 @@ class _Folder:
         if not self._files:
             raise InputError(f"{path} holds no .png or .tif files; name the folder that the frames are in")
         self.n_frames = len(self._files)
-        look_first(spread([file for file in self._files if not _is_png(file)]), "photonpano_sensors.looks:tiff_picture")
         self.form = _common((f"{file}", _form_of(file)) for file in self._files)
 
     def read(self, index: int) -> Image:
@@ -84,7 +82,6 @@ class _Pages:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = Lock()
-        look_first(path, "photonpano_sensors.looks:tiff")
         self._file = _tiff(path)
         try:
             with reading(path, _DAMAGED):

@@ -15,7 +15,7 @@ from av.video.format import VideoFormat
 from numpy.typing import NDArray
 
 from photonpano import InputError
-from photonpano.reading import look_first, missing_file, reading
+from photonpano.reading import missing_file, reading
 from photonpano_sensors.intensity.contributions import refuse_mdat
 from photonpano_sensors.intensity.source import Encoding
 
@@ -47,7 +47,6 @@ class VideoIndex:
 def index_of(path: Path) -> VideoIndex:
     """Read the packets of the first video stream of a file; raises an `InputError` if it is no video, or ends early."""
     refuse_mdat(path)
-    look_first(path, "photonpano_sensors.looks:video")
     with reading(path, _DAMAGED), opened(path) as container:
         stream = container.streams.video[0]
         context = stream.codec_context

@@ -362,5 +362,5 @@ CASES: dict[str, Arrange] = {
     "image-folder without pixels": files({"1.png": png_of(0, 0)}),
     "image-folder of 48 GiB": files({"1.png": png_of(200_000, 250_000)}),
     "image-folder with pages of two sizes": pages(SMALL, LARGE),
-    "image-folder with a page of 48 GiB": pages(FRAMES[0], ImageWidth=250_000, ImageLength=200_000, RowsPerStrip=200_000),
+    "image-folder with a page of 48 GiB": pages(SMALL, ImageWidth=250_000, ImageLength=200_000, RowsPerStrip=200_000),
 }

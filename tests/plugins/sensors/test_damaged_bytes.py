@@ -41,13 +41,6 @@ JSON = st.recursive(
 few = settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-@pytest.fixture(autouse=True)
-def no_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read files without a first look, which takes longer than all else here."""
-    for module in ("ubicept", "intensity.pictures", "intensity.video_index"):
-        monkeypatch.setattr(f"photonpano_sensors.{module}.look_first", lambda *_: None)
-
-
 def read(name: str, path: Path) -> str:
     """Read some frames, and return the sentence that refuses the capture; empty if nothing is found to be wrong."""
     contribution = CATALOG.find("source", name).contribution
