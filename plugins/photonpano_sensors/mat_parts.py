@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
 from photonpano.reading import BinarySource, FrameLayout, objections, read_json, require_readable
-from photonpano_sensors.matlab import MatFrames
+from photonpano_sensors.matlab import packed_frames, shape_of_frames
 
 _NAME = re.compile(r"part_([1-9][0-9]*)\.mat")
 _INFO = "info.json"
@@ -42,7 +42,7 @@ class MatPartsSource(BinarySource):
 
     def __init__(self, config: MatPartsConfig) -> None:
         self._paths = _parts(config.path)
-        shapes = [MatFrames(path).shape for path in self._paths]
+        shapes = [shape_of_frames(path) for path in self._paths]
         for path, shape in zip(self._paths, shapes, strict=True):
             if shape[1:] != shapes[0][1:]:
                 raise InputError(
@@ -60,7 +60,7 @@ class MatPartsSource(BinarySource):
         _, height, width = shapes[0]
         super().__init__(self._starts[-1], FrameLayout((height, width), (height, -(-width // 8))), config.frame_rate_hz)
         self._lock = Lock()
-        self._packed = lru_cache(_MOST_PARTS)(lambda path: MatFrames(path).packed())
+        self._packed = lru_cache(_MOST_PARTS)(packed_frames)
 
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Yield the frames of a span, one part after the other: see `BinarySource`."""

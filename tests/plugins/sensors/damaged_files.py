@@ -292,6 +292,7 @@ CASES: dict[str, Arrange] = {
     "mat-parts compressed and cut short": mat(cut=-20),
     "mat-parts without the variable": mat({"OTHER": 1}),
     "mat-parts of four dimensions": mat({"OUTPUT": np.zeros((2, 2, 2, 2))}),
+    "mat-parts of complex numbers": mat({"OUTPUT": last(FRAMES) * 1j}),
     "mat-parts of two sizes": mat({"OUTPUT": np.zeros((4, 5, 6))}),
     "mat-parts that are not binary": mat({"OUTPUT": np.full((10, 16, 6), 2)}),
     "visionsim without a height": visionsim(h=0),

@@ -108,14 +108,13 @@ def test_visionsim_raises_input_error_on_random_bytes(folder: Path, changes: dic
 
 
 @few
-@given(changes=CHANGES, info=st.none() | JSON, compressed=st.booleans())
-def test_mat_parts_raises_input_error_on_random_bytes(
-    folder: Path, changes: dict[int, int], info: Any, compressed: bool
-) -> None:
+@given(kept=st.integers(0, 20_000), info=st.none() | JSON, compressed=st.booleans())
+def test_mat_parts_raises_input_error_on_truncated_file(folder: Path, kept: int, info: Any, compressed: bool) -> None:
+    """Other bytes are not changed: scipy may end the process for some of these."""
     parts = folder / "parts"
     parts.mkdir(exist_ok=True)
     content = (folder / ("compressed.mat" if compressed else "whole.mat")).read_bytes()
-    (parts / "part_1.mat").write_bytes(changed(content, changes))
+    (parts / "part_1.mat").write_bytes(content[: kept % len(content)])
     (parts / "info.json").unlink(missing_ok=True)
     if info is not None:
         (parts / "info.json").write_text(json.dumps(info))
