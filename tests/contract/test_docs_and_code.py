@@ -17,7 +17,7 @@ from photonpano import discover
 from photonpano.api.cli.app import commands
 from photonpano.corrections import CORRECTIONS
 from photonpano.plugins import hookspecs
-from photonpano.residuals import pose_verdict, residual_tests, verdict
+from photonpano.residuals import causes, pose_verdict, verdict
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
@@ -57,10 +57,8 @@ def test_promises_page_names_tests_that_exist():
 def test_trust_page_shows_thresholds_of_verdict():
     page = (ROOT / "docs" / "explanation" / "trust.md").read_text(encoding="utf-8")
     shown = re.findall(r"^\|[^|]+\|[^|]+\| ([\d.]+) \|$", page, re.MULTILINE)
-    # One row for a motion that is not known and for one that is uncertain.
-    limits = [test.threshold for test in verdict.TESTS if test.what != "no motion is known"]
-    assert shown == [f"{limit:g}" for limit in limits]
-    assert f"more than {100 * residual_tests.MAX_CONTRAST:g} % of the light" in page
+    assert shown == [f"{test.threshold:g}" for test in (*verdict.JUDGES, *causes.CAUSES)]
+    assert f"more than {100 * verdict.MAX_CONTRAST:g} % of the light" in page
 
 
 def test_poses_page_shows_thresholds_of_verdict():
