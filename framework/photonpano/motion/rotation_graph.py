@@ -24,10 +24,10 @@ from photonpano.values import FloatArray
 _FOCAL_LENGTHS = np.geomspace(0.2, 100, 49)  # tried first, in sides of a frame
 # Prior of the focal length, in sides of a frame, and the standard deviation of its logarithm.
 _PRIOR_FOCAL, _PRIOR_STD = 3.0, 2.0
-# Prior standard deviations of how k1, k2, p1 and p2 move a corner, in half diagonals, with which they are fitted; and scales
-# of their priors as lenses have them, by which models are compared. These are those of Cauchy: what bends the frames of a long
-# focal length as much as those of a short one is large in these numbers.
-_PRIOR_BENDS, _SCALES = np.array([0.1, 0.1, 0.01, 0.01]), np.array([0.3, 0.3, 0.03, 0.03])
+_PRIOR_DISTORTION = np.array([0.3, 0.3, 0.03, 0.03])  # prior standard deviations of k1, k2, p1 and p2, as lenses have them
+# That of the shift of a corner by k1, in half diagonals, with which it is fitted: of a long focal length, small ones are large
+# numbers. Models are compared by a prior of Cauchy, to which these are hardly less likely.
+_PRIOR_BEND = 0.1
 _STEP = 1e-5  # step of numerical derivatives
 _MOST_TRIED = 400  # edges by which the first focal length is chosen
 # A rotation of a camera that turns by more, in radians, is another one seen from the other side: its vector cannot be scaled.
@@ -162,23 +162,21 @@ class RotationAdjustment(Adjustment[Rotations]):
         """
         before = float((self._lens.unexplained() ** 2).sum()) if self._finds_lens else 0.0
         units = 2 * (self._n_nodes - 1) * float(np.log(state.camera.focal_px / self._half))
-        return super().deviance(state, weights) - before + units + self._as_lenses_are(state.camera)
-
-    def _as_lenses_are(self, camera: Camera) -> float:
-        """Return by how much the deviance grows with the priors of lenses, in place of those of the fit."""
-        lens = np.array([index - 1 for index in self._unknown if index], dtype=int)
-        distortion, stds = camera.distortion[lens], (_PRIOR_BENDS * self._all_units(camera)[1:])[lens]
-        fitted = (distortion / stds) ** 2 + 2 * np.log(stds)
-        cauchy = 2 * np.log1p((distortion / _SCALES[lens]) ** 2) + 2 * np.log(_SCALES[lens]) + np.log(np.pi / 2)
-        return float((cauchy - fitted).sum())
+        found = super().deviance(state, weights) - before + units
+        if 1 not in self._unknown:
+            return found
+        k1, scale = float(state.camera.distortion[0]), float(_PRIOR_DISTORTION[0])
+        std = _PRIOR_BEND * float(self._units(state.camera)[self._unknown.index(1)])
+        return found + float(2 * np.log1p((k1 / scale) ** 2) - (k1 / std) ** 2 + 2 * np.log(scale / std) + np.log(np.pi / 2))
 
     def prior(self, state: Rotations) -> Prior:
         """Return what is known before: a focal length of some sides of a frame, a small distortion, and where patches lie."""
         units = self._units(state.camera)
         away = np.array([_away(state.camera, index, 2 * self._half) for index in self._unknown])
-        stds = np.array([_PRIOR_STD, *_PRIOR_BENDS])[list(self._unknown)]
-        known, of_known = away / units / stds, np.diag(1 / stds)
-        log_variances = 2 * float(np.log(stds).sum())
+        stds = np.array([_PRIOR_STD, *_PRIOR_DISTORTION])[list(self._unknown)]
+        stds = np.where(np.array(self._unknown) == 1, _PRIOR_BEND * units, stds)
+        known, of_known = away / stds, np.diag(units / stds)
+        log_variances = 2 * float(np.log(stds / units).sum())
         if self._finds_lens:
             left = self._unexplained(state)
             of_left = np.stack([(self._unexplained(each) - left) / _STEP for each in self._nearby(state)], axis=-1)
@@ -187,11 +185,8 @@ class RotationAdjustment(Adjustment[Rotations]):
 
     def _units(self, camera: Camera) -> FloatArray:
         """Return the change of each unknown that moves the ends of a frame by about half its side."""
-        return self._all_units(camera)[list(self._unknown)]
-
-    def _all_units(self, camera: Camera) -> FloatArray:
         end = float(np.hypot(*self._frame_shape)) / 2 / camera.focal_px
-        return np.array([1.0, end**-2, end**-4, end**-1, end**-1])
+        return np.array([1.0, end**-2, end**-4, end**-1, end**-1])[list(self._unknown)]
 
     def std_camera(self, state: Rotations, shared: FloatArray) -> FloatArray:
         """Return the expected errors of the focal length, in px, and of k1, k2, p1 and p2: (5,), 0 for what is given."""
