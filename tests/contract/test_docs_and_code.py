@@ -57,7 +57,7 @@ def test_promises_page_names_tests_that_exist():
 def test_trust_page_shows_thresholds_of_verdict():
     page = (ROOT / "docs" / "explanation" / "trust.md").read_text(encoding="utf-8")
     shown = re.findall(r"^\|[^|]+\|[^|]+\| ([\d.]+) \|$", page, re.MULTILINE)
-    assert shown == [f"{test.threshold:g}" for test in (*verdict.JUDGES, *causes.CAUSES)]
+    assert shown == [f"{test.threshold:g}" for test in (*verdict.FACTS, *verdict.AGREEMENT, *causes.CAUSES)]
     assert f"more than {100 * verdict.MAX_CONTRAST:g} % of the light" in page
 
 

@@ -154,8 +154,11 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
         plane = replace(model, kind="homography")
         free = _planar(tied, start, "homography")
         if _in_front(free.homographies, tied.frame_shape):
-            fits[plane] = _nearer(tied, start, free)
-            if isinstance(free.adjustment, PlanarAdjustment) and not free.adjustment.is_coupled:
+            assert isinstance(free.adjustment, PlanarAdjustment)
+            # Where all that is left of homographies is that perspective follows the shift, they are rotations.
+            still = free.adjustment.is_coupled and not free.adjustment.walks_px
+            fits[plane] = _planar(tied, start, "euclidean") if still else _nearer(tied, start, free)
+            if not free.adjustment.is_coupled:
                 return fits
     for rotation in model.rotations:
         if fits:
@@ -311,17 +314,13 @@ def _planar(tied: _Tied, start: FloatArray | None, model: PlanarName) -> _Fit:
 
 
 def _nearer(tied: _Tied, start: FloatArray | None, fit: _Fit) -> _Fit:
-    """Return homographies, or shifts and rolls if those are likelier, or all that is left.
+    """Return homographies, or shifts and rolls if those are likelier.
 
-    Along a long chain, homographies without walks may be too far from those with walks to be found from there; and where all
-    that they have is that perspective follows the shift, they are rotations.
+    Along a long chain, homographies without walks may be too far from those with walks to be found from there.
     """
     if fit.adjustment.unknowns <= 3 * len(tied.problem.instants):
         return fit
-    still = _planar(tied, start, "euclidean")
-    if isinstance(fit.adjustment, PlanarAdjustment) and not fit.adjustment.walks_px:
-        return still
-    return min((fit, still), key=lambda each: each.adjustment.deviance(each.state, fit.weights))
+    return min((fit, _planar(tied, start, "euclidean")), key=lambda each: each.adjustment.deviance(each.state, fit.weights))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -446,12 +445,15 @@ class _Tied:
         adjustment, found = fit.adjustment, fit.state
         homographies = np.full((len(self.located), 3, 3), np.nan)
         homographies[self.located] = fit.homographies
+        assess = adjustment.assess
+        if isinstance(adjustment, PlanarAdjustment) and model.planar == "homography":
+            assess = adjustment.assess_beside_turns
         return GraphSolution(
             homographies,
             self.located,
             tuple(int(position) for position in self.positions[~fit.kept]),
             float(np.sqrt(np.mean(adjustment.residuals_px(found)[fit.kept] ** 2))),
-            partial(adjustment.assess, found, fit.norms, fit.kept),
+            partial(assess, found, fit.norms, fit.kept),
             model,
             found if isinstance(found, Rotations) else None,
             adjustment.walks_px if isinstance(adjustment, PlanarAdjustment) else {},

@@ -272,16 +272,16 @@ class PlanarAdjustment(Adjustment[Plane]):
         squares = [sparse.csr_array(part.slopes.T @ part.slopes) for part in parts]
         return _Around(jacobians.T @ jacobians, np.column_stack([jacobians.T @ residuals, drawn]), parts, squares, sides)
 
-    def assess(self, state: Plane, norms: FloatArray, kept: BoolArray) -> Assessment:
-        """Assess a solution; a model without perspective may miss that of a camera that turns, which bends a long path.
+    def assess_beside_turns(self, state: Plane, norms: FloatArray, kept: BoolArray) -> Assessment:
+        """Assess a solution whose perspective may have been missed: that of a camera that turns bends a long path.
 
         As many of the drawn errors as it is likely that perspective follows the shift (weights of Akaike) are those with it.
         """
-        own = super().assess(state, norms, kept)
+        own = self.assess(state, norms, kept)
         if self._n_shared:
             return own
         bent = PlanarAdjustment(self._problem, self._model, bends=True)
-        bent._noise_norm, bent.variances = self._noise_norm, self.variances
+        bent._noise_norm, bent.variances = self._noise_norm, np.append(self.variances, 1.0)
         jacobians, residuals = bent._linearised(state, bent.weights(norms, kept))
         free = bent._free(state)
         normal, changes = (jacobians.T @ jacobians)[free][:, free], np.zeros((len(free), 2))
@@ -338,7 +338,7 @@ class PlanarAdjustment(Adjustment[Plane]):
     def _components(self, state: Plane) -> list[Prior]:
         """Return the steps of each walk beyond the coupling, over the roots of their times; and the coupling."""
         n_steps, k, w = len(self._times), self._n_node, self._n_walks
-        if not w:
+        if not w and not self._n_shared:
             return []
         perspective = self._model == "homography"
         relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
@@ -364,7 +364,7 @@ class PlanarAdjustment(Adjustment[Plane]):
             if self._n_shared:
                 slopes = sparse.csr_array(sparse.hstack([slopes, sparse.csr_array(by_coupling[:, [walk]] * roots[:, None])]))
             parts.append(Prior(steps[:, walk] * roots, slopes))
-        if perspective:
+        if self._n_shared:
             parts.append(Prior(np.array([state.coupling]), self._of_shared(np.ones((1, 1)))))
         return parts
 

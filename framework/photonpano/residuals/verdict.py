@@ -34,18 +34,17 @@ _STILL_PX = 1.0  # an image that moves by less over the capture stands still
 _SMOOTH_PX = 8.0  # standard deviation of the Gaussian that takes the light of the scene out of its image
 _FINE, _COARSE = (0.35, 0.5), (0.1, 0.17)  # cycles per pixel
 
-JUDGES = Tests()
+FACTS, AGREEMENT = Tests(), Tests()
 
 
 def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
     """Test the result of a run; `levels` are empty if they are not known, `decisions` hold the share that stands still."""
     figures = explained.ratio, float(explained.residuals.reduced_chi2.mean())
     ratio, reduced_chi2 = (each if np.isfinite(each) else None for each in figures)
-    tests: tuple[Test[TestedRun], ...] = (*JUDGES, *CAUSES)
-    return replace(judged(tests, TestedRun(explained, levels, decisions), ratio), reduced_chi2=reduced_chi2)
+    return replace(judged(TESTS, TestedRun(explained, levels, decisions), ratio), reduced_chi2=reduced_chi2)
 
 
-@JUDGES.doubtful_above(
+@FACTS.doubtful_above(
     1,
     "the capture holds shots that no pair of exposures ties together, and the panorama is of the longest alone",
     "look at the panoramas of the others beside the run folder: DIR.panorama-2 and so on",
@@ -55,7 +54,7 @@ def _shots(run: TestedRun) -> Found | None:
     return Found(shots.count("frame"), shots) if shots else None
 
 
-@JUDGES.doubtful_above(
+@FACTS.doubtful_above(
     0,
     "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
     "leave these frames out, or keep the light on",
@@ -65,7 +64,7 @@ def _jump_in_the_dark(run: TestedRun) -> Found:
     return Found(len(found), ", ".join(found))
 
 
-@JUDGES.doubtful_above(
+@FACTS.doubtful_above(
     0,
     "no test of the motion can be made, since the capture is too short",
     "record more frames, or compare the panorama with what you know of the scene",
@@ -77,7 +76,7 @@ def _untested_motion(run: TestedRun) -> Found:
     return Found(0 if known else max(FEWEST_SPANS - len(residuals.spans), 1), where)
 
 
-@JUDGES.doubtful_above(
+@FACTS.doubtful_above(
     10,
     "the photons contradict the focal length or the lens that the spec gives",
     "write camera: {focal_px: find}, and distortion: {k1: find} if the lens distorts, or calibrate the camera anew",
@@ -91,7 +90,7 @@ def _given_camera(run: TestedRun) -> Found | None:
     return Found(abs(freed.found - freed.given) / freed.std, where)
 
 
-@JUDGES.doubtful_above(TOO_NARROW, NARROW, FREE)
+@FACTS.doubtful_above(TOO_NARROW, NARROW, FREE)
 def _narrow(run: TestedRun) -> Found | None:
     """Homographies are likelier, and farther away than the motion is expected to err."""
     if not run.levels or not (times := run.levels[-1].narrow):
@@ -105,39 +104,64 @@ def _narrow(run: TestedRun) -> Found | None:
     return Found(times, where, what_to_do=what_to_do)
 
 
-@JUDGES.doubtful_above(
-    3.0,
-    "the frames before and after an instant do not agree along the motion that was found",
-    "look at the halves and the path in the report; the motion may be wrong, or the scene changes",
+@FACTS.doubtful_above(
+    0.5,
+    "the image stands still, and has the fine grain of a sensor whose pixels differ",
+    "divide by a flat field (corrections: flat-field); what was found to stand still may be the sensor, and not the scene",
 )
-def _halves(run: TestedRun) -> Found | None:
-    halves = run.explained.halves
-    if not np.isfinite(halves.coherence).any():
+def _grain(run: TestedRun) -> Found | None:
+    residuals, motion = run.explained.residuals, run.explained.motion
+    middle = corners(residuals.frame_shape).mean(axis=0)
+    places = transform_points(motion.homographies[motion.located], middle[None])[:, 0]
+    if np.ptp(places, axis=0).max() > _STILL_PX:
         return None
-    least = int(np.nanargmin(halves.coherence))
-    where = (
-        f"standard errors are missing to a coherence of 1, half of the time; least is {halves.coherence[least]:.3g}, at frame "
-    )
-    return Found(halves.disagreement, f"{where}{halves.cuts[least]:.0f}", what_to_do=run.freer_model)
+    # A lens blurs what it images, so that waves of two or three pixels are weak; the grain of pixels is white.
+    counts = np.nan_to_num(residuals.pixel_gain * residuals.pixel_mean)
+    image = counts / np.maximum(ndimage.gaussian_filter(counts, _SMOOTH_PX), 1e-9)
+    window = np.outer(*(np.hanning(size + 2)[1:-1] for size in image.shape))
+    power = np.abs(np.fft.rfft2(window * (image - np.average(image, weights=window)))) ** 2 / (window**2).sum()
+    sums = residuals.blocks[..., [V, M]].sum(axis=(0, 1))
+    noise = sums[0] / max(sums[1], 1e-9) / max(float(counts.mean()), 1e-9)
+    cycles = np.hypot(np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1]))
+    fine, coarse = (float(power[(low < cycles) & (cycles < high)].mean()) - noise for low, high in (_FINE, _COARSE))
+    return Found(max(fine, 0.0) / max(coarse, 1e-9), "power of waves of 2 to 3 px, relative to those of 6 to 10 px")
 
 
-@JUDGES.doubtful_above(
-    1.1,
-    "the panorama does not explain the photons: they differ from its prediction by more than their noise",
-    "look at the maps of the report; the motion may be wrong, or the scene changes",
+@FACTS.doubtful_above(
+    0.5,
+    "more than half of the frame stands still while the rest moves",
+    "mask what stands in the frame (corrections: mask); the motion may be that of either part",
 )
-def _photons(run: TestedRun) -> Found | None:
-    residuals = run.explained.residuals
-    reduced_chi2 = float(residuals.reduced_chi2.mean())
-    sums = residuals.blocks.sum(axis=(0, 1))
-    per_span = sums / max(len(residuals.spans), 1)
-    n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
-    # The squared residual of a block beyond its variance, as a part of its photons.
-    contrast = float(np.sqrt(max(reduced_chi2 - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
-    return Found(reduced_chi2, f"on average by {contrast:.0%} of the light") if contrast > MAX_CONTRAST else None
+def _standing(run: TestedRun) -> Found | None:
+    return run.decided("standing_share", "share of the parts that show motion or rest")
 
 
-@JUDGES.doubtful_above(
+@FACTS.doubtful_above(
+    0.5,
+    "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
+    "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
+)
+def _layers(run: TestedRun) -> Found | None:
+    # Later levels leave out what is near.
+    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
+    where = "share of the frames that is left out, on average"
+    if parallax:
+        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
+    if (found := run.decided("movers", where)) is None:
+        return None
+    # Where little is left out, but much changes that is not, what is left out may be the scene.
+    changing_share, _ = changing_places(run.explained.residuals)
+    if min(found.figure, changing_share) <= MUCH:
+        return found
+    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
+
+
+def of_either_part(run: TestedRun) -> bool:
+    """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
+    return any(test.judged(run) for test in (_grain, _standing, _layers))
+
+
+@FACTS.doubtful_above(
     _UNCERTAIN_PX,
     "the expected error of the motion is large",
     "use more light; where few pairs tie parts together, more of them (graph.skips, graph.tie)",
@@ -203,58 +227,38 @@ def _one_direction(run: TestedRun) -> Found | None:
     return Found(weak, f"{where}; {strong:.2g} px across it", what=what, what_to_do=what_to_do)
 
 
-@JUDGES.doubtful_above(
-    0.5,
-    "the image stands still, and has the fine grain of a sensor whose pixels differ",
-    "divide by a flat field (corrections: flat-field); what was found to stand still may be the sensor, and not the scene",
+@AGREEMENT.doubtful_above(
+    3.0,
+    "the frames before and after an instant do not agree along the motion that was found",
+    "look at the halves and the path in the report; the motion may be wrong, or the scene changes",
 )
-def _grain(run: TestedRun) -> Found | None:
-    residuals, motion = run.explained.residuals, run.explained.motion
-    middle = corners(residuals.frame_shape).mean(axis=0)
-    places = transform_points(motion.homographies[motion.located], middle[None])[:, 0]
-    if np.ptp(places, axis=0).max() > _STILL_PX:
+def _halves(run: TestedRun) -> Found | None:
+    halves = run.explained.halves
+    if not np.isfinite(halves.coherence).any():
         return None
-    # A lens blurs what it images, so that waves of two or three pixels are weak; the grain of pixels is white.
-    counts = np.nan_to_num(residuals.pixel_gain * residuals.pixel_mean)
-    image = counts / np.maximum(ndimage.gaussian_filter(counts, _SMOOTH_PX), 1e-9)
-    window = np.outer(*(np.hanning(size + 2)[1:-1] for size in image.shape))
-    power = np.abs(np.fft.rfft2(window * (image - np.average(image, weights=window)))) ** 2 / (window**2).sum()
-    sums = residuals.blocks[..., [V, M]].sum(axis=(0, 1))
-    noise = sums[0] / max(sums[1], 1e-9) / max(float(counts.mean()), 1e-9)
-    cycles = np.hypot(np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1]))
-    fine, coarse = (float(power[(low < cycles) & (cycles < high)].mean()) - noise for low, high in (_FINE, _COARSE))
-    return Found(max(fine, 0.0) / max(coarse, 1e-9), "power of waves of 2 to 3 px, relative to those of 6 to 10 px")
+    least = int(np.nanargmin(halves.coherence))
+    where = (
+        "standard errors that the coherence lacks to 1, median over the instants; "
+        f"least is {halves.coherence[least]:.3g}, before frame {halves.cuts[least]:.0f}"
+    )
+    return Found(halves.disagreement, where, what_to_do=run.freer_model)
 
 
-@JUDGES.doubtful_above(
-    0.5,
-    "more than half of the frame stands still while the rest moves",
-    "mask what stands in the frame (corrections: mask); the motion may be that of either part",
+@AGREEMENT.doubtful_above(
+    1.1,
+    "the panorama does not explain the photons: they differ from its prediction by more than their noise",
+    "look at the maps of the report; the motion may be wrong, or the scene changes",
 )
-def _standing(run: TestedRun) -> Found | None:
-    return run.decided("standing_share", "share of the parts that show motion or rest")
+def _photons(run: TestedRun) -> Found | None:
+    residuals = run.explained.residuals
+    reduced_chi2 = float(residuals.reduced_chi2.mean())
+    sums = residuals.blocks.sum(axis=(0, 1))
+    per_span = sums / max(len(residuals.spans), 1)
+    n = max(float(np.count_nonzero(residuals.blocks[..., V])), 1)
+    # The squared residual of a block beyond its variance, as a part of its photons.
+    contrast = float(np.sqrt(max(reduced_chi2 - 1, 0) * per_span[V] / n) / max(per_span[M] / n, 1e-9))
+    return Found(reduced_chi2, f"on average by {contrast:.0%} of the light") if contrast > MAX_CONTRAST else None
 
 
-@JUDGES.doubtful_above(
-    0.5,
-    "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
-    "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
-)
-def _layers(run: TestedRun) -> Found | None:
-    # Later levels leave out what is near.
-    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
-    where = "share of the frames that is left out, on average"
-    if parallax:
-        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
-    if (found := run.decided("movers", where)) is None:
-        return None
-    # Where little is left out, but much changes that is not, what is left out may be the scene.
-    changing_share, _ = changing_places(run.explained.residuals)
-    if min(found.figure, changing_share) <= MUCH:
-        return found
-    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
-
-
-def of_either_part(run: TestedRun) -> bool:
-    """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
-    return any(test.judged(run) for test in (_grain, _standing, _layers))
+# What is a fact, or is not known to a pixel; causes; and whether all agrees. The most telling are listed first.
+TESTS: tuple[Test[TestedRun], ...] = (*FACTS, *CAUSES, *AGREEMENT)

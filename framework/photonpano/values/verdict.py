@@ -121,6 +121,7 @@ def judged(tests: Iterable[Test[Facts]], facts: Facts, residual_ratio: float | N
     found = [(test, test.find(facts)) for test in tests]
     reasons = [(test, reason) for test, each in found if (reason := test.reason(each)) is not None]
     untested = (clause for test, each in found if (clause := test.untested(each)) is not None)
-    doubts = [*doubts, *(reason for test, reason in reasons if test.decides)]
-    others = [reason for test, reason in reasons if not test.decides]
-    return Verdict.of([*others, *doubts] if doubts else [], residual_ratio, untested, [] if doubts else others)
+    listed, doubts = [reason for _, reason in reasons], tuple(doubts)
+    if doubts or any(test.decides for test, _ in reasons):
+        return Verdict.of((*doubts, *listed), residual_ratio, untested)
+    return Verdict.of((), residual_ratio, untested, listed)

@@ -76,12 +76,6 @@ def test_check_run_opens_a_capture_that_was_moved(finished: Path) -> None:
         check_run(finished, capture=moved)
 
 
-def test_check_run_judges_recorded_contradictions(finished: Path) -> None:
-    pair = {"moving": [0, 50], "fixed": [50, 100]}
-    change(finished, lambda record: record["levels"][-1].update(pairs=10, contradictions=[pair, pair]))
-    assert check_run(finished).verdict.reasons[-1].where == "2 of 10 pairs of the last level"
-
-
 def test_check_run_keeps_what_only_the_run_can_find(finished: Path) -> None:
     repeats = {"what": REPEATS, "figure": 0.2, "threshold": 0.05, "where": "4 of 20 pairs", "what_to_do": "look"}
     other = repeats | {"what": "the light changes over time"}

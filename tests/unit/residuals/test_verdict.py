@@ -139,7 +139,7 @@ def test_what_residuals_show_is_a_note_and_the_cause_of_a_doubt(
     assert note.figure > note.threshold
     assert note.what_to_do
     doubted = judge(replace(found, motion=replace(found.motion, std_px=found.motion.std_px + 3)), ())
-    assert [reason.what for reason in doubted.reasons] == [note.what, "the expected error of the motion is large"]
+    assert [reason.what for reason in doubted.reasons] == ["the expected error of the motion is large", note.what]
     assert (doubted.status, doubted.notes) == ("doubtful", ())
 
 
@@ -311,7 +311,7 @@ def test_halves_that_do_not_agree_for_half_of_the_time_are_doubtful(explained: E
     halves = Halves(np.array([500.0, 1000.0, 1500.0, 1900.0]), coherence, stds, np.full((4, 2), 0.1), np.zeros(4))
     verdict = judge(replace(explained, halves=halves), ())
     assert [reason.figure for reason in verdict.reasons] == [pytest.approx(lacks)] * doubtful
-    assert all("least is 0.918, before frame 1000" in reason.where for reason in verdict.reasons)
+    assert all(reason.where.endswith(", before frame 1000") for reason in verdict.reasons)
 
 
 def test_things_that_pass_the_background_tell_how_far_the_camera_travels(explained: Explained) -> None:
