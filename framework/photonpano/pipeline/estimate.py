@@ -21,7 +21,7 @@ from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.obstacles import timeline_of
-from photonpano.pipeline.shots import ApartError, shots_of
+from photonpano.pipeline.shots import ApartError, parts_of, shots_of
 from photonpano.pipeline.state import State, model_of, within
 from photonpano.specs.plan import Plan
 from photonpano.text import listed
@@ -70,7 +70,7 @@ def _in_shots(
         except ApartError as apart:
             shots = apart.shots
         except UntiedError as unlocated:
-            if timeline.shots or not (shots := shots_of(source, unlocated)):
+            if timeline.shots or not (shots := shots_of(source, unlocated.groups, unlocated.parts)):
                 raise
         del journal[before:]
         starts = sorted({shot.start for shot in (*timeline.shots, *shots)})
@@ -94,6 +94,9 @@ def _along(
     gyroscope = _gyroscope(plan, source, timeline, journal, context)
     state = State(plan, source, context, reference, levels, timeline, model_of(plan), start, gyroscope, shortened)
     state = state.located(levels[:1], start)
+    located = state.results[-1].located
+    if not timeline.shots and (shots := shots_of(source, located.groups, parts_of(located))):
+        raise ApartError(shots)
     tried: tuple[passes.Pass, ...] = (
         passes.through_found_lens,
         passes.without_shading,

@@ -300,7 +300,7 @@ def cut_at_jumps(state: State) -> Proposal | None:
         try:
             cut = _located_anew(replace(state, timeline=state.timeline.cut_at(cuts), levels=levels))
         except UntiedError as error:
-            if shots := shots_of(state.source, error, [each.frame for each in cuts]):
+            if shots := shots_of(state.source, error.groups, error.parts, [each.frame for each in cuts]):
                 raise ApartError(shots) from error
             raise
         measured = [each.along(cut.motion.trajectory, cut.motion.frame_shape) for each in cuts]

@@ -9,25 +9,29 @@ from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.contracts.protocols import Source
 from photonpano.errors import PhotonpanoError, described
 from photonpano.execution.context import Progress
+from photonpano.geometry import corners, inverse, transform_points
 from photonpano.merging import binned_mean
-from photonpano.motion.diagnosis import UntiedError
+from photonpano.motion.graph import components
+from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.timeline import SHOTS
 from photonpano.plugins.contributions import PartOfCapture
 from photonpano.record.run_warnings import other_shots
 from photonpano.record.schema import RunRecord
+from photonpano.robust import robust_std
 from photonpano.specs.plan import Plan
-from photonpano.values import FloatArray, FrameSpan
+from photonpano.values import FloatArray, FrameSpan, Group
 
 logger = logging.getLogger(__name__)
 ResultT = TypeVar("ResultT")
 
 _BLOCKS, _SHORTEST, _LONGEST = 64, 4, 32  # blocks of frames that are compared; fewest and most frames of one
 _SIDE = 4  # blocks before and after an instant whose means are compared
-_ABRUPT = 3.0  # least change of the image where a shot ends, relative to the median around it
+_ABRUPT = 3.0  # least change of the image where a shot ends, relative to the changes around it, without photon noise
 _FEWEST = 3  # exposures of a shot
 
 
@@ -39,12 +43,26 @@ class ApartError(Exception):
         self.shots = shots
 
 
-def shots_of(source: Source, error: UntiedError, cuts: Sequence[int] = ()) -> tuple[FrameSpan, ...]:
+def parts_of(located: LocatedLevel) -> NDArray[np.integer]:
+    """Number the parts that the exposures of a level fall into: (N,).
+
+    No pair ties them together, or the image is upside down from one to the next, as no camera turns.
+    """
+    there, middle = np.flatnonzero(located.solution.located), corners(located.frame_shape).mean(axis=0)
+    homographies = located.solution.homographies[there]
+    moved = transform_points(inverse(homographies[:-1]) @ homographies[1:], middle + np.array([[0.0, 0.0], [1.0, 0.0]]))
+    labels, turned = components(len(located.groups), located.edges), np.zeros(len(located.groups), dtype=int)
+    turned[there[1:]] = moved[:, 1, 0] < moved[:, 0, 0]
+    return np.asarray(labels + (labels.max() + 1) * turned.cumsum())
+
+
+def shots_of(
+    source: Source, groups: Sequence[Group], labels: NDArray[np.integer], cuts: Sequence[int] = ()
+) -> tuple[FrameSpan, ...]:
     """Return the shots of a capture whose exposures fall into parts; none unless there are `cuts`, or abrupt changes, between.
 
     Motion that is too fast, and darkness, also tear the exposures apart; there, the image changes all the time, or not at all.
     """
-    groups, labels = error.groups, error.parts
     members = [np.flatnonzero(labels == part) for part in np.flatnonzero(np.bincount(labels) >= _FEWEST)]
     members.sort(key=lambda each: int(each[0]))
     if len(members) < 2 or any(one[-1] > other[0] for one, other in pairwise(members)):
@@ -74,10 +92,15 @@ def _first_after_change(source: Source, span: FrameSpan) -> int | None:
     images = np.stack([np.nan_to_num(binned_mean(source, block)) for block in blocks])
     sums = np.concatenate([np.zeros((1, *images.shape[1:])), images.cumsum(axis=0)])
     means = (sums[_SIDE:] - sums[:-_SIDE]) / _SIDE
-    changes = ((means[_SIDE:] - means[:-_SIDE]) ** 2).mean(axis=(1, 2))
+    # Blocks that alternate show the same image, with the same noise.
+    signs = (-1.0) ** np.arange(len(images))[:, None, None]
+    alternating = np.concatenate([np.zeros((1, *images.shape[1:])), (signs * images).cumsum(axis=0)])
+    noise = ((alternating[2 * _SIDE :] - alternating[: -2 * _SIDE]) / _SIDE) ** 2
+    changes = ((means[_SIDE:] - means[:-_SIDE]) ** 2 - noise).mean(axis=(1, 2))
     starts = around.start + length * (np.arange(len(changes)) + _SIDE)
     index = int(np.where((span.start <= starts) & (starts < span.stop), changes, -1).argmax())
-    if changes[index] < _ABRUPT * np.median(changes):
+    usual = max(float(np.median(changes)), 0.0)
+    if changes[index] < _ABRUPT * (usual + robust_std(changes - np.median(changes))):
         return None
     # The change lies within a block of the boundary between both means.
     first = int(starts[index]) - length
