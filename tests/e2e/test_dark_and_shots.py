@@ -154,6 +154,23 @@ def test_shots_that_nothing_ties_together_are_run_apart(
     assert (folder / "notes.txt").read_text() == "mine"
 
 
+@pytest.mark.parametrize("how", ["upside down", "largest"])
+def test_what_no_camera_passes_is_two_shots(two_shots: Path, small_capture: Path, tmp_path: Path, how: str) -> None:
+    """The image is upside down from one frame to the next; or the largest part of what is not tied was asked for."""
+    spec, frames = spec_of(two_shots), np.unpackbits(np.load(small_capture), axis=-1)
+    if how == "upside down":
+        frames[160:] = frames[160:, ::-1, ::-1]
+        np.save(tmp_path / "turned.npy", np.packbits(frames, axis=-1))
+        spec = spec_of(tmp_path / "turned.npy") | {"motion": {"model": "homography"}}
+    else:
+        spec["graph"] = {"disconnected": "largest"}
+    result = run_plan(parse_spec(spec, output=tmp_path / "run"))
+    shots = [each["value"] for each in result.record["decisions"] if each["what"] == "shots"]
+    assert len(shots) == len(result.others) == 1
+    assert how == "largest" or "frames 0 to 159 and frames 160 to" in shots[0]
+
+
+
 def test_other_shots_are_numbered_by_their_length_and_those_that_fail_are_left_out(
     tiny_spec: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -176,3 +176,18 @@ def test_walks_of_few_exposures_are_learnt_without_failing() -> None:
 def test_logarithms_undo_exponentials() -> None:
     steps = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 8))
     np.testing.assert_allclose(logarithms(normalised(moved(np.eye(3)[None], steps, np.eye(8), SHAPE)), SHAPE), steps, atol=1e-6)
+
+
+def test_shifts_claim_what_a_turn_that_does_not_show_would_bend() -> None:
+    """Between neighbours, the turn changes perspective by less than noise; over 15 frames, it bends the path by pixels."""
+    n_nodes, focal_px, errors, claims = 40, 12_000.0, [], []
+    angles = np.linspace(-0.5, 0.5, n_nodes) * 15 * SHAPE[1] / focal_px
+    rotations = rotation_matrices(np.outer(angles, [0, 1, 0]))
+    true = normalised(Camera.of(focal_px, SHAPE).homographies(rotations[n_nodes // 2].T @ rotations))
+    for seed in range(3):
+        solution = solve(groups_of(n_nodes), measured_with(true, seed, 1.0), n_nodes // 2, SHAPE, model=AUTO)
+        assert (solution.model.kind, solution.walks_px) == ("homography", {})
+        errors.append(rms_px(solution.homographies, true))
+        claims.append(float(np.sqrt((solution.assess().std_px ** 2).mean())))
+    assert np.mean(errors) > 10
+    assert 0.5 < np.linalg.norm(errors) / np.linalg.norm(claims) < 2
