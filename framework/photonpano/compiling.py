@@ -1,31 +1,18 @@
-"""Compile loops over pixels and bits with numba; the machine code is kept on disk for the next process.
+"""Compile loops over pixels and bits with numba, which keeps the machine code on disk for the next process.
 
 Plugins may use `compiled` for their own loops. Modules that use it import numba: import them from `build`, not from hooks.
 """
 
 from __future__ import annotations
 
-import logging
-import os
-import pickle
-import stat
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
-from hashlib import sha256
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import event
-from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 
 __all__ = ["compiled", "notify_on_first_compile"]
-
-logger = logging.getLogger(__name__)
-
-_DIGEST_BYTES = sha256().digest_size
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -42,7 +29,9 @@ def compiled(function: Function) -> Function:
     """
     # No "nnan" and "ninf": NaN stands for pixels without a value.
     dispatcher: Any = numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})(function)
-    dispatcher._cache = _Cache(function)
+    # As cache=True, which raises where no folder can be written to: then each process compiles the function for itself.
+    with suppress(RuntimeError):
+        dispatcher.enable_caching()
     return cast("Function", dispatcher)
 
 
@@ -71,114 +60,3 @@ class _Once(event.Listener):
 
     def on_end(self, event: object) -> None:
         del event
-
-
-class _Cache:
-    """Machine code on disk, for numba: it never fails. What is damaged is compiled and written again.
-
-    If the folder cannot be written, a temporary one of the user takes its place.
-    """
-
-    def __init__(self, function: Callable[..., object]) -> None:
-        self._function = function
-        self._files: Any
-        try:
-            self._files = _files_of(function)
-        except (RuntimeError, OSError):  # no folder can be written to: neither beside the module nor in a home
-            self._files = self._elsewhere()
-
-    @property
-    def cache_path(self) -> str:
-        return str(self._files.cache_path)
-
-    def load_overload(self, signature: object, context: object) -> object:
-        """Return the code for a signature; None if it has to be compiled."""
-        try:
-            found = self._files.load_overload(signature, context)
-            if found is None and _temporary_name().is_dir():
-                found = self._elsewhere().load_overload(signature, context)
-            return found
-        except Exception:  # whatever is wrong with it, the code can be compiled again
-            _note(f"compiled code in {self.cache_path} is damaged, and is compiled again")
-        try:
-            self._files.flush()
-        except OSError:
-            self._files = self._elsewhere()
-        return None
-
-    def save_overload(self, signature: object, result: object) -> None:
-        """Keep code, if any folder can be written."""
-        try:
-            self._files.save_overload(signature, result)
-        except OSError as error:
-            before = self.cache_path
-            self._files = self._elsewhere()
-            with suppress(OSError):
-                self._files.save_overload(signature, result)
-            _note(f"compiled code cannot be kept in {before} ({error.strerror}); it is kept in {self.cache_path} instead")
-
-    def _elsewhere(self) -> Any:
-        config: Any = numba.core.config
-        before, config.CACHE_DIR = config.CACHE_DIR, str(_temporary_folder())
-        try:
-            return _files_of(self._function)
-        except (RuntimeError, OSError):  # not even there
-            return NullCache()
-        finally:
-            config.CACHE_DIR = before
-
-
-class _CheckedFiles(IndexDataCacheFile):
-    """An index of signatures, and a file of code for each, with their hashes: damaged code might run, and do anything."""
-
-    def _dump(self, content: object) -> bytes:
-        data: bytes = super()._dump(content)  # type: ignore[no-untyped-call]
-        return data + sha256(data).digest()
-
-    def _load_data(self, name: str) -> object:
-        return _checked(Path(self._cache_path, name).read_bytes())
-
-    def _load_index(self) -> dict[object, str]:
-        try:
-            data = Path(self._index_path).read_bytes()
-        except FileNotFoundError:
-            return {}
-        version = pickle.dumps(self._version, protocol=-1)
-        if not data.startswith(version):  # of another version of numba, or damaged
-            return {}
-        stamp, overloads = _checked(data[len(version) :])
-        return overloads if stamp == self._source_stamp else {}
-
-
-def _files_of(function: Callable[..., object]) -> Any:
-    cache: Any = FunctionCache(function)  # type: ignore[no-untyped-call]
-    name, stamp = f"{cache._impl.filename_base}-sha256", cache._impl.locator.get_source_stamp()
-    cache._cache_file = _CheckedFiles(cache.cache_path, name, stamp)  # type: ignore[no-untyped-call]
-    return cache
-
-
-def _checked(data: bytes) -> Any:
-    content, digest = data[:-_DIGEST_BYTES], data[-_DIGEST_BYTES:]
-    if sha256(content).digest() != digest:
-        raise ValueError("its hash is another")
-    return pickle.loads(content)
-
-
-def _temporary_name() -> Path:
-    return Path(tempfile.gettempdir(), f"photonpano-{os.getuid()}")
-
-
-def _temporary_folder() -> Path:
-    """Return a folder for temporary files that only this user can write, and that the next process finds."""
-    folder = _temporary_name()
-    with suppress(OSError):
-        folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
-        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
-            return folder
-    return Path(tempfile.mkdtemp(prefix="photonpano-"))
-
-
-@cache
-def _note(message: str) -> None:
-    logger.warning(message)

@@ -1,8 +1,6 @@
 """Threads, interrupts and compiled code."""
 
-import errno
 import importlib.util
-import logging
 import os
 import signal
 import threading
@@ -10,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import ModuleType
 
 import cv2
 import numba
@@ -18,7 +15,6 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from photonpano import compiling
 from photonpano.compiling import notify_on_first_compile
 from photonpano.errors import described
 from photonpano.execution.interrupts import is_interrupt
@@ -185,53 +181,32 @@ def test_notify_on_first_compile_calls_once_per_block_and_only_if_something_is_c
 
 
 @pytest.fixture
-def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Callable[[], str]:
-    """Compile a function of a module anew, as a further process does, call it, and return the warnings."""
-    (tmp_path / "module").mkdir()
-    (tmp_path / "module" / "loops.py").write_text(SOURCE)
-    monkeypatch.setattr(compiling.tempfile, "gettempdir", lambda: str(tmp_path))
-    number = iter(range(9))
+def compiles(tmp_path: Path) -> Callable[[], bool]:
+    """Load a module anew, as a further process does, call its function, and return whether that was compiled."""
+    path = tmp_path / "loops.py"
+    path.write_text(SOURCE)
 
-    def load() -> ModuleType:
-        spec = importlib.util.spec_from_file_location(f"loops{next(number)}", tmp_path / "module" / "loops.py")
+    def compiles() -> bool:
+        spec = importlib.util.spec_from_file_location("loops", path)
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
-        return module
+        notes: list[str] = []
+        with notify_on_first_compile(lambda: notes.append("compiling")):
+            assert module.total(np.arange(5.0)) == 10
+        return bool(notes)
 
-    def totals() -> str:
-        caplog.clear()
-        compiling._note.cache_clear()
-        with caplog.at_level(logging.WARNING):
-            assert load().total(np.arange(5.0)) == 10
-        return caplog.text
-
-    return totals
+    return compiles
 
 
-def test_damaged_machine_code_is_compiled_again(tmp_path: Path, totals: Callable[[], str]) -> None:
-    assert totals() == totals() == ""
-    folder = tmp_path / "module" / "__pycache__"
-    code, index = (next(folder.glob(f"*.{suffix}")) for suffix in ("nbc", "nbi"))
-    whole = code.read_bytes()
-    for file, content in ((code, whole[:999] + b"x" + whole[1000:]), (code, b""), (index, index.read_bytes()[:-1])):
-        file.write_bytes(content)
-        assert f"compiled code in {folder} is damaged, and is compiled again" in totals()
-        assert totals() == ""
+def test_machine_code_is_kept_for_the_next_process(compiles: Callable[[], bool]) -> None:
+    assert [compiles(), compiles()] == [True, False]
 
 
-def test_machine_code_that_cannot_be_kept_moves_to_temporary_folder(
-    tmp_path: Path, totals: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+def test_function_is_compiled_anew_where_machine_code_cannot_be_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiles: Callable[[], bool]
 ) -> None:
-    folder, write = tmp_path / "module" / "__pycache__", compiling._CheckedFiles._save_data
-
-    def full(files: compiling._CheckedFiles, name: str, data: object) -> None:
-        if files._cache_path == str(folder):
-            raise OSError(errno.ENOSPC, "No space left on device")
-        write(files, name, data)
-
-    monkeypatch.setattr(compiling._CheckedFiles, "_save_data", full)
-    printed = totals()
-    assert (
-        f"compiled code cannot be kept in {folder} (No space left on device); it is kept in {tmp_path}/photonpano-" in printed
-    )
-    assert len(list(tmp_path.glob("photonpano-*/*/*.nbc"))) == 1
+    """Neither beside the module nor in a home."""
+    (tmp_path / "__pycache__").touch()
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, os.devnull)
+    assert [compiles(), compiles()] == [True, True]
