@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import importlib.util
 import os
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -17,7 +16,6 @@ import pytest
 from hypothesis import settings
 
 from photonpano import FrameSpan, Group, VirtualExposure
-from photonpano.execution import interrupts
 from photonpano.execution.threads import one_thread_inside
 from photonpano.geometry import translation
 from photonpano.photometry import BinaryResponse
@@ -312,12 +310,3 @@ def pytest_runtest_teardown() -> Iterator[None]:
     while locks is not None and locks.global_compiler_lock.is_locked():
         locks.global_compiler_lock.release()
     return (yield)
-
-
-@pytest.fixture
-def heeded(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Handle SIGINT as the program does."""
-    monkeypatch.setattr(interrupts, "_noted", [])
-    before = signal.signal(signal.SIGINT, interrupts.interrupt)
-    yield
-    signal.signal(signal.SIGINT, before)

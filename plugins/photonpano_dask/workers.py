@@ -21,6 +21,8 @@ _SETTINGS = {
     "distributed.comm.timeouts.connect": f"{_PATIENCE_S}s",
     # It would look at the stack of each worker a hundred times a second.
     "distributed.worker.profile.enabled": False,
+    # A terminal sends Ctrl-C to workers, too: without them, the tasks that this process waits for would never end.
+    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
 }
 _SETTINGS_OF_TASKS = {
     # The motion of a long capture is tens of megabytes: it travels once for many tasks, and again if a worker dies.
@@ -81,10 +83,6 @@ class DaskWorkers:
         """Have a worker call a function: see `Workers`."""
         # Tasks are not pure: a key that is computed from large arguments takes time, and none is submitted twice.
         return self._client.submit(function, *given, pure=False)
-
-    def when_done(self, pending: Future, call: Callable[[], object]) -> None:
-        """Have a function called once a task has ended: see `Workers`."""
-        pending.add_done_callback(lambda _: call())
 
     def close(self) -> None:
         """Cancel what is under way, and end the processes that were started."""

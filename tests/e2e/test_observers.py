@@ -35,7 +35,7 @@ def photonpano_stage_finished(level, stage):
 
 @hookimpl
 def photonpano_run_finished(record):
-    raise SystemExit(3)
+    raise OSError("no space")
 """
 
 
@@ -90,7 +90,7 @@ def test_failing_observer_is_a_warning_and_changes_no_result(
     what = "TypeError: 'mappingproxy' object does not support item assignment"
     assert started == f"warning: photonpano_run_started {who} {what}; the run goes on"
     assert located == f"warning: photonpano_stage_finished {who} RuntimeError: no space at level 1; the run goes on"
-    assert finished == f"warning: photonpano_run_finished {who} SystemExit: 3; the run goes on"
+    assert finished == f"warning: photonpano_run_finished {who} OSError: no space; the run goes on"
     assert [line["event"] for line in lines("watched")] == ["started", *["stage"] * 5, "done"]
 
     alone = run("--output", "runs/alone", PHOTONPANO_DISABLE_PLUGINS="clumsy,logger")

@@ -9,7 +9,6 @@ from typing import Any, Generic, TypeAlias, TypeVar
 import numpy as np
 
 from photonpano.errors import PhotonpanoError, PluginError, described
-from photonpano.execution.interrupts import is_interrupt
 
 T = TypeVar("T")
 # What is required, as a sentence for users, and a check of a value against facts, such as the number of frames of the capture.
@@ -25,7 +24,7 @@ class BrokenContract(Exception):  # noqa: N818 - it is not raised to callers
 def attributing(origin: str, where: str) -> Iterator[None]:
     """Raise a `PluginError` that names a component for errors of the block.
 
-    Errors that are written for users, and interrupts, pass unchanged.
+    Errors that are written for users pass unchanged.
 
     Args:
         origin: who provides the component, such as "merger 'photon-mle' of photonpano 0.1.0".
@@ -37,9 +36,7 @@ def attributing(origin: str, where: str) -> Iterator[None]:
         raise
     except BrokenContract as error:
         raise PluginError(f"{origin} broke its contract at {where}: {error}") from None
-    except BaseException as error:  # a plugin that calls sys.exit() must not end the program in silence
-        if is_interrupt(error):
-            raise
+    except Exception as error:
         raise PluginError(f"{origin} failed at {where}: {described(error)}") from error
 
 

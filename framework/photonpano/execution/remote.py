@@ -8,14 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from operator import itemgetter
-from threading import Event
 from typing import Any, Protocol, TypeVar, cast
 
 from photonpano.errors import PluginError
-from photonpano.execution.interrupts import interrupted
 
 _CAPTURE = "capture"
-_POLL_S = 0.2  # from one check for an interrupt to the next, in threads that wait
 # Items of a task. An exposure takes some ten milliseconds, and a task costs about one in the scheduler and in the client.
 _MOST_AT_ONCE = 8
 # Items are worked on at once where there are so many tasks for each one under way, so that no worker waits for the last.
@@ -97,9 +94,6 @@ class Workers(Protocol):
     def under_way(self) -> int:
         """How many tasks are worth having under way at once: more than there are workers, so that none waits for the next."""
 
-    def when_done(self, pending: Pending, call: Callable[[], object]) -> None:
-        """Have a function called, in any thread, once a task has ended in whatever way."""
-
     def close(self) -> None:
         """Cancel what is under way, and end the processes that were started."""
 
@@ -129,26 +123,17 @@ class Remote:
 
     def call(self, work: Callable[..., ResultT], *given: Any) -> ResultT:
         """Work on a task, and return its result."""
-        result: ResultT = self._awaited(self._submitted(work, *given))
+        result: ResultT = self._submitted(work, *given).result()
         return result
 
     def keep(self, work: Callable[..., tuple[ValueT, ResultT]], *given: Any) -> tuple[ValueT, ResultT]:
         """Work on a task with two results; the first stays where it was made."""
         both = self._submitted(work, *given)
-        return cast("ValueT", _StandIn(both, of_two=True)), self._awaited(self._workers.submit(_second, both))
+        return cast("ValueT", _StandIn(both, of_two=True)), self._workers.submit(_second, both).result()
 
     def close(self) -> None:
         """End the processes that were started."""
         self._workers.close()
-
-    def _awaited(self, pending: Pending) -> Any:
-        """Wait for a result. Once the program is interrupted, its threads do not wait any longer."""
-        done = Event()
-        self._workers.when_done(pending, done.set)
-        while not done.wait(_POLL_S):
-            if interrupted():
-                raise KeyboardInterrupt
-        return pending.result()
 
     def _submitted(self, work: Any, *given: Any) -> Pending:
         parts = [

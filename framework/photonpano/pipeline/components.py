@@ -16,7 +16,6 @@ from photonpano.contracts.protocols import PoseEstimator, Resampler, Source, lig
 from photonpano.contracts.rules import attributing, shown
 from photonpano.corrections import Mask, corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
-from photonpano.execution.interrupts import is_interrupt
 from photonpano.execution.threads import in_order, thread_count
 from photonpano.motion.level import Level, NamedLocator, Recorder
 from photonpano.plugins.contributions import (
@@ -262,9 +261,7 @@ def built(choice: Choice, context: SourceContext | StageContext | ExecutorContex
         lacking = [name for name in KINDS[contribution.kind].methods if not callable(getattr(component, name, None))]
     except PhotonpanoError:
         raise
-    except BaseException as error:
-        if is_interrupt(error):
-            raise
+    except Exception as error:
         raise PluginError(f"{who} could not be built: {described(error)}") from error
     if lacking:
         raise PluginError(f"{who} could not be built: build returned {shown(component)}, which has no {listed(lacking, 'nor')}")

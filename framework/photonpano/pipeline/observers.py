@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from photonpano.errors import described, public_name
-from photonpano.execution.interrupts import is_interrupt
 from photonpano.geometry import Canvas
 from photonpano.motion.loop import LevelResult
 from photonpano.plugins.registry import Observer
@@ -74,9 +73,7 @@ class Observers:
         for observer in self.observers:
             try:
                 getattr(observer.hook, hook)(directory=self.directory, **values)
-            except BaseException as error:
-                if is_interrupt(error):
-                    raise
+            except Exception as error:
                 what = described(error)
                 logger.warning("%s of %s raised %s; the run goes on", hook, observer.origin, what, exc_info=True)
 

@@ -12,7 +12,6 @@ from typing import Any
 from pydantic import ConfigDict, Field
 
 from photonpano.errors import described
-from photonpano.execution.interrupts import is_interrupt
 from photonpano.files.paths import Location, Url
 from photonpano.plugins.contributions import Config, Recognised, SourceContribution, SpecLocation, hookimpl
 from photonpano.plugins.registry import Catalog, Entry
@@ -123,9 +122,7 @@ def ask_sources(catalog: Catalog, path: Location) -> tuple[list[tuple[Entry, Rec
             continue
         try:
             answer = entry.contribution.recognise(path)
-        except BaseException as error:
-            if is_interrupt(error):
-                raise
+        except Exception as error:
             failures.append(f"recognise of the {entry.label} raised {described(error)}")
             continue
         returned = f"recognise of the {entry.label} returned"
@@ -160,9 +157,7 @@ def _near_misses(spec: Spec, keys: Written, path: Location) -> list[tuple[str, s
             continue
         try:
             config = validate(contribution.config, keys, replace(spec, problems=[]))
-        except BaseException as error:  # what is wrong with the config is reported once the source is named
-            if is_interrupt(error):
-                raise
+        except Exception:  # what is wrong with the config is reported once the source is named
             config = None
         if config is not None:
             problems += ((entry.name, each) for each in complaints(Choice(contribution, config, entry.origin)))

@@ -9,7 +9,6 @@ from typing import Any
 
 from photonpano.corrections import Correction, FlatField
 from photonpano.errors import InputError, Problem, described
-from photonpano.execution.interrupts import is_interrupt
 from photonpano.motion.rates import read_rates
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.specs.plan import Choice, LevelPlan, Plan
@@ -62,9 +61,7 @@ def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
     try:
         found = choice.contribution.check(choice.config, *stream)
         return (found,) if isinstance(found, str) else tuple(map(str, islice(found, MAX_COMPLAINTS)))
-    except BaseException as error:
-        if is_interrupt(error):
-            raise
+    except Exception as error:
         return (f"the check of the {choice.label} raised {described(error)}",)
 
 

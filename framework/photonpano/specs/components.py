@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from photonpano.errors import PluginError, described
-from photonpano.execution.interrupts import is_interrupt
 from photonpano.plugins.contributions import KINDS, ExporterContribution, Kind, LocatorContribution, SourceContribution
 from photonpano.plugins.registry import Entry
 from photonpano.specs.plan import Choice
@@ -184,9 +183,7 @@ class ComponentResolver:
             config = validate(entry.contribution.config, keys, self.spec)
             if config is not None:
                 config.model_dump(mode="json")  # a run records it
-        except BaseException as error:
-            if is_interrupt(error):
-                raise
+        except Exception as error:
             self.spec.wrong_key(keys, f"the config of the {entry.label} raised {described(error)}")
             return None
         return None if config is None else Choice(entry.contribution, config, entry.origin, section.place)

@@ -41,7 +41,7 @@ def worker_pids() -> list[int]:
 
 
 class Killing(Quiet):
-    """Kills a worker in the middle of each of some stages."""
+    """Kills a worker in the middle of each of some stages, after Ctrl-C for all workers, which they ignore."""
 
     def __init__(self, *stages: str) -> None:
         self.stages, self.killed = list(stages), list[str]()
@@ -53,6 +53,8 @@ class Killing(Quiet):
         def advance(_: int) -> None:
             if title in self.stages:
                 self.stages.remove(title)
+                for each in worker_pids():
+                    os.kill(each, signal.SIGINT)
                 os.kill(worker_pids()[0], signal.SIGKILL)
                 self.killed.append(title)
 

@@ -1,8 +1,7 @@
-"""Threads, interrupts and compiled code."""
+"""Threads and compiled code."""
 
 import importlib.util
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +16,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from photonpano.compiling import notify_on_first_compile
 from photonpano.errors import described
-from photonpano.execution.interrupts import is_interrupt
 from photonpano.execution.threads import Stopwatch, in_order, one_thread_inside, thread_count
 
 
@@ -108,31 +106,6 @@ def test_in_order_raises_an_error_in_its_turn() -> None:
     assert [next(results) for _ in range(3)] == [1 / 3, 1 / 2, 1]
     with pytest.raises(ZeroDivisionError):
         next(results)
-
-
-@pytest.mark.usefixtures("heeded")
-def test_keyboard_interrupt_is_interrupt_only_after_signal() -> None:
-    assert not is_interrupt(KeyboardInterrupt())
-    with pytest.raises(KeyboardInterrupt) as caught:
-        signal.raise_signal(signal.SIGINT)
-    assert is_interrupt(caught.value)
-    assert not is_interrupt(SystemExit(0))
-
-
-@pytest.fixture
-def default_handler() -> Iterator[None]:
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("default_handler")
-def test_without_handler_keyboard_interrupt_counts_in_main_thread_alone() -> None:
-    seen = [is_interrupt(KeyboardInterrupt())]
-    thread = threading.Thread(target=lambda: seen.append(is_interrupt(KeyboardInterrupt())))
-    thread.start()
-    thread.join()
-    assert seen == [True, False]
 
 
 class Mute(BaseException):

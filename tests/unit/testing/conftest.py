@@ -132,11 +132,8 @@ def catalog(frames: np.ndarray) -> Catalog:
 
 
 @pytest.fixture
-def outcome_of(catalog: Catalog, tmp_path: Path, capsys: pytest.CaptureFixture[str], heeded: None) -> Callable[..., Outcome]:
-    """Run the small capture as the command line does, with contributions of a strange plugin, over an earlier run.
-
-    SIGINT is handled as by the program.
-    """
+def outcome_of(catalog: Catalog, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
+    """Run the small capture as the command line does, with contributions of a strange plugin, over an earlier run."""
     earlier = tmp_path / "run" / "panorama.png"
 
     def outcome_of(sections: Mapping[str, Any], *contributions: Any, observers: tuple[Observer, ...] = ()) -> Outcome:

@@ -12,13 +12,10 @@ from typer.core import TyperCommand, TyperGroup
 
 import photonpano
 from photonpano import api
-from photonpano.api.cli.ending import end_on_signals, leave
-from photonpano.api.cli.errors import FAILED, SIGNALLED, print_error
+from photonpano.api.cli.errors import end_on_signals
 from photonpano.api.cli.signatures import SETTINGS, loaded
 from photonpano.api.cli.streams import prepare_streams
 from photonpano.api.cli.verbosity import with_verbosity
-from photonpano.errors import OutputError
-from photonpano.execution.interrupts import interrupted_by
 
 # The commands that `--help` lists before all others
 _FIRST = ("demo", "info", "check", "run", "batch", "check_run", "verify", "evaluate", "compare", "render", "video", "export")
@@ -112,11 +109,4 @@ def main() -> None:
     """Run the program with the arguments of the process."""
     prepare_streams()
     end_on_signals()
-    try:
-        app(prog_name="photonpano")  # with "python -m photonpano", completion would not work
-    except SystemExit as error:
-        leave(error.code if isinstance(error.code, int) else FAILED)
-    except KeyboardInterrupt:  # before the command or after it
-        leave(SIGNALLED + interrupted_by())
-    except OutputError as error:  # while help is printed
-        leave(print_error(error))
+    app(prog_name="photonpano")  # with "python -m photonpano", completion would not work

@@ -1,22 +1,39 @@
-"""Report errors of commands: a message on stderr, and an exit code."""
+"""Report errors of commands, and signals that end them: a message on stderr, and an exit code."""
 
 import logging
+import signal
 import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 import typer
 
 from photonpano.api.cli.verbosity import SHOWN, log_shown
 from photonpano.api.command import WrongArgumentError
 from photonpano.errors import PhotonpanoError, PluginError, SpecError
-from photonpano.execution.interrupts import interrupted_by
 
 FAILED = 1
 WRONG_SPEC = 2
 SIGNALLED = 128  # plus the number of the signal: 130 for Ctrl-C
 INTERRUPTED = "\ninterrupted; no file is left half-written under its final name"
+
+
+class Signalled(KeyboardInterrupt):
+    """SIGTERM or SIGHUP: they end a command as Ctrl-C does, with exit codes of their own."""
+
+
+def end_on_signals() -> None:
+    """Have SIGTERM and SIGHUP end the program as Ctrl-C does, unless the caller ignores them, as `nohup` does SIGHUP."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _end)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    del frame
+    raise Signalled(number)
 
 
 @contextmanager
@@ -36,12 +53,16 @@ def reported(*, debug: bool = False) -> Iterator[None]:
             traceback.print_exc()
         raise typer.Exit(print_error(error, debug)) from error
     except SystemExit as error:  # a command ends with typer.Exit
-        what = f"a plugin or a library called sys.exit({error.code!r}) in the middle of the command"
-        raise typer.Exit(print_error(PluginError(what), debug)) from error
+        if debug:
+            traceback.print_exc()
+        called = PluginError(f"a plugin or a library called sys.exit({error.code!r}) in the middle of the command")
+        called.__cause__ = error
+        raise typer.Exit(print_error(called, debug)) from error
     except KeyboardInterrupt as error:
         typer.echo(INTERRUPTED, err=True)
         log_shown(logging.ERROR, INTERRUPTED.strip())
-        raise typer.Exit(SIGNALLED + interrupted_by()) from error
+        number = error.args[0] if isinstance(error, Signalled) else signal.SIGINT
+        raise typer.Exit(SIGNALLED + number) from error
     except Exception as error:
         if not isinstance(error, typer.Exit | typer.BadParameter):
             log_shown(logging.ERROR, "a defect of photonpano or of a plugin", error)

@@ -21,7 +21,6 @@ from photonpano.contracts.protocols import Piped
 from photonpano.contracts.rules import attributing
 from photonpano.errors import InputError, OutputError, PhotonpanoError, described
 from photonpano.execution.context import Context, Progress
-from photonpano.execution.interrupts import is_interrupt
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.files.folders import lock_path
 from photonpano.files.locks import locked
@@ -95,7 +94,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
                 if spool.path.exists():
                     logger.warning(f"the frames that arrived are in {spool.path}; {_way_on(plan)}")
             message = str(error) if isinstance(error, PhotonpanoError) else described(error)
-            page.end("interrupted" if is_interrupt(error) else message, arrivals.n_frames)
+            page.end("interrupted" if isinstance(error, KeyboardInterrupt) else message, arrivals.n_frames)
             raise
 
 

@@ -9,7 +9,6 @@ from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 
 from photonpano.errors import PluginError, described
-from photonpano.execution.interrupts import is_interrupt
 from photonpano.plugins.contributions import PROJECT
 from photonpano.plugins.registry.catalog import (
     BrokenPlugin,
@@ -55,9 +54,7 @@ def discover() -> Catalog:
             rows += [make_entry(contribution, origin) for contribution in contributions_of(loaded)]
             if hook:
                 observers.append(Observer(origin, hook))
-        except BaseException as error:  # whatever the plugin's import does, it is a row
-            if is_interrupt(error):
-                raise
+        except Exception as error:  # whatever is wrong with a plugin, it is a row
             message = str(error) if isinstance(error, PluginError) else described(error)
             broken.append(BrokenPlugin(origin, " ".join(message.split())))
     if unknown := [word for key, word in disabling.items() if key not in set(map(_canonical, names))]:

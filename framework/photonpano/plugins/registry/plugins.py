@@ -8,7 +8,6 @@ from typing import Any
 import pluggy
 
 from photonpano.errors import PluginError, described
-from photonpano.execution.interrupts import is_interrupt
 from photonpano.plugins import hookspecs
 from photonpano.plugins.contributions import API_VERSION, KINDS, PROJECT, Contribution, Kind
 from photonpano.text import listed
@@ -73,9 +72,7 @@ def _offered(manager: pluggy.PluginManager, kind: Kind) -> list[Contribution]:
     try:
         results: list[Any] = getattr(manager.hook, kind.hook)()
         offered = [item for result in results for item in _items(result)]
-    except BaseException as error:
-        if is_interrupt(error):
-            raise
+    except Exception as error:
         raise PluginError(f"{kind.hook} raised {described(error)}") from error
     if len(offered) > MAX_OFFERED:
         raise PluginError(f"{kind.hook} offers more than {MAX_OFFERED} components; does it end?")

@@ -211,7 +211,7 @@ def test_interrupted_run_keeps_its_frames_and_says_how_to_go_on(moving_frames: n
         program.send_signal(signal.SIGINT)
         assert program.stderr is not None
         printed = program.stderr.read().decode()
-        assert program.wait() in (130, -signal.SIGINT), printed  # the latter where a busy machine takes long to clean up
+        assert program.wait() == 130, printed
     way_on = f"photonpano run pipe.yaml --set source.with.path={kept} --output {tmp_path / 'run'}"
     assert f"warning: the frames that arrived are in {kept}; run them with `{way_on}`\n" in printed
     assert "interrupted; no file is left half-written" in printed
