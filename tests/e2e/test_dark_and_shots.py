@@ -170,7 +170,6 @@ def test_what_no_camera_passes_is_two_shots(two_shots: Path, small_capture: Path
     assert how == "largest" or "frames 0 to 159 and frames 160 to" in shots[0]
 
 
-
 def test_other_shots_are_numbered_by_their_length_and_those_that_fail_are_left_out(
     tiny_spec: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
