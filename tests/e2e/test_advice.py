@@ -67,7 +67,7 @@ def test_advice_that_is_followed_helps(case: str, simulated: Callable[..., Path]
     )
     assert doubtful.verdict is not None
     assert better.verdict is not None
-    assert advice in {reason.what: reason.what_to_do for reason in doubtful.verdict.reasons}[what]
+    assert advice in {reason.what: reason.what_to_do for reason in (*doubtful.verdict.reasons, *doubtful.verdict.notes)}[what]
     assert better.verdict.status == "trusted"
     scores = [evaluate(each.directory, truth_path(capture)) for each in (doubtful, better)]
     if case == "flat-field":  # the panorama is worse, rather than the motion

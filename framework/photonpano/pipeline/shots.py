@@ -32,6 +32,7 @@ ResultT = TypeVar("ResultT")
 _BLOCKS, _SHORTEST, _LONGEST = 64, 4, 32  # blocks of frames that are compared; fewest and most frames of one
 _SIDE = 4  # blocks before and after an instant whose means are compared
 _ABRUPT = 3.0  # least change of the image where a shot ends, relative to the changes around it, without photon noise
+_SURE = 6.0  # standard deviations of these changes by which it must exceed them
 _FEWEST = 3  # exposures of a shot
 
 
@@ -99,8 +100,8 @@ def _first_after_change(source: Source, span: FrameSpan) -> int | None:
     changes = ((means[_SIDE:] - means[:-_SIDE]) ** 2 - noise).mean(axis=(1, 2))
     starts = around.start + length * (np.arange(len(changes)) + _SIDE)
     index = int(np.where((span.start <= starts) & (starts < span.stop), changes, -1).argmax())
-    usual = max(float(np.median(changes)), 0.0)
-    if changes[index] < _ABRUPT * (usual + robust_std(changes - np.median(changes))):
+    usual = float(np.median(changes))
+    if changes[index] < max(_ABRUPT * usual, usual + _SURE * robust_std(changes - usual)):
         return None
     # The change lies within a block of the boundary between both means.
     first = int(starts[index]) - length

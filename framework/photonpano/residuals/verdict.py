@@ -105,63 +105,6 @@ def _narrow(run: TestedRun) -> Found | None:
 
 
 @FACTS.doubtful_above(
-    0.5,
-    "the image stands still, and has the fine grain of a sensor whose pixels differ",
-    "divide by a flat field (corrections: flat-field); what was found to stand still may be the sensor, and not the scene",
-)
-def _grain(run: TestedRun) -> Found | None:
-    residuals, motion = run.explained.residuals, run.explained.motion
-    middle = corners(residuals.frame_shape).mean(axis=0)
-    places = transform_points(motion.homographies[motion.located], middle[None])[:, 0]
-    if np.ptp(places, axis=0).max() > _STILL_PX:
-        return None
-    # A lens blurs what it images, so that waves of two or three pixels are weak; the grain of pixels is white.
-    counts = np.nan_to_num(residuals.pixel_gain * residuals.pixel_mean)
-    image = counts / np.maximum(ndimage.gaussian_filter(counts, _SMOOTH_PX), 1e-9)
-    window = np.outer(*(np.hanning(size + 2)[1:-1] for size in image.shape))
-    power = np.abs(np.fft.rfft2(window * (image - np.average(image, weights=window)))) ** 2 / (window**2).sum()
-    sums = residuals.blocks[..., [V, M]].sum(axis=(0, 1))
-    noise = sums[0] / max(sums[1], 1e-9) / max(float(counts.mean()), 1e-9)
-    cycles = np.hypot(np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1]))
-    fine, coarse = (float(power[(low < cycles) & (cycles < high)].mean()) - noise for low, high in (_FINE, _COARSE))
-    return Found(max(fine, 0.0) / max(coarse, 1e-9), "power of waves of 2 to 3 px, relative to those of 6 to 10 px")
-
-
-@FACTS.doubtful_above(
-    0.5,
-    "more than half of the frame stands still while the rest moves",
-    "mask what stands in the frame (corrections: mask); the motion may be that of either part",
-)
-def _standing(run: TestedRun) -> Found | None:
-    return run.decided("standing_share", "share of the parts that show motion or rest")
-
-
-@FACTS.doubtful_above(
-    0.5,
-    "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
-    "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
-)
-def _layers(run: TestedRun) -> Found | None:
-    # Later levels leave out what is near.
-    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
-    where = "share of the frames that is left out, on average"
-    if parallax:
-        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
-    if (found := run.decided("movers", where)) is None:
-        return None
-    # Where little is left out, but much changes that is not, what is left out may be the scene.
-    changing_share, _ = changing_places(run.explained.residuals)
-    if min(found.figure, changing_share) <= MUCH:
-        return found
-    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
-
-
-def of_either_part(run: TestedRun) -> bool:
-    """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
-    return any(test.judged(run) for test in (_grain, _standing, _layers))
-
-
-@FACTS.doubtful_above(
     _UNCERTAIN_PX,
     "the expected error of the motion is large",
     "use more light; where few pairs tie parts together, more of them (graph.skips, graph.tie)",
@@ -225,6 +168,63 @@ def _one_direction(run: TestedRun) -> Found | None:
     )
     what = "the image says nothing of motion along one direction"
     return Found(weak, f"{where}; {strong:.2g} px across it", what=what, what_to_do=what_to_do)
+
+
+@FACTS.doubtful_above(
+    0.5,
+    "the image stands still, and has the fine grain of a sensor whose pixels differ",
+    "divide by a flat field (corrections: flat-field); what was found to stand still may be the sensor, and not the scene",
+)
+def _grain(run: TestedRun) -> Found | None:
+    residuals, motion = run.explained.residuals, run.explained.motion
+    middle = corners(residuals.frame_shape).mean(axis=0)
+    places = transform_points(motion.homographies[motion.located], middle[None])[:, 0]
+    if np.ptp(places, axis=0).max() > _STILL_PX:
+        return None
+    # A lens blurs what it images, so that waves of two or three pixels are weak; the grain of pixels is white.
+    counts = np.nan_to_num(residuals.pixel_gain * residuals.pixel_mean)
+    image = counts / np.maximum(ndimage.gaussian_filter(counts, _SMOOTH_PX), 1e-9)
+    window = np.outer(*(np.hanning(size + 2)[1:-1] for size in image.shape))
+    power = np.abs(np.fft.rfft2(window * (image - np.average(image, weights=window)))) ** 2 / (window**2).sum()
+    sums = residuals.blocks[..., [V, M]].sum(axis=(0, 1))
+    noise = sums[0] / max(sums[1], 1e-9) / max(float(counts.mean()), 1e-9)
+    cycles = np.hypot(np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1]))
+    fine, coarse = (float(power[(low < cycles) & (cycles < high)].mean()) - noise for low, high in (_FINE, _COARSE))
+    return Found(max(fine, 0.0) / max(coarse, 1e-9), "power of waves of 2 to 3 px, relative to those of 6 to 10 px")
+
+
+@FACTS.doubtful_above(
+    0.5,
+    "more than half of the frame stands still while the rest moves",
+    "mask what stands in the frame (corrections: mask); the motion may be that of either part",
+)
+def _standing(run: TestedRun) -> Found | None:
+    return run.decided("standing_share", "share of the parts that show motion or rest")
+
+
+@FACTS.doubtful_above(
+    0.5,
+    "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
+    "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
+)
+def _layers(run: TestedRun) -> Found | None:
+    # Later levels leave out what is near.
+    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
+    where = "share of the frames that is left out, on average"
+    if parallax:
+        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
+    if (found := run.decided("movers", where)) is None:
+        return None
+    # Where little is left out, but much changes that is not, what is left out may be the scene.
+    changing_share, _ = changing_places(run.explained.residuals)
+    if min(found.figure, changing_share) <= MUCH:
+        return found
+    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
+
+
+def of_either_part(run: TestedRun) -> bool:
+    """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
+    return any(test.judged(run) for test in (_grain, _standing, _layers))
 
 
 @AGREEMENT.doubtful_above(
