@@ -8,13 +8,12 @@ from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.lens import LensDistortion, deformation_px, lens_distortion
 from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
-from photonpano.residuals.tested_run import FIND_LENS, TestedRun, Tests
+from photonpano.residuals.tested_run import TestedRun, Tests
 from photonpano.values import BoolArray
 from photonpano.values.verdict import Found
 
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
-_WITHOUT_LENS = "undistort the frames before, or use their middle only (corrections: crop)"
 
 CAUSES = Tests(decides=False)
 
@@ -131,22 +130,6 @@ def distorting_lens(explained: Explained) -> LensDistortion | None:
     # What else is not explained, such as a tremor, moves blocks by more than photon noise.
     misfit = max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
     return None if found is None or found.sigmas <= 5 * misfit else found
-
-
-@CAUSES.doubtful_above(
-    0.002,  # half of this is seen without a lens
-    "the lens distorts the frames, which bends the motion",
-    f"write motion: {{model: rotation}} and {FIND_LENS} for a camera that only turns; or {_WITHOUT_LENS}",
-)
-def _lens(run: TestedRun) -> Found | None:
-    found = distorting_lens(run.explained)
-    if found is None:
-        return None
-    camera, what_to_do = run.explained.motion.camera, run.freer_model
-    if camera is not None:
-        distortion = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
-        what_to_do = f"{distortion}; or {_WITHOUT_LENS}"
-    return Found(abs(found.k1), f"about {found.k1:.1%} at the corners", what_to_do=what_to_do)
 
 
 @CAUSES.doubtful_above(

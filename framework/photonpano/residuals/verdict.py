@@ -16,7 +16,7 @@ from photonpano.geometry import corners, transform_points
 from photonpano.motion.loop import TOO_NARROW, LevelResult
 from photonpano.motion.timeline import DARK_JUMP, SHOTS, UNCUT_JUMP
 from photonpano.residuals.block_sums import M, V
-from photonpano.residuals.causes import CAUSES, changing_places
+from photonpano.residuals.causes import CAUSES, changing_places, distorting_lens
 from photonpano.residuals.measure import FEWEST_FRAMES
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
 from photonpano.residuals.tested_run import FIND_LENS, FREE, RIVAL, TestedRun, Tests
@@ -25,6 +25,7 @@ from photonpano.values.verdict import Found, Test, judged
 
 NARROW = "the camera moves by more than the model of its motion holds"
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
+_WITHOUT_LENS = "undistort the frames before, or use their middle only (corrections: crop)"
 MUCH = 0.25  # share of the panorama that changes, beyond which what is left out may be the scene
 MAX_CONTRAST = 0.05  # up to this share of the light, what the panorama does not explain does not matter
 _UNCERTAIN_PX = 1.0
@@ -102,6 +103,22 @@ def _narrow(run: TestedRun) -> Found | None:
     finds = model.kind == "rotation" and not (motion.camera is not None and motion.camera.distorts)
     what_to_do = f"{FREE}, or {FIND_LENS}" if finds else ""
     return Found(times, where, what_to_do=what_to_do)
+
+
+@FACTS.doubtful_above(
+    0.002,  # half of this is seen without a lens
+    "the lens distorts the frames, which bends the motion",
+    f"write motion: {{model: rotation}} and {FIND_LENS} for a camera that only turns; or {_WITHOUT_LENS}",
+)
+def _lens(run: TestedRun) -> Found | None:
+    found = distorting_lens(run.explained)
+    if found is None:
+        return None
+    camera, what_to_do = run.explained.motion.camera, run.freer_model
+    if camera is not None:
+        distortion = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
+        what_to_do = f"{distortion}; or {_WITHOUT_LENS}"
+    return Found(abs(found.k1), f"about {found.k1:.1%} at the corners", what_to_do=what_to_do)
 
 
 @FACTS.doubtful_above(
