@@ -116,13 +116,13 @@ def test_shots_that_nothing_ties_together_are_run_apart(
         np.testing.assert_array_equal(np.flatnonzero(motion["located"]), np.arange(120, 300))
         assert motion["reference"] == 210
     assert result.record["warnings"][0] == (
-        "the capture holds 2 shots that no pair of exposures ties together: frames 0 to 119 and frames 120 to 299. The "
+        "the capture holds 2 shots that no motion ties together: frames 0 to 119 and frames 120 to 299. The "
         "panorama is of frames 120 to 299 alone; the others have run folders of their own beside this one, unless their runs "
         "failed: frames 0 to 119 in run.panorama-2"
     )
     assert result.verdict is not None
     assert str(result.verdict.reasons[0]) == (
-        "the capture holds shots that no pair of exposures ties together, and the panorama is of the longest alone (frames 0 "
+        "the capture holds shots that no motion ties together, and the panorama is of the longest alone (frames 0 "
         "to 119 and frames 120 to 299): 2, trusted up to 1; look at the panoramas of the others beside the run folder: "
         "DIR.panorama-2 and so on"
     )

@@ -66,7 +66,7 @@ class Timeline:
     taken: FloatArray  # (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated
     cuts: tuple[Cut, ...] = ()  # where the image jumps, in order
     dark: tuple[FrameSpan, ...] = ()  # frames without light, in order: no group holds them, and they are not located
-    shots: tuple[FrameSpan, ...] = ()  # parts that no pair of exposures ties together, in order; groups are of the longest
+    shots: tuple[FrameSpan, ...] = ()  # parts that no motion ties together, in order; groups are of the longest
 
     @classmethod
     def regular(cls, n_frames: int) -> Timeline:
@@ -106,7 +106,7 @@ class Timeline:
         dark = [
             Decision(DARK_FRAMES, str(span), "no light reaches the sensor; these frames are left out") for span in self.dark
         ]
-        apart = f"no pair of exposures ties them together; {self.shot} are located, since they are the most"
+        apart = f"no motion ties them together; {self.shot} are located, since they are the most"
         shots = [Decision(SHOTS, listed(map(str, self.shots)), apart)] if self.shots else []
         return (found if repeated else []) + shots + dark + [cut.decision for cut in self.cuts]
 

@@ -1,4 +1,4 @@
-"""Find the shots of a capture: parts that no pair of exposures ties together, as where the camera was stopped and moved."""
+"""Find the shots of a capture: parts that no motion ties together, as where the camera was stopped and moved."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def timeline_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
         shots = timeline.shots
         others = [f"{shot} in {folder.name}" for folder, shot in other_shots(shots, directory).items()]
         warnings.append(
-            f"the capture holds {len(shots)} shots that no pair of exposures ties together: {listed(map(str, shots))}. The "
+            f"the capture holds {len(shots)} shots that no motion ties together: {listed(map(str, shots))}. The "
             f"panorama is of {timeline.shot} alone; the others have run folders of their own beside this one, unless their "
             f"runs failed: {listed(others)}"
         )

@@ -32,9 +32,10 @@ class TestedRun:
 
     def decided(self, name: str, meaning: str = "", *, what: str = "", what_to_do: str = "") -> Found | None:
         """Return the figure of the last decision of a name, with its reason if no meaning is given; None if there is none."""
-        found = [each for each in self.decisions if each.what == name]
-        where = meaning or found[-1].reason if found else ""
-        return Found(float(found[-1].value), where, what=what, what_to_do=what_to_do) if found else None
+        for each in reversed(self.decisions):
+            if each.what == name:
+                return Found(float(each.value), meaning or each.reason, what=what, what_to_do=what_to_do)
+        return None
 
 
 _Finder: TypeAlias = Callable[[TestedRun], Found | None]

@@ -1,4 +1,4 @@
-"""The verdict on a run: whether motion and panorama explain the photons, as a table of tests judges.
+"""The verdict on a run: whether motion and panorama explain the photons, by a table of tests.
 
 Few tests decide: the halves of the capture agree, the photons are as the panorama predicts, the motion is known to a pixel, no
 freer motion is likelier, and it is that of the scene. What else is found names the cause of a doubt, or is a note.
@@ -47,7 +47,7 @@ def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequen
 
 @FACTS.doubtful_above(
     1,
-    "the capture holds shots that no pair of exposures ties together, and the panorama is of the longest alone",
+    "the capture holds shots that no motion ties together, and the panorama is of the longest alone",
     "look at the panoramas of the others beside the run folder: DIR.panorama-2 and so on",
 )
 def _shots(run: TestedRun) -> Found | None:
@@ -133,6 +133,8 @@ def _uncertain(run: TestedRun) -> Found | None:
     if not len(known) or not np.isfinite(known).all():
         alone = Found(0.0, "a single exposure was located", doubtful=True, what="no motion is known")
         return None if of_either_part(run) else alone._replace(what_to_do="use smaller groups, or more light")
+    if _narrow.judged(run):  # its distance is in the expected error
+        return None
     for found in (_two_motions(run), _uncut_jump(run), _ambiguous(run), _one_direction(run)):
         if found is not None and found.figure > _UNCERTAIN_PX:
             return found

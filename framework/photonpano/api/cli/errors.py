@@ -1,6 +1,8 @@
 """Report errors of commands, and signals that end them: a message on stderr, and an exit code."""
 
+import errno
 import logging
+import os
 import signal
 import sys
 import traceback
@@ -12,7 +14,7 @@ import typer
 
 from photonpano.api.cli.verbosity import SHOWN, log_shown
 from photonpano.api.command import WrongArgumentError
-from photonpano.errors import PhotonpanoError, PluginError, SpecError
+from photonpano.errors import OutputError, PhotonpanoError, PluginError, SpecError
 
 FAILED = 1
 WRONG_SPEC = 2
@@ -63,6 +65,14 @@ def reported(*, debug: bool = False) -> Iterator[None]:
         log_shown(logging.ERROR, INTERRUPTED.strip())
         number = error.args[0] if isinstance(error, Signalled) else signal.SIGINT
         raise typer.Exit(SIGNALLED + number) from error
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EFBIG) or error.filename is not None:
+            raise
+        # Files that cannot be written have errors of their own: this is standard output.
+        # What is left in the buffer is dropped: it would fail once more when the interpreter ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        full = OutputError(f"cannot write to standard output: {error.strerror}")
+        raise typer.Exit(print_error(full, debug)) from error
     except Exception as error:
         if not isinstance(error, typer.Exit | typer.BadParameter):
             log_shown(logging.ERROR, "a defect of photonpano or of a plugin", error)

@@ -1,6 +1,7 @@
 """Commands end with a sentence and an exit code: on errors, on signals, and where nobody reads their output."""
 
 import logging
+import resource
 import signal
 import subprocess
 import sys
@@ -58,6 +59,20 @@ def test_ignored_signal_stays_ignored(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0
+
+
+def test_full_standard_output_is_one_sentence(folder: Path, program: list[str]) -> None:
+    """A limit on file sizes refuses the first byte, as a full disk does."""
+    with (folder / "output").open("w") as output:
+        done = subprocess.run(
+            [*program, "plugins", "list"],
+            stdout=output,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)),
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (1, "error: cannot write to standard output: File too large\n")
 
 
 def test_closed_streams_are_no_error_and_files_do_not_take_their_place(folder: Path, program: list[str]) -> None:
