@@ -122,10 +122,11 @@ def too_short(group_size: int, n_frames: int) -> str | None:
     """Return the problem if a capture is shorter than a group; None if it is not."""
     if n_frames >= group_size:
         return None
-    return (
-        f"the capture has {n_frames} frames, fewer than one group of {group_size}; "
-        f"set group_size to {max(1, n_frames // 4)} or less, so that at least four groups fit"
-    )
+    most, have = n_frames // 4, f"the capture has {n_frames} frame{'s' * (n_frames > 1)}"
+    if not most:
+        return f"{have}; a motion takes four or more"
+    size = f"{most} or less" if most > 1 else "1"
+    return f"{have}, fewer than one group of {group_size}; set group_size to {size}, so that at least four groups fit"
 
 
 class AutoResampler:
