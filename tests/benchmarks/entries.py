@@ -3,8 +3,9 @@
     python tests/benchmarks/entries.py docs/how-to/benchmark.md [--quantaodometry FOLDER] [--quantaodometry-python PYTHON]
         [--folder runs/entries] [--only flat dark] [--limit-s 900]
 
-The captures are those that `photonpano benchmark make` writes, the public half. Programs run as in peers.py; one whose code is
-not given has no column. Entries stay in the folder, one for each program, so that an interrupted benchmark continues.
+The captures are those that `python -m tests.benchmarks.open make` writes, the public half. Programs run as in peers.py; one
+whose code is not given has no column. Entries stay in the folder, one for each program, so that an interrupted benchmark
+continues.
 """
 
 from __future__ import annotations
@@ -17,12 +18,11 @@ from typing import Any
 
 import numpy as np
 from harness import chosen, command, table, write_tables
+from open.captures import PUBLIC, Benchmark, BenchmarkCapture, make
+from open.score import CaptureScore, score
 from peers import Peer, result_of
 
 from photonpano import parse_spec, run
-from photonpano.api.benchmark.captures import PUBLIC, Benchmark, BenchmarkCapture
-from photonpano.api.benchmark.make import make
-from photonpano.api.benchmark.score import CaptureScore, score
 from photonpano.text import pixels, share
 
 GROUPS = {"dark": 150, "fast": 17, "loop": 33, "trembling": 50, "turn": 35}

@@ -25,10 +25,10 @@ import cv2
 import numpy as np
 from harness import IMAGES, Study, chosen, command, simulator, table, write_tables
 from numpy.typing import NDArray
+from open.pictures import alignment_of
 
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import Truth, corner_errors, image_score, load_truth, true_panorama, white_flux
-from photonpano.evaluation.registration import alignment_of
 from photonpano.geometry import Canvas, corners, transform_points
 from photonpano.photometry import tone_mapped
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import importlib.util
 import itertools
+import os
 import re
 import shlex
 import shutil
@@ -193,6 +194,8 @@ class Reader:
                 return None
             case ["pytest", *arguments]:
                 return self.run_pytest(block, arguments, shown)
+            case ["python", "-m", module, *arguments]:
+                return self.run_module(block, module, arguments, shown)
             case ["python", script, *_]:
                 assert (ROOT / script).is_file(), f"{block}: {script}"
                 return None
@@ -220,6 +223,21 @@ class Reader:
             self.compare(block, arguments, done.stdout, shown)
         else:
             assert done.returncode == 0, f"{block}: {arguments}\n{done.stdout}"
+
+    def run_module(self, block: Block, module: str, arguments: list[str], shown: str) -> None:
+        """Run a module of the repository, which pages run in its root."""
+        more = ["--help"] if block.marker == "test: parse" else []
+        paths = os.pathsep.join([str(ROOT), *filter(None, sys.path)])
+        done = subprocess.run(
+            [sys.executable, "-m", module, *arguments, *more],
+            env={**os.environ, "PYTHONPATH": paths},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, f"{block}: {module}\n{done.stderr}"
+        if not more:
+            self.compare(block, [module, *arguments], done.stdout, shown)
 
     def compare(self, block: Block, words: list[str], printed: str, shown: str) -> None:
         flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE

@@ -50,7 +50,7 @@ def test_help_imports_nothing_heavy(program: list[str]) -> None:
 
 def test_commands_are_complete() -> None:
     words = "run batch check check-run render video verify explain info preview convert export simulate dark evaluate compare"
-    groups = {"benchmark make", "benchmark score", "plugins list", "plugins show"}
+    groups = {"plugins list", "plugins show"}
     assert set(COMMANDS) == {*words.split(), *groups, "clean", "demo", "schema", "warm-up"}
 
 

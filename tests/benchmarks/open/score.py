@@ -1,25 +1,20 @@
-"""Score the motion or the panoramas that any program has made of the benchmark."""
+"""Score the motion or the panoramas that any program has made of the captures of the open benchmark."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import typer
 
-from photonpano.api.benchmark.captures import Benchmark, BenchmarkCapture
-from photonpano.api.command import command, json_lines
 from photonpano.capture import seen_through
 from photonpano.contracts.protocols import Trajectory
 from photonpano.errors import InputError, PhotonpanoError
 from photonpano.evaluation import Evaluation, RunTrajectory, load_panorama, load_truth
-from photonpano.evaluation.entries import Expected, in_true_plane, read_motion
-from photonpano.evaluation.registration import PICTURES, register_picture
 from photonpano.evaluation.run_scores import picture_scores
 from photonpano.evaluation.run_scores import score as score_of
 from photonpano.execution.context import Context, Progress, Quiet, usual
@@ -31,14 +26,17 @@ from photonpano.pipeline.components import build_source
 from photonpano.reading import reading
 from photonpano.record.run_json import read_record
 from photonpano.specs import parse_spec
-from photonpano.text import columns
 from photonpano.values import FluxImage, FrameSpan, Panorama
+
+from .captures import Benchmark, BenchmarkCapture
+from .motion import in_true_plane, read_motion
+from .pictures import PICTURES, register_picture
 
 _MOTION = ("", ".npz", ".csv", ".txt")  # a run folder, or a file
 _POOR = 0.95  # correlation with the scene, below which a picture hardly fits: that of right ones is 0.96 or more
 _LARGEST = 100  # longest side of a panorama that is rendered, in sides of a frame
 _SECONDS = "seconds.csv"  # of an entry: a line `capture,seconds` for each
-_HEADER = ("capture", "error, px", "95 %", "located", "in 3 std", "PSNR, dB", "SSIM", "to oracle", "seconds", "note")
+HEADER = ("capture", "error, px", "95 %", "located", "in 3 std", "PSNR, dB", "SSIM", "to oracle", "seconds", "note")
 _FORMS = ("{:.3f}", "{:.3f}", "{:.0%}", "{:.0%}", "{:.2f}", "{:.3f}", "{:.2f}", "{:.1f}")
 
 Pictures: TypeAlias = "tuple[FluxImage, FluxImage]"  # flux and weight
@@ -67,20 +65,6 @@ class CaptureScore:
         return [self.capture, *shown, self.note]
 
 
-def _lines(scores: tuple[CaptureScore, ...], *, as_json: bool = False) -> Iterator[str]:
-    if as_json:
-        yield from json_lines([asdict(each) for each in scores])
-    else:
-        yield columns([_HEADER, *(each.cells() for each in scores)])
-
-
-@command(
-    "set entry",
-    _lines,
-    folder=typer.Argument(metavar="DIR", help="The folder that 'benchmark make' wrote."),
-    entry=typer.Argument(metavar="ENTRY", help="A folder with a file or a run folder for each capture."),
-    truths=typer.Option(metavar="DIR"),
-)
 def score(
     folder: Path | str,
     entry: Path | str,
@@ -163,8 +147,7 @@ def _scored(
             return CaptureScore(
                 name, psnr_db=scored.psnr_db, ssim=scored.ssim, below_oracle_db=below, seconds=seconds, note=note
             )
-        expected = Expected(capture.n_frames, capture.frame_shape, capture.frame_rate_hz, capture.focal_px)
-        motion, notes = read_motion(path, expected)
+        motion, notes = read_motion(path, capture)
         if path.is_dir():
             panorama: Callable[[], Pictures] | None = partial(load_panorama, path)
             if seconds is None:

@@ -1,9 +1,10 @@
-"""The captures of the benchmark: the conditions, what is drawn of each from the seed, and the file that describes a set."""
+"""The captures of the open benchmark: the conditions, what is drawn of each from a seed, and how a set is written."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import shutil
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, Literal
@@ -11,9 +12,13 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from photonpano import __version__
+from photonpano.api.simulate import simulate
 from photonpano.errors import InputError, SpecError
+from photonpano.execution.context import Progress, Quiet, usual
+from photonpano.files.folders import atomic_folder, require_new
 from photonpano.pipeline.components import build_source
-from photonpano.reading import read_json
+from photonpano.reading import read_json, reading
 from photonpano.specs import Plan, parse_spec
 
 VERSION: Literal[1] = 1  # of the set; raised whenever a capture changes
@@ -22,6 +27,7 @@ SEALED = "sealed-"  # prefix of the captures whose truth is not published
 _PUBLIC_SEED = b"photonpano benchmark 1"
 # Below these, seeds are drawn: nobody can try all of those of a sealed capture.
 _PUBLIC_SEEDS, _SEALED_SEEDS = 2**31, 2**63 - 1
+_SHORTEST_SECRET = 16  # bytes, which nobody guesses
 _DRAWS = 20  # paths that are tried for a capture, since some leave the scene
 _SHAKE = {"rms_px": 2, "roll_rms_deg": 0.05, "frequencies_hz": [60, 170, 400]}
 
@@ -103,7 +109,7 @@ class Benchmark(BaseModel):
         """Read the description of a set; raises an `InputError` if it is none, or of another version."""
         path = folder / DESCRIPTION
         if not path.exists():
-            raise InputError(f"{folder} has no {DESCRIPTION}; give the folder that `photonpano benchmark make` wrote")
+            raise InputError(f"{folder} has no {DESCRIPTION}; give the folder that `make` wrote")
         found = read_json(path, _Version)
         if found.version != VERSION:
             raise InputError(
@@ -156,3 +162,69 @@ def described_capture(file: Path, plan: Plan) -> BenchmarkCapture:
         filters=settings["sensor"]["filters"],
         sha256=digest,
     )
+
+
+def make(
+    folder: Path | str,
+    captures: Sequence[str] = (),
+    secret: Path | str | None = None,
+    truths: Path | str | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Benchmark:
+    """Write the captures of the benchmark with their truth, and benchmark.json, which describes them.
+
+    The sealed captures come with a release. Who keeps their secret makes them with it; their truth goes to another folder.
+
+    Args:
+        folder: of the set.
+        captures: names of the captures to write; by default all that can be.
+        secret: a file of 16 bytes or more, from which the sealed captures are drawn.
+        truths: the folder for the truth of the sealed captures.
+        overwrite: replace the captures that are there under these names.
+        progress: receives the stages; by default, bars in a notebook and nothing elsewhere.
+
+    Raises:
+        InputError: there is no such capture, or the secret is missing or too short.
+        OutputError: the folder, or a truth of a sealed capture, is there already, or cannot be written.
+    """
+    folder = Path(folder)
+    chosen = captures or (PUBLIC if secret is None else ALL)
+    if unknown := sorted(set(chosen) - set(ALL)):
+        raise InputError(f"there is no capture {' or '.join(unknown)}; choose from {', '.join(ALL)}")
+    sealed = [name for name in chosen if name.startswith(SEALED)]
+    if sealed and (secret is None or truths is None):
+        raise InputError(
+            f"{', '.join(sealed)}: sealed captures come with a release; to make them, give their --secret, and a folder for "
+            "their --truths"
+        )
+    seed = None if secret is None else _secret(Path(secret))
+    require_new(folder, overwrite)
+    sealed_truths = {name: Path(truths, f"{name}.truth.npz") for name in sealed} if truths is not None else {}
+    for path in sealed_truths.values():
+        require_new(path, overwrite)
+    described = {}
+    with atomic_folder(folder) as written, usual(progress).stage("benchmark", len(chosen), "captures") as advance:
+        for name in chosen:
+            plan = capture_plan(name, seed)
+            made = simulate(plan, written / f"{name}.npy", Quiet())
+            if name in sealed_truths:
+                assert made.truth is not None
+                sealed_truths[name].parent.mkdir(parents=True, exist_ok=True)
+                shutil.move(made.truth, sealed_truths[name])
+            described[name] = described_capture(made.path, plan)
+            advance(1)
+        benchmark = Benchmark(version=VERSION, photonpano=__version__, captures=described)
+        (written / DESCRIPTION).write_text(benchmark.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    return benchmark
+
+
+def _secret(path: Path) -> bytes:
+    with reading(path):
+        secret = path.read_bytes().strip()
+    if len(secret) < _SHORTEST_SECRET:
+        raise InputError(
+            f"{path} holds {len(secret)} bytes, which can be guessed; give a secret of {_SHORTEST_SECRET} bytes or more"
+        )
+    return secret

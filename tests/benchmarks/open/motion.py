@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,8 @@ from photonpano.geometry import Camera, normalised, rescaling, scaled_ahead, tra
 from photonpano.reading import reading
 from photonpano.values import BoolArray, FloatArray, Homography
 
+from .captures import BenchmarkCapture
+
 _MATRIX = tuple(f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
 _COLUMNS = f"frame and {_MATRIX[0]} to {_MATRIX[-1]}, or frame, x and y, with angle_deg and std_px if they are known"
 _TUM = "seconds, x, y, z and a quaternion x, y, z, w"
@@ -25,17 +27,7 @@ _FEWEST = 20  # located frames of an entry: the alignment has as many parameters
 _SCALES = (0.25, 0.5, 2.0, 4.0)  # sizes of frames that are tried, as shares of that of the capture
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Expected:
-    """What is known of the capture of an entry."""
-
-    n_frames: int
-    frame_shape: tuple[int, int]
-    frame_rate_hz: float
-    focal_px: float
-
-
-def read_motion(path: Path, capture: Expected) -> tuple[RunTrajectory, tuple[str, ...]]:
+def read_motion(path: Path, capture: BenchmarkCapture) -> tuple[RunTrajectory, tuple[str, ...]]:
     """Read the motion of a run folder, or of an .npz, .csv or .txt (TUM) file, and notes about what was adapted.
 
     Frames that the file leaves out, or whose numbers are not finite, are not located; between located ones, their motion is
@@ -64,7 +56,7 @@ def read_motion(path: Path, capture: Expected) -> tuple[RunTrajectory, tuple[str
 _Read = tuple[FloatArray, BoolArray, FloatArray, Camera | None, tuple[str, ...]]
 
 
-def _from_archive(path: Path, capture: Expected) -> _Read:
+def _from_archive(path: Path, capture: BenchmarkCapture) -> _Read:
     content = "the motion of an entry, `homographies` (frames, 3, 3)"
     arrays = read_numbers(path, content, (), ("homographies", "located", "std_px", "frame_shape"))
     found = arrays.get("homographies")
@@ -91,7 +83,7 @@ def _from_archive(path: Path, capture: Expected) -> _Read:
     return homographies, located, std_px, None, notes
 
 
-def _from_table(path: Path, capture: Expected) -> _Read:
+def _from_table(path: Path, capture: BenchmarkCapture) -> _Read:
     with reading(path, "is not a table; separate its columns by commas"), path.open(newline="", encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file))
     names = set(rows[0]) if rows else set()
@@ -119,7 +111,7 @@ def _from_table(path: Path, capture: Expected) -> _Read:
     return _safe(homographies, located, path), located, std_px, None, ()
 
 
-def _from_tum(path: Path, capture: Expected) -> _Read:
+def _from_tum(path: Path, capture: BenchmarkCapture) -> _Read:
     with reading(path, f"is not a trajectory as TUM writes it: lines of {_TUM}"):
         table = np.loadtxt(path, ndmin=2)
         if table.shape[1] != 8:
@@ -210,5 +202,5 @@ def _size(n_frames: int, frame_shape: tuple[int, int]) -> str:
     return f"{n_frames:,} frames of {frame_shape[0]}x{frame_shape[1]}"
 
 
-def _expected(capture: Expected) -> str:
+def _expected(capture: BenchmarkCapture) -> str:
     return f"the capture has {_size(capture.n_frames, capture.frame_shape)}"

@@ -1,1 +1,0 @@
-"""A fixed set of captures on which programs are compared."""
