@@ -25,6 +25,8 @@ from photonpano.plugins.registry.discovery import DISABLE
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_simulator import scenes
 
+sys.path.append(str(Path(__file__).parent / "benchmarks" / "baselines"))  # a plugin that is not installed
+
 settings.register_profile("suite", max_examples=50, deadline=None)  # the machine may be busy
 settings.load_profile("suite")
 

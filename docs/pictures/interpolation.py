@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import picture_parts as draw
-from harness import to_reference
+from harness import to_reference, with_baselines
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from photonpano import StageContext, StreamInfo, discover
+from photonpano import StageContext, StreamInfo
 from photonpano import geometry as g
 from photonpano.capture.writing import truth_path
 from photonpano.photometry import BinaryResponse
@@ -57,7 +57,7 @@ def between_knots(
     noise = np.random.default_rng(0).normal(0, error_px, (len(instants), 8))
     to_corners = np.array([g.jacobian(knot, g.corners(shape)).reshape(8, 8) for knot in motion[instants]])
     knots = g.from_parameters(g.parameters(motion[instants]) + np.linalg.solve(to_corners, noise[..., None])[..., 0])
-    contribution = discover().find("interpolator", name).contribution
+    contribution = with_baselines().find("interpolator", name).contribution
     context = StageContext(StreamInfo(len(motion), *shape, None), BinaryResponse())
     trajectory = contribution.build(contribution.config(), context).fit(instants.astype(float), knots, None)
     frames = np.arange(instants[0], instants[-1] + 1)

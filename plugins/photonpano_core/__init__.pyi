@@ -1,10 +1,8 @@
 from .exporters import ExrExporter as ExrExporter
 from .exporters import RadianceExporter as RadianceExporter
 from .interpolators.interpolating import GeodesicInterpolator as GeodesicInterpolator
-from .interpolators.interpolating import LieInterpolator as LieInterpolator
 from .interpolators.interpolating import LucasKanadeInterpolator as LucasKanadeInterpolator
 from .interpolators.smoothing_spline import SmoothingSplineInterpolator as SmoothingSplineInterpolator
-from .mergers.burst import BurstMerger as BurstMerger
 from .mergers.local_flow import LocalFlowMerger as LocalFlowMerger
 from .mergers.photon_mle import PhotonMleMerger as PhotonMleMerger
 from .mergers.splat import SplatMerger as SplatMerger

@@ -93,12 +93,6 @@ def photonpano_mergers() -> Iterator[MergerContribution]:
         build=lambda config, _: plugin.LocalFlowMerger(config),
         handles_movers=True,
     )
-    yield MergerContribution(
-        name="burst",
-        summary="Quanta burst photography (Ma et al. 2020): blocks of frames aligned patch by patch in one shot, a baseline",
-        config=configs.BurstConfig,
-        build=lambda config, _: plugin.BurstMerger(config),
-    )
 
 
 @hookimpl
@@ -121,12 +115,6 @@ def photonpano_interpolators() -> Iterator[InterpolatorContribution]:
         summary="Constant velocity from each located instant to the next, along geodesics",
         config=configs.InterpolatorConfig,
         build=lambda config, _: plugin.GeodesicInterpolator(config),
-    )
-    yield InterpolatorContribution(
-        name="lie",
-        summary="Cubic spline in the group of the homographies",
-        config=configs.InterpolatorConfig,
-        build=lambda config, context: plugin.LieInterpolator(config, context.stream.frame_shape),
     )
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from photonpano import FrameSpan, Panorama, Plan, Source, evaluate, load_panorama, open_source, parse_spec, run
+from photonpano import Catalog, FrameSpan, Panorama, Plan, Source, evaluate, load_panorama, open_source, parse_spec, run
 from photonpano.capture.writing import truth_path, write_packed
 from photonpano.evaluation import (
     Evaluation,
@@ -42,6 +42,8 @@ from photonpano.merging.canvas_plan import plan_canvas
 from photonpano.merging.panorama import render
 from photonpano.reading import Closing
 from photonpano.record.environment import peak_memory_bytes
+
+sys.path.append(str(Path(__file__).parent / "baselines"))
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
@@ -120,8 +122,15 @@ class Study:
             spec = {**spec, "source": packed(capture, rate)["source"]}
         folder = self.folder / f"{name.replace(' ', '-')}-{digest(spec)}"
         if not (folder / "run.json").exists():
-            run(parse_spec(spec, output=folder))
+            run(parse_spec(spec, output=folder, catalog=with_baselines()))
         return folder
+
+
+def with_baselines() -> Catalog:
+    """Return what the installed plugins and the baselines offer."""
+    import photonpano_baselines
+
+    return photonpano_baselines.catalog()
 
 
 @contextmanager
@@ -207,7 +216,7 @@ class Compared:
     @property
     def plan(self) -> Plan:
         """The spec of the run."""
-        return parse_spec(record_of(self.folder)["spec"])
+        return parse_spec(record_of(self.folder)["spec"], catalog=with_baselines())
 
     @contextmanager
     def source(self) -> Iterator[Source]:

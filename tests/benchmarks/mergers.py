@@ -33,8 +33,9 @@ from harness import Study, chosen, command, groups, least, packed, passing, seen
 
 from photonpano import FrameSpan, Group, Merger, Source, SourceContext, load_trajectory
 from photonpano.geometry import FrameTrajectory, inverse, transform_points, translation
-from photonpano_core.configs import BurstConfig, LocalFlowConfig, PhotonMleConfig
-from photonpano_core.mergers.burst import BurstMerger
+from photonpano_baselines.burst import BurstMerger
+from photonpano_baselines.configs import BurstConfig
+from photonpano_core.configs import LocalFlowConfig, PhotonMleConfig
 from photonpano_core.mergers.local_flow import LocalFlowMerger
 from photonpano_core.mergers.photon_mle import PhotonMleMerger
 from photonpano_core.mergers.splat import SplatMerger

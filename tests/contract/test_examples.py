@@ -85,7 +85,6 @@ RUNS: dict[str, dict[str, Any]] = {
     "local-flow": SMALL_STREET
     | UNREFINED
     | {"source.with.frame_shape": "[64, 96]", "resample.with.group_size": 60, "levels": 2},
-    "burst": SMALL_STREET | UNREFINED | {"source.with.frame_shape": "[64, 96]", "resample.with.group_size": 60, "levels": 2},
     "splat": SMALL_STREET | SHORT | {"source.with.flux": 0.2, "resample.with.group_size": 60},
     "revisits": SMALL_STREET
     | {"source.with.n_frames": 500, "source.with.path.length_px": 300, "source.with.path.row_spacing_px": 20}

@@ -47,8 +47,6 @@ TestPhotonMle = of(MergerConformance, "photon-mle", config={"tolerance_px": 0.5}
 TestNaiveAverage = of(MergerConformance, "photon-mle", config={"compensate": False}, compensates=False)
 TestSplat = of(MergerConformance, "splat")
 TestLocalFlow = of(MergerConformance, "local-flow")
-# It finds the motion by itself, as well as patches of 40x56 px allow.
-TestBurst = of(MergerConformance, "burst", compensates=False)
 
 TestDirect = of(LocatorConformance, "direct", tolerance_px=0.1)
 TestOpencvSift = of(LocatorConformance, "opencv-sift", tolerance_px=0.3)
@@ -89,7 +87,6 @@ class TestKorniaLoftr(LocatorConformance):
 
 TestLucasKanade = of(InterpolatorConformance, "lucas-kanade")
 TestGeodesic = of(InterpolatorConformance, "geodesic")
-TestLie = of(InterpolatorConformance, "lie")
 TestSmoothingSpline = of(InterpolatorConformance, "smoothing-spline", tolerance_px=3.0)
 
 TestShortSpans = of(RefinerConformance, "short-spans")

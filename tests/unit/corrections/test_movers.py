@@ -147,7 +147,7 @@ def test_the_merged_background_is_that_without_the_walker() -> None:
     assert np.sqrt(np.nanmean(clean**2)) < 0.25 * np.sqrt(np.nanmean(ghost**2))
 
 
-@pytest.mark.parametrize("merger", ["photon-mle", "splat", "burst"])
+@pytest.mark.parametrize("merger", ["photon-mle", "splat"])
 def test_exposures_of_mergers_show_the_background_alone(merger: str) -> None:
     found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
     assert found is not None

@@ -16,7 +16,7 @@ from scipy import fft
 from photonpano import FloatArray, FrameSpan, Group, Response, Source, Trajectory, VirtualExposure
 from photonpano.compiling import compiled
 from photonpano.merging import PhotonSum
-from photonpano_core.configs import BurstConfig
+from photonpano_baselines.configs import BurstConfig
 from photonpano_core.mergers.dense_motion.frames import WeightedFrames, count_variance, rescaled
 from photonpano_core.mergers.dense_motion.sub_exposures import halved, smoothed
 from photonpano_core.mergers.dense_motion.warping import Frames
