@@ -16,8 +16,9 @@ import photonpano
 from photonpano import discover
 from photonpano.api.cli.app import commands
 from photonpano.corrections import CORRECTIONS
+from photonpano.pipeline import pose_run
 from photonpano.plugins import hookspecs
-from photonpano.residuals import causes, pose_verdict, verdict
+from photonpano.residuals import causes, verdict
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
@@ -65,7 +66,7 @@ def test_poses_page_shows_thresholds_of_verdict():
     page = (ROOT / "docs" / "how-to" / "poses.md").read_text(encoding="utf-8")
     _, _, table = page.partition("## The verdict")
     shown = re.findall(r"^\|[^|]+\|[^|]+\| ([\d.]+) \|$", table.partition("\n## ")[0], re.MULTILINE)
-    assert shown[-len(pose_verdict.TESTS) :] == [f"{test.threshold:g}" for test in pose_verdict.TESTS]
+    assert shown[-len(pose_run.TESTS) :] == [f"{test.threshold:g}" for test in pose_run.TESTS]
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ from photonpano.errors import described, public_name
 from photonpano.geometry import Canvas
 from photonpano.motion.loop import LevelResult
 from photonpano.plugins.registry import Observer
-from photonpano.values import PoseEstimate
 
 logger = logging.getLogger(__name__)
 
@@ -51,22 +50,14 @@ class Observers:
             "interpolate": {"change_px": result.change_px, "std_px": std_px if np.isfinite(std_px) else None},
         }
         for stage, summary in summaries.items():
-            self._stage_finished(result.level.number, stage, result.seconds.get(stage, 0.0), summary)
+            self.stage_finished(result.level.number, stage, result.seconds.get(stage, 0.0), summary)
 
     def rendered(self, canvas: Canvas, seconds: float) -> None:
         """Report the panorama."""
-        self._stage_finished(None, "render", seconds, {"height": canvas.height, "width": canvas.width})
+        self.stage_finished(None, "render", seconds, {"height": canvas.height, "width": canvas.width})
 
-    def posed(self, estimate: PoseEstimate, seconds: float) -> None:
-        """Report the poses."""
-        counts = {
-            "located": int(estimate.located.sum()),
-            "exposures": len(estimate.views),
-            "points": len(estimate.points.positions),
-        }
-        self._stage_finished(None, "pose", seconds, counts)
-
-    def _stage_finished(self, level: int | None, stage: str, seconds: float, summary: Mapping[str, float | None]) -> None:
+    def stage_finished(self, level: int | None, stage: str, seconds: float, summary: Mapping[str, float | None]) -> None:
+        """Report a stage, which belongs to no level if that is None."""
         self._call("photonpano_stage_finished", level=level, stage=stage, seconds=seconds, summary=frozen(summary))
 
     def _call(self, hook: str, **values: Any) -> None:

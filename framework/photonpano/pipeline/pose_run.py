@@ -1,8 +1,9 @@
-"""Find the pose of every frame, and write the files of a run with `pose`."""
+"""A run with `pose`: find the pose of every frame, write the files, describe the poses for `run.json`, and judge them."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +19,15 @@ from photonpano.pipeline.obstacles import naming_obstacles
 from photonpano.pipeline.run_steps import BegunRun
 from photonpano.record.picture_files import png_of
 from photonpano.record.poses import Poses, colmap, in_standard_world, nerfstudio, ply, tum
-from photonpano.record.run_json import poses_record, verdict_record
-from photonpano.record.run_warnings import poses_warnings
-from photonpano.record.schema import RunRecord
+from photonpano.record.run_json import verdict_record
+from photonpano.record.schema import PosesRecord, RunRecord
 from photonpano.report import render_pose_report
-from photonpano.residuals.pose_verdict import judge_poses
 from photonpano.specs.plan import Plan
-from photonpano.values import CameraGuess, FluxImage, PoseEstimate, StreamInfo
+from photonpano.values import CameraGuess, FloatArray, FluxImage, PoseEstimate, StreamInfo, Verdict
+from photonpano.values.verdict import Found, Test, judged
 
 _WHITE_QUANTILE = 0.995  # quantile of the flux of an exposure that is white in its picture
+_SHOWN_LOST = 3  # spans of lost frames that a warning names
 
 
 def find_poses(run: BegunRun) -> None:
@@ -34,7 +35,7 @@ def find_poses(run: BegunRun) -> None:
     plan, source, start = run.plan, run.source, time.perf_counter()
     with naming_obstacles(source, run.journal):
         estimate = _estimated(run)
-    run.observers.posed(estimate, time.perf_counter() - start)
+    run.observers.stage_finished(None, "pose", time.perf_counter() - start, counts_of(estimate))
     files = write_pose_files(run.folder.staging, estimate, source.info, plan.output.exposures)
     verdict = judge_poses(estimate)
     record: RunRecord = {
@@ -138,3 +139,97 @@ def _picture(flux: FluxImage) -> bytes:
     known = np.isfinite(flux)
     white = float(np.quantile(flux[known], _WHITE_QUANTILE)) if known.any() else 1.0
     return png_of(tone_mapped(flux, max(white, 1e-12)))
+
+
+def counts_of(estimate: PoseEstimate) -> Mapping[str, int]:
+    """Return how many frames were located, by how many exposures, with how many points."""
+    return {
+        "located": int(estimate.located.sum()),
+        "exposures": len(estimate.views),
+        "points": len(estimate.points.positions),
+    }
+
+
+def poses_record(estimate: PoseEstimate, verdict: Verdict) -> PosesRecord:
+    """Describe an estimate and the doubts of its verdict, in a world in which the path has the length 1."""
+    camera = Camera(estimate.camera_matrix, estimate.distortion)
+    counts, std_focal_px = counts_of(estimate), float(estimate.std_focal_px)
+    return {
+        "camera": {
+            "focal_px": camera.focal_px,
+            "std_focal_px": std_focal_px if np.isfinite(std_focal_px) else None,
+            "centre_px": list(camera.centre_px),
+            "distortion": camera.distortion.tolist(),
+            "std_distortion": [0.0] * 4,
+        },
+        "located": counts["located"],
+        "std_position": _rms(estimate.std_position[estimate.located]),
+        "std_rotation_deg": _rms(estimate.std_rotation_deg[estimate.located]),
+        "points": counts["points"],
+        "exposures": counts["exposures"],
+        "lost": [{"frames": [each.span.start, each.span.stop], "reason": each.reason} for each in estimate.lost],
+        "levels": [dict(level) for level in estimate.levels],
+        "doubts": [str(reason) for reason in verdict.reasons],
+    }
+
+
+def poses_warnings(estimate: PoseEstimate) -> list[str]:
+    """Warn of frames without a pose."""
+    if estimate.located.all():
+        return []
+    lost, frames = int((~estimate.located).sum()), len(estimate.located)
+    spans = "; ".join(f"{each.span}: {each.reason}" for each in estimate.lost[:_SHOWN_LOST])
+    more = f"; and {len(estimate.lost) - _SHOWN_LOST} more spans" if len(estimate.lost) > _SHOWN_LOST else ""
+    return [f"{lost} of {frames} frames have no pose ({spans}{more})"]
+
+
+def judge_poses(estimate: PoseEstimate) -> Verdict:
+    """Judge an estimate in a world in which the path has the length 1."""
+    return judged(TESTS, estimate, estimate.residual_ratio, estimate.doubts)
+
+
+def _residuals(estimate: PoseEstimate) -> Found | None:
+    return None if estimate.residual_ratio is None else Found(estimate.residual_ratio)
+
+
+def _position(estimate: PoseEstimate) -> Found | None:
+    return _expected(100 * estimate.std_position[estimate.located], "% of the path, root mean square")
+
+
+def _rotation(estimate: PoseEstimate) -> Found | None:
+    return _expected(estimate.std_rotation_deg[estimate.located], "degrees, root mean square")
+
+
+def _expected(std: FloatArray, unit: str) -> Found | None:
+    figure = _rms(std)
+    return None if figure is None else Found(figure, unit)
+
+
+def _rms(std: FloatArray) -> float | None:
+    """Return the root mean square; None where an error is not known."""
+    return float(np.sqrt(np.mean(std**2))) if len(std) and np.isfinite(std).all() else None
+
+
+def _unknown(estimate: PoseEstimate) -> Found:
+    known = np.isfinite(estimate.std_position) & np.isfinite(estimate.std_rotation_deg)
+    return Found(float((~known[estimate.located]).mean()), "share of the frames with a pose")
+
+
+def _lost(estimate: PoseEstimate) -> Found:
+    lost, frames = int((~estimate.located).sum()), len(estimate.located)
+    return Found(lost / frames, f"{lost} of {frames} frames")
+
+
+_MORE_LIGHT = "use more light, a longer path, or more frames of it; or another pose.with.group_size"
+TESTS: tuple[Test[PoseEstimate], ...] = (
+    Test(
+        "the poses do not explain the photons: points are farther from where exposures show them than noise explains",
+        1.0,
+        "the poses are likely wrong: move farther, or choose another pose.with.group_size",
+        _residuals,
+    ),
+    Test("the expected error of the positions is large", 0.3, _MORE_LIGHT, _position),
+    Test("the expected error of the rotations is large", 5.0, _MORE_LIGHT, _rotation),
+    Test("the expected errors are not known", 0, "use a pose estimator that knows them, or more light", _unknown),
+    Test("many frames have no pose", 0.5, "see the reasons under `lost`; choose another pose.with.group_size", _lost),
+)

@@ -13,7 +13,6 @@ from typing import Any, Literal
 import numpy as np
 
 from photonpano.errors import InputError
-from photonpano.geometry import Camera
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.loop import LevelResult, converges
 from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
@@ -34,7 +33,6 @@ from photonpano.record.schema import (
     MotionRecord,
     PairRecord,
     PanoramaRecord,
-    PosesRecord,
     RefinementRecord,
     RescuedRecord,
     RivalRecord,
@@ -44,7 +42,7 @@ from photonpano.record.schema import (
 from photonpano.residuals.halves import Halves
 from photonpano.residuals.refinement import Explained, Refinement
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, PoseEstimate, Reason, StreamInfo, Verdict
+from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, Reason, StreamInfo, Verdict
 
 
 def record_of(
@@ -302,29 +300,3 @@ def _number(value: float) -> float | None:
     """Return a number as JSON holds it: plain Python, None if it is not finite."""
     plain: float = value.item() if isinstance(value, np.generic) else value
     return plain if np.isfinite(plain) else None
-
-
-def poses_record(estimate: PoseEstimate, verdict: Verdict) -> PosesRecord:
-    """Describe an estimate and the doubts of its verdict, in a world in which the path has the length 1."""
-    camera = Camera(estimate.camera_matrix, estimate.distortion)
-    return {
-        "camera": {
-            "focal_px": camera.focal_px,
-            "std_focal_px": _number(estimate.std_focal_px),
-            "centre_px": list(camera.centre_px),
-            "distortion": camera.distortion.tolist(),
-            "std_distortion": [0.0] * 4,
-        },
-        "located": int(estimate.located.sum()),
-        "std_position": _rms(estimate.std_position[estimate.located]),
-        "std_rotation_deg": _rms(estimate.std_rotation_deg[estimate.located]),
-        "points": len(estimate.points.positions),
-        "exposures": len(estimate.views),
-        "lost": [{"frames": [each.span.start, each.span.stop], "reason": each.reason} for each in estimate.lost],
-        "levels": [dict(level) for level in estimate.levels],
-        "doubts": [str(reason) for reason in verdict.reasons],
-    }
-
-
-def _rms(std: FloatArray) -> float | None:
-    return _number(float(np.sqrt(np.mean(std**2)))) if len(std) else None

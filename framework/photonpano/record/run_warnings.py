@@ -1,4 +1,4 @@
-"""Warnings of a run: exposures that were not located, outliers, frames with a large expected error, frames without a pose."""
+"""Warnings of a run: exposures that were not located, outliers, frames with a large expected error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from photonpano.motion.timeline import Timeline
 from photonpano.record.schema import DecisionRecord
 from photonpano.residuals.refinement import Refinement
 from photonpano.text import listed
-from photonpano.values import FrameSpan, PoseEstimate, true_spans
+from photonpano.values import FrameSpan, true_spans
 
 # Expected corner error above which a warning names the frames: it is likely to be visible.
 UNCERTAIN_PX = 0.5
@@ -21,7 +21,6 @@ SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst fir
 
 TIME_LIMIT = "time_limit"  # name of the decision on what was left out
 _MANY_COPIES = 0.25  # share of the frames from which a warning names them
-_SHOWN_LOST = 3  # spans of lost frames that a warning names
 
 
 def level_warnings(results: Sequence[LevelResult]) -> list[str]:
@@ -130,13 +129,3 @@ def refinement_warnings(refinements: Sequence[Refinement]) -> list[str]:
         for each in refinements
         if each.kept_out
     ]
-
-
-def poses_warnings(estimate: PoseEstimate) -> list[str]:
-    """Warn of frames without a pose."""
-    if estimate.located.all():
-        return []
-    lost, frames = int((~estimate.located).sum()), len(estimate.located)
-    spans = "; ".join(f"{each.span}: {each.reason}" for each in estimate.lost[:_SHOWN_LOST])
-    more = f"; and {len(estimate.lost) - _SHOWN_LOST} more spans" if len(estimate.lost) > _SHOWN_LOST else ""
-    return [f"{lost} of {frames} frames have no pose ({spans}{more})"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import PoseEstimate, Reason, ScenePoints
-from photonpano.residuals.pose_verdict import judge_poses
+from photonpano.pipeline.pose_run import judge_poses
 
 N_FRAMES = 40
 GOOD = PoseEstimate(
