@@ -310,7 +310,7 @@ def _planar(tied: _Tied, start: FloatArray | None, model: PlanarName) -> _Fit:
     given = tied.given(start)
     found = nearest(model, tied.problem.observed if given is None else given, tied.frame_shape)
     adjustment = PlanarAdjustment(tied.problem, model)
-    return tied.fit(adjustment, Plane(tied.composed(found) if given is None else found))
+    return tied.fit(adjustment, adjustment.starting(tied.composed(found) if given is None else found))
 
 
 def _nearer(tied: _Tied, start: FloatArray | None, fit: _Fit) -> _Fit:
