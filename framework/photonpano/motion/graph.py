@@ -27,7 +27,7 @@ from photonpano.motion.adjustment import Adjustment, Assessment, Problem
 from photonpano.motion.consensus import agreed_share, agreeing, contradicting, layers, tolerances_px, travelled
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
 from photonpano.motion.pairs import GYROSCOPE, TIE, adjacency, component_labels, instants_of
-from photonpano.motion.planar import PlanarAdjustment, PlanarName, Plane, nearest
+from photonpano.motion.planar import PlanarAdjustment, PlanarName, nearest
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, FrameSpan, Group, Located
 

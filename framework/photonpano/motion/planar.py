@@ -182,8 +182,8 @@ class PlanarAdjustment(Adjustment[Plane]):
     def walks_px(self) -> dict[str, float]:
         """How far each walk moves the ends of a frame over the capture, in px: a standard deviation; none that are 0."""
         walks, drifts = (self.variances * self._durations)[: 2 * self._n_walks].reshape(2, -1)
-        there = self._there[: self._n_walks]
-        return {name: float(px) for name, px, is_there in zip(_WALKS, np.sqrt(walks + drifts) * self._half, there) if is_there}
+        ends_px = np.sqrt(walks + drifts) * self._half
+        return {_WALKS[walk]: float(ends_px[walk]) for walk in np.flatnonzero(self._there[: self._n_walks])}
 
     @property
     def _there(self) -> BoolArray:
@@ -384,7 +384,7 @@ class PlanarAdjustment(Adjustment[Plane]):
             of_shared = sparse.csr_array(by_shared[walk] * roots[:, None])
             step = steps[:, walk] + by_shared[walk] @ shared
             parts.append(Prior(step * roots, sparse.csr_array(sparse.hstack([of_nodes, of_shared]))))
-        return parts + [Prior(np.array([value]), self._of_shared(row[None])) for value, row in zip(shared, np.eye(len(shared)))]
+        return parts + [Prior(shared[[place]], self._of_shared(np.eye(len(shared))[[place]])) for place in range(len(shared))]
 
     def information(self, state: Plane, blocks: FloatArray) -> FloatArray:
         """Convert (N, k, k) information on changes of nodes to that on p1..p8 of their homographies.

@@ -25,8 +25,8 @@ from photonpano.record.run_warnings import (
     timeline_warnings,
 )
 from photonpano.record.schema import (
+    AgreementRecord,
     CameraRecord,
-    CutRecord,
     DecisionRecord,
     FailureRecord,
     LevelRecord,
@@ -39,7 +39,7 @@ from photonpano.record.schema import (
     RunRecord,
     VerdictRecord,
 )
-from photonpano.residuals.halves import Halves
+from photonpano.residuals.halves import Agreements
 from photonpano.residuals.refinement import Explained, Refinement
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, Reason, StreamInfo, Verdict
@@ -64,7 +64,8 @@ def record_of(
         "panorama": panorama_record(plan, panorama, rendered),
         "motion": motion_record(motion.std_px),
         "refinements": [refinement_record(each) for each in explained.refinements],
-        "halves": halves_record(explained.halves),
+        "halves": agreement_records(explained.halves.cuts),
+        "stretches": agreement_records(explained.halves.stretches),
         "verdict": verdict_record(verdict),
         "warnings": [
             *time_warnings(started["decisions"]),
@@ -102,6 +103,7 @@ def started_record(
         "motion": None,
         "refinements": [],
         "halves": [],
+        "stretches": [],
         "verdict": None,
         "warnings": [],
         "seconds": round(seconds, 3),
@@ -257,18 +259,18 @@ def refinement_record(refinement: Refinement) -> RefinementRecord:
     }
 
 
-def halves_record(halves: Halves) -> list[CutRecord]:
-    """Describe how the halves of a capture agree."""
-    columns = halves.cuts, halves.coherence, halves.std_coherence, halves.std_px, halves.angles_deg
+def agreement_records(found: Agreements) -> list[AgreementRecord]:
+    """Describe how frames agree across cuts, or those of stretches with all others."""
+    columns = found.firsts, found.coherence, found.std_coherence, found.std_px, found.angles_deg
     return [
         {
-            "frame": int(cut),
+            "frame": int(frame),
             "coherence": _number(coherence),
             "std_coherence": _number(std_coherence),
             "std_px": std_px.tolist(),
             "angle_deg": _number(angle),
         }
-        for cut, coherence, std_coherence, std_px, angle in zip(*columns, strict=True)
+        for frame, coherence, std_coherence, std_px, angle in zip(*columns, strict=True)
     ]
 
 

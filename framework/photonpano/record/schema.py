@@ -163,8 +163,11 @@ class RefinementRecord(TypedDict):
     kept_out: str | None
 
 
-class CutRecord(TypedDict):
-    """How the frames before a frame, and those from it on, agree: see `Halves`; None where they share nothing."""
+class AgreementRecord(TypedDict):
+    """How frames agree, see `Agreements`: those before `frame` and from it on, or a stretch from it on and all others.
+
+    None where they share nothing.
+    """
 
     frame: int
     coherence: float | None
@@ -258,7 +261,8 @@ class RunRecord(TypedDict):
     levels: Sequence[LevelRecord]
     motion: MotionRecord | None
     refinements: Sequence[RefinementRecord]
-    halves: Sequence[CutRecord]
+    halves: Sequence[AgreementRecord]
+    stretches: Sequence[AgreementRecord]
     verdict: VerdictRecord | None
     panorama: PanoramaRecord | None
     warnings: Sequence[str]

@@ -124,19 +124,22 @@ def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
 
 def halves_over_time(halves: Halves, n_frames: int) -> str | None:
     """Draw how the frames before and after each instant agree, and how well they are tied; None for short captures."""
-    if not len(halves.cuts):
+    cuts, stretches = halves.cuts, halves.stretches
+    if not len(cuts.firsts):
         return None
     with plain_figure(WIDTH_IN, 4.4) as figure:
         agree, tie = add_axes(figure, Margins(top=0.35), rows=(1, 1), gap_in=0.6)
-        band = 2 * halves.std_coherence
-        agree.fill_between(halves.cuts, halves.coherence - band, halves.coherence + band, color=MUTED, alpha=0.25, linewidth=0)
+        band = 2 * cuts.std_coherence
+        agree.fill_between(cuts.firsts, cuts.coherence - band, cuts.coherence + band, color=MUTED, alpha=0.25, linewidth=0)
         agree.axhline(1, color=MUTED, linewidth=1, linestyle="--")
-        agree.plot(halves.cuts, halves.coherence, "o-", color=SERIES[0], markersize=4)
+        agree.plot(cuts.firsts, cuts.coherence, "o-", color=SERIES[0], markersize=4)
         agree.set_ylabel("coherence")
-        for values, name, colour in zip(halves.std_px.T[::-1], ("least known direction", "best known"), SERIES, strict=False):
-            tie.semilogy(halves.cuts, values, color=colour, label=name)
+        for values, name, colour in zip(cuts.std_px.T[::-1], ("least known direction", "best known"), SERIES, strict=False):
+            tie.semilogy(cuts.firsts, values, color=colour, label=name)
+        edges = np.append(stretches.firsts, n_frames)
+        tie.stairs(stretches.std_px[:, 1], edges, baseline=None, color=MUTED, label="stretch, least known")
         tie.set_ylabel("error across (px)")
-        tie.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, columnspacing=1.2)
+        tie.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, columnspacing=1.2)
         for axes in (agree, tie):
             mark_frames(axes, 0, n_frames)
         return svg_of(figure, "halves")

@@ -2,12 +2,14 @@
 
 Both halves are merged along the motion, each in two parts whose frames alternate. The noise of the four pictures is
 independent, so that products of their gradients are unbiased by it: those of the parts of a half, and those of the halves.
+Short stretches are compared with all other frames in the same way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -41,39 +43,59 @@ _ERRORS = 2.0  # standard errors that are taken off the information
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Halves:
-    """How the frames before each of C cuts, and those after it, agree."""
+class Agreements:
+    """How the merges of two sets of frames agree, for each of C pairs of such sets."""
 
-    cuts: FloatArray  # (C,) the first frame after each
-    # (C,) correlation of the gradients of the halves without their noise: 1 if the motion is right, and nothing else changes;
-    # NaN where the halves show too little in common
+    firsts: FloatArray  # (C,) first frame of the later set, or of a stretch that is compared with all other frames
+    # (C,) correlation of the gradients of both without their noise: 1 if the motion is right, and nothing else changes; NaN
+    # where they show too little in common
     coherence: FloatArray
     std_coherence: FloatArray  # (C,) by photon noise
-    # (C, 2) errors of the shift of one half against the other that photon noise lets expect, in px of a frame: along the
-    # direction that is known best, and least; half of the longer side of a frame where nothing is known
+    # (C, 2) errors of the shift of one against the other that photon noise lets expect, in px of a frame: along the direction
+    # that is known best, and least; half of the longer side of a frame where nothing is known
     std_px: FloatArray
     angles_deg: FloatArray  # (C,) of the direction that is known least, from x towards y on the panorama, 0 to 180
 
     @classmethod
+    def of(cls, firsts: Sequence[int], found: Sequence[_Agreement], scale: float) -> Agreements:
+        """Gather what was found of each pair, on a canvas of so many px for one of a frame."""
+        columns = [np.array(column, dtype=np.float64) for column in zip(*found, strict=True)] or [np.zeros(0)] * 4
+        coherence, std_coherence, std_px, angles = columns
+        return cls(np.array(firsts, dtype=np.float64), coherence, std_coherence, std_px.reshape(-1, 2) / scale, angles)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Halves:
+    """How the frames of a capture agree with each other."""
+
+    cuts: Agreements  # the frames before each cut, and those after it
+    stretches: Agreements  # each of the stretches into which the capture is divided, and all frames that are not in it
+
+    @classmethod
     def none(cls) -> Halves:
         """Return those of a capture that is too short for a cut."""
-        none = np.zeros(0)
-        return cls(none, none, none, np.zeros((0, 2)), none)
+        nothing = Agreements.of([], [], 1)
+        return cls(nothing, nothing)
 
     @property
     def disagreement(self) -> float:
         """By how many standard errors coherence is below 1: the median over the cuts at which it is known."""
-        return float(np.nanmedian((1 - self.coherence) / np.hypot(self.std_coherence, _INTERPOLATED)))
+        return float(np.nanmedian((1 - self.cuts.coherence) / np.hypot(self.cuts.std_coherence, _INTERPOLATED)))
 
     def tied_px(self, located: BoolArray) -> FloatArray:
-        """Return how far frames may lie beside others that only a weak cut ties them to: (T,), given which are located.
+        """Return how far frames may lie beside others to which they are tied weakly: (T,), given which are located.
 
         Of a displacement across a cut, the best alignment of the planes gives each side the share of the frames of the other.
+        A path that returns crosses each cut more than once: there, a stretch that is tied to nothing shows by itself.
         """
-        frames, number = np.arange(len(located)), np.cumsum(located)
-        earlier = number[self.cuts.astype(int) - 1] / max(int(number[-1]), 1)
-        shares = np.where(frames[:, None] < self.cuts, 1 - earlier, earlier)
-        return np.asarray((shares * self.std_px[:, 1]).max(axis=1, initial=0.0))
+        frames, number, cuts = np.arange(len(located)), np.cumsum(located), self.cuts.firsts
+        earlier = number[cuts.astype(int) - 1] / max(int(number[-1]), 1)
+        shares = np.where(frames[:, None] < cuts, 1 - earlier, earlier)
+        across_px = (shares * self.cuts.std_px[:, 1]).max(axis=1, initial=0.0)
+        if not len(self.stretches.firsts):
+            return np.asarray(across_px)
+        stretch = np.searchsorted(self.stretches.firsts, frames, side="right").clip(1) - 1
+        return np.asarray(np.maximum(across_px, self.stretches.std_px[stretch, 1]))
 
 
 class _Block(NamedTuple):
@@ -85,7 +107,7 @@ class _Block(NamedTuple):
 
 
 class _Agreement(NamedTuple):
-    """How two halves agree: what `Halves` has of one cut."""
+    """How two sets of frames agree: what `Agreements` have of one pair."""
 
     coherence: float
     std_coherence: float
@@ -94,7 +116,7 @@ class _Agreement(NamedTuple):
 
 
 def halves_of(source: Source, motion: FrameMotion, canvas: Canvas, context: Context) -> Halves:
-    """Compare the halves of a capture along a motion across up to 32 cuts, on a canvas of any projection."""
+    """Compare the halves of a capture along a motion across up to 32 cuts, and 33 stretches with all others, on any canvas."""
     span, canvas = motion.span, _reduced(canvas)
     number = 2 * min(_CUTS + 1, len(span) // (2 * _FEWEST_FRAMES))
     if number < 4:
@@ -108,14 +130,16 @@ def halves_of(source: Source, motion: FrameMotion, canvas: Canvas, context: Cont
     sums = np.zeros((4, 2, *canvas.shape, channels_of(source)), np.float32)
     for index, block in enumerate(blocks):
         _add(sums[2 + index % 2], block, 1)
-    found = []
-    for pair in zip(blocks[:-2:2], blocks[1:-2:2], strict=True):
+    pairs = list(zip(blocks[::2], blocks[1::2], strict=True))
+    compared = partial(_compared, response=source.response, widest_px=widest_px)
+    of_stretches = [compared(_beside(pair, sums[2:])) for pair in pairs]
+    of_cuts = []
+    for pair in pairs[:-1]:
         for part, block in enumerate(pair):
             _add(sums[part], block, 1)
             _add(sums[2 + part], block, -1)
-        found.append(_compared(sums, source.response, widest_px))
-    coherence, std_coherence, std_px, angles = (np.array(column, dtype=np.float64) for column in zip(*found, strict=True))
-    return Halves(np.array(starts[2:-1:2], dtype=np.float64), coherence, std_coherence, std_px / scale, angles)
+        of_cuts.append(compared(sums))
+    return Halves(Agreements.of(starts[2:-1:2], of_cuts, scale), Agreements.of(starts[:-1:2], of_stretches, scale))
 
 
 def _reduced(canvas: Canvas) -> Canvas:
@@ -155,6 +179,19 @@ def _around(ranges: Iterable[range], length: int) -> slice:
 def _add(sums: FluxImage, block: _Block, sign: int) -> None:
     for total, values in zip(sums, (block.lit, block.weight), strict=True):
         total[block.part] += sign * values
+
+
+def _beside(pair: tuple[_Block, _Block], totals: FluxImage) -> FluxImage:
+    """Return the sums of two blocks, and of all others, where the blocks lie: (4, 2, h, w, C), given (2, 2, H, W, C) of all."""
+    top, left = (min(block.part[axis].start for block in pair) for axis in (0, 1))
+    bottom, right = (max(block.part[axis].stop for block in pair) for axis in (0, 1))
+    others = totals[:, :, top:bottom, left:right]
+    own = np.zeros_like(others)
+    for of_block, block in zip(own, pair, strict=True):
+        rows, columns = block.part
+        part = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+        _add(of_block, block._replace(part=part), 1)
+    return np.concatenate([own, others - own])
 
 
 def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreement:

@@ -175,13 +175,15 @@ def second_place_px(run: TestedRun) -> float:
 
 def _one_direction(run: TestedRun) -> Found | None:
     halves = run.explained.halves
-    if not len(halves.cuts):
+    if not len(halves.cuts.firsts):
         return None
-    weakest = int(np.argmax(halves.std_px[:, 1]))
-    (strong, weak), angle = halves.std_px[weakest].tolist(), halves.angles_deg[weakest]
+    between = "px between the frames before and after {:.0f}", "px between the frames from {:.0f} on for a while and all others"
+    ties, place = max(zip((halves.cuts, halves.stretches), between, strict=True), key=lambda each: each[0].std_px[:, 1].max())
+    weakest = int(np.argmax(ties.std_px[:, 1]))
+    (strong, weak), angle = ties.std_px[weakest].tolist(), ties.angles_deg[weakest]
     if weak < _ASLANT * strong:
         return None
-    where = f"px between the frames before and after {halves.cuts[weakest]:.0f}, at {angle:.0f} degrees from x towards y"
+    where = f"{place.format(ties.firsts[weakest])}, at {angle:.0f} degrees from x towards y"
     what_to_do = (
         "the motion may be wrong by any distance along it, which this panorama does not show; keep other structures in view"
     )
@@ -252,15 +254,15 @@ def of_either_part(run: TestedRun) -> bool:
     "look at the halves and the path in the report; the motion may be wrong, or the scene changes",
 )
 def _halves(run: TestedRun) -> Found | None:
-    halves = run.explained.halves
-    if not np.isfinite(halves.coherence).any():
+    cuts = run.explained.halves.cuts
+    if not np.isfinite(cuts.coherence).any():
         return None
-    least = int(np.nanargmin(halves.coherence))
+    least = int(np.nanargmin(cuts.coherence))
     where = (
         "standard errors that the coherence lacks to 1, median over the instants; "
-        f"least is {halves.coherence[least]:.3g}, before frame {halves.cuts[least]:.0f}"
+        f"least is {cuts.coherence[least]:.3g}, before frame {cuts.firsts[least]:.0f}"
     )
-    return Found(halves.disagreement, where, what_to_do=run.freer_model)
+    return Found(run.explained.halves.disagreement, where, what_to_do=run.freer_model)
 
 
 @AGREEMENT.doubtful_above(

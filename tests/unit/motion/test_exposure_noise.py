@@ -9,7 +9,7 @@ from photonpano import FrameSpan, Group
 from photonpano.geometry import corners, transform_points
 from photonpano.motion.adjustment import Problem
 from photonpano.motion.exposure_noise import ExposureNoise
-from photonpano.motion.planar import PlanarAdjustment, Plane
+from photonpano.motion.planar import PlanarAdjustment
 from photonpano.values import FloatArray
 
 from .measured_graphs import SHAPE, edge, groups_of, noise_of, pairs, true_motion

@@ -14,7 +14,7 @@ from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.photometry import BinaryResponse
 from photonpano.residuals.block_sums import GXX, GYY, N_SUMS, M, R, V, n_blocks
-from photonpano.residuals.halves import Halves
+from photonpano.residuals.halves import Agreements, Halves
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.shaking import Shaking
@@ -148,7 +148,8 @@ def tremor() -> Residuals:
 def explained(motion: FrameMotion, panorama: RenderedPanorama, residuals: Residuals) -> Explained:
     cuts = np.linspace(motion.span.start, motion.span.stop, 34)[1:-1]
     agreeing, std_px = np.full(len(cuts), 0.999), np.full((len(cuts), 2), (0.01, 0.02))
-    halves = Halves(cuts, agreeing, 0.002 * agreeing, std_px, 90 * agreeing)
+    found = Agreements(cuts, agreeing, 0.002 * agreeing, std_px, 90 * agreeing)
+    halves = Halves(found, found)
     return Explained(motion, panorama.canvas, residuals, 1.0123, halves, ())
 
 

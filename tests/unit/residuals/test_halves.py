@@ -11,7 +11,7 @@ from photonpano import FrameSpan
 from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory, canvas_of, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.residuals.halves import Halves, halves_of
+from photonpano.residuals.halves import Agreements, Halves, halves_of
 from photonpano.testing.scenes import detected, seen_along, textured
 
 SHAPE, N_FRAMES = (64, 96), 400
@@ -41,7 +41,7 @@ def scene() -> np.ndarray:
 def test_coherence_along_the_true_motion_is_one_but_for_its_noise(halves: Callable, scene: np.ndarray, flux: float) -> None:
     found = [halves(flux * scene, seed=seed) for seed in range(12)]
     inner = slice(4, -4)  # at the ends, a half is a few frames
-    scores = np.array([((each.coherence - 1) / each.std_coherence)[inner] for each in found])
+    scores = np.array([((each.cuts.coherence - 1) / each.cuts.std_coherence)[inner] for each in found])
     assert 0.7 < np.sqrt(np.mean(scores**2)) < 1.4
     assert abs(scores.mean()) < 0.5
 
@@ -49,8 +49,8 @@ def test_coherence_along_the_true_motion_is_one_but_for_its_noise(halves: Callab
 @pytest.mark.parametrize("flux", [0.3, 0.02])
 def test_error_of_the_shift_across_a_cut_is_that_of_photon_noise(halves: Callable, scene: np.ndarray, flux: float) -> None:
     """At a fifteenth of the light, it is about four times as large."""
-    std_px = halves(flux * scene).std_px[len(PAN) // 25]
-    lit = halves(0.3 * scene).std_px[len(PAN) // 25]
+    std_px = halves(flux * scene).cuts.std_px[len(PAN) // 25]
+    lit = halves(0.3 * scene).cuts.std_px[len(PAN) // 25]
     expected = np.sqrt(0.3 / flux)
     np.testing.assert_allclose(std_px / lit, expected, rtol=0.4)
     assert (std_px >= lit).all()
@@ -60,11 +60,11 @@ def test_motion_that_is_wrong_after_a_cut_is_seen_there(halves: Callable, scene:
     """A jump of 1 px that the motion lacks: halves across it are displaced."""
     found = PAN.copy()
     found[N_FRAMES // 2 :] = found[N_FRAMES // 2 :] @ translation(0, 1)
-    wrong = halves(0.3 * scene, found=found)
+    wrong = halves(0.3 * scene, found=found).cuts
     sigmas = (1 - wrong.coherence) / wrong.std_coherence
-    assert wrong.coherence[len(wrong.cuts) // 2] < 0.97
-    assert sigmas[len(wrong.cuts) // 2] > 5
-    assert abs(wrong.cuts[np.nanargmin(wrong.coherence)] - N_FRAMES // 2) < 0.2 * N_FRAMES
+    assert wrong.coherence[len(wrong.firsts) // 2] < 0.97
+    assert sigmas[len(wrong.firsts) // 2] > 5
+    assert abs(wrong.firsts[np.nanargmin(wrong.coherence)] - N_FRAMES // 2) < 0.2 * N_FRAMES
 
 
 @pytest.mark.parametrize(("along", "angle"), [(0, 90), (1, 0)], ids=["vertical edges", "horizontal edges"])
@@ -72,12 +72,29 @@ def test_bare_edges_tie_nothing_along_them(halves: Callable, scene: np.ndarray, 
     """Before a wall with one edge, half of the longer side of a frame is all that is known."""
     wall = np.full_like(scene, 0.3)
     wall[(slice(None), slice(115, None)) if along == 0 else (slice(50, None), slice(None))] = 0.6
-    found = halves(wall)
-    middle = len(found.cuts) // 2
+    found = halves(wall).cuts
+    middle = len(found.firsts) // 2
     strong, weak = found.std_px[middle]
     assert strong < 0.1
     assert weak > 5
     assert min(abs(found.angles_deg[middle] - angle), abs(found.angles_deg[middle] - angle - 180)) < 3
+
+
+def test_stretch_that_sees_a_bare_edge_is_tied_to_nothing_where_the_path_returns(halves: Callable, scene: np.ndarray) -> None:
+    """Frames on both sides of each cut see the same places, so that no cut shows it."""
+    wall = 0.3 * scene
+    wall[:, 50:170] = 0.3
+    wall[50:, 50:170] = 0.6
+    there_and_back = np.array([translation(10 + 110 * np.sin(np.pi * frame / N_FRAMES), 20) for frame in range(N_FRAMES)])
+    found = halves(wall, there_and_back)
+    assert found.cuts.std_px[4:-4, 1].max() < 0.3
+    bare = (found.stretches.std_px[:, 1] > 20) & (found.stretches.std_px[:, 0] < 0.2)
+    frames = found.stretches.firsts[bare]
+    assert 2 <= len(frames) <= 8
+    assert min(frames) < N_FRAMES / 2 < max(frames)
+    tied_px = found.tied_px(np.ones(N_FRAMES, dtype=bool))
+    assert tied_px[frames.astype(int)].min() > 20
+    assert tied_px[[0, N_FRAMES // 2, N_FRAMES - 1]].max() < 1
 
 
 def test_short_captures_have_no_cuts(halves: Callable, memory_source: type, scene: np.ndarray) -> None:
@@ -85,13 +102,14 @@ def test_short_captures_have_no_cuts(halves: Callable, memory_source: type, scen
     located = np.ones(10, dtype=bool)
     motion = FrameMotion(FrameTrajectory(homographies), FrameSpan(0, 10), homographies, located, np.full(10, 0.1), 5, SHAPE)
     found = halves_of(source, motion, canvas_of(homographies, SHAPE, 1.0), Context())
-    assert not len(found.cuts)
+    assert not len(found.cuts.firsts)
     np.testing.assert_array_equal(found.tied_px(located), np.zeros(10))
 
 
 def test_each_side_of_a_weak_cut_lies_off_by_the_share_of_the_other() -> None:
     """Of 10 px between 20 and 60 frames, 7.5 are an error of the 20, and 2.5 of the 60."""
     one = np.ones(2)
-    found = Halves(np.array([20.0, 50.0]), one, 0.01 * one, np.array([[0.1, 10.0], [0.1, 0.2]]), 90 * one)
+    cuts = Agreements(np.array([20.0, 50.0]), one, 0.01 * one, np.array([[0.1, 10.0], [0.1, 0.2]]), 90 * one)
+    found = Halves(cuts, Halves.none().stretches)
     tied_px = found.tied_px(np.ones(80, dtype=bool))
     np.testing.assert_allclose(tied_px[[0, 19, 20, 79]], [7.5, 7.5, 2.5, 2.5])

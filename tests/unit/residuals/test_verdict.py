@@ -17,7 +17,7 @@ from photonpano.motion.model import SAME_LENS_PX, MotionModel
 from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
 from photonpano.residuals import tested_run
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
-from photonpano.residuals.halves import Halves
+from photonpano.residuals.halves import Agreements, Halves
 from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained, residual_ratio
@@ -313,8 +313,8 @@ def test_halves_that_do_not_agree_for_half_of_the_time_are_doubtful(explained: E
     """One cut is far off, as where something passes; the median counts. Cuts that show too little say nothing."""
     stds = np.array([0.01, 0.004, 0.01, np.nan])
     coherence = 1 - np.hypot(stds, 0.001) * [lacks, 20.0, 0.0, np.nan]
-    halves = Halves(np.array([500.0, 1000.0, 1500.0, 1900.0]), coherence, stds, np.full((4, 2), 0.1), np.zeros(4))
-    verdict = judge(replace(explained, halves=halves), ())
+    cuts = Agreements(np.array([500.0, 1000.0, 1500.0, 1900.0]), coherence, stds, np.full((4, 2), 0.1), np.zeros(4))
+    verdict = judge(replace(explained, halves=Halves(cuts, cuts)), ())
     assert [reason.figure for reason in verdict.reasons] == [pytest.approx(lacks)] * doubtful
     assert all(reason.where.endswith(", before frame 1000") for reason in verdict.reasons)
 
@@ -343,14 +343,19 @@ def test_camera_that_pairs_contradict_by_ten_expected_errors_is_doubtful(
 
 @pytest.mark.parametrize(("along", "doubtful"), [(6.0, True), (0.8, False), (0.1, False)])
 @pytest.mark.parametrize("angle", [0, 37, 90])
-def test_motion_along_an_edge_is_doubtful(explained: Explained, angle: int, along: float, doubtful: bool) -> None:
-    """Across one of two cuts, the photons tell of the motion across the edge to 0.1 px, and little of that along it."""
-    cuts, one = np.array([500.0, 1500.0]), np.ones(2)
-    halves = Halves(cuts, one, 0.01 * one, np.array([[0.05, 0.06], [0.1, along]]), np.array([12.0, angle]))
+@pytest.mark.parametrize(("ties", "place"), [("cuts", "before and after 1500"), ("stretches", "from 1500 on for a while")])
+def test_motion_along_an_edge_is_doubtful(
+    explained: Explained, ties: str, place: str, angle: int, along: float, doubtful: bool
+) -> None:
+    """Of one of two cuts or stretches, the photons tell the motion across the edge to 0.1 px, and little of that along it."""
+    firsts, one = np.array([500.0, 1500.0]), np.ones(2)
+    weak = Agreements(firsts, one, 0.01 * one, np.array([[0.05, 0.06], [0.1, along]]), np.array([12.0, angle]))
+    strong = replace(weak, std_px=np.full((2, 2), 0.05))
+    halves = replace(Halves(strong, strong), **{ties: weak})
     motion = replace(explained.motion, std_px=np.hypot(explained.motion.std_px, along))
     reasons = judge(replace(explained, halves=halves, motion=motion), []).reasons
-    assert [reason.figure for reason in reasons] == [pytest.approx(along)] * doubtful
-    assert all(f"frames before and after 1500, at {angle} degrees" in reason.where for reason in reasons)
+    assert [reason.figure for reason in reasons] == [pytest.approx(along, rel=1e-3)] * doubtful
+    assert all(place in reason.where and f", at {angle} degrees" in reason.where for reason in reasons)
 
 
 @pytest.mark.parametrize(("n_pairs", "where"), [(2, []), (3, ["px to the second place; 3 of 30 pairs of level 1"])])

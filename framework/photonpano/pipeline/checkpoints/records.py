@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from photonpano.motion.diagnosis import Contrast
 from photonpano.motion.registration import Registered
 from photonpano.motion.tracking import Place, StartingMotion
-from photonpano.residuals.halves import Halves
+from photonpano.residuals.halves import Agreements, Halves
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.shaking import Shaking
 from photonpano.values import Decision, Edge, FrameSpan, Located, NotLocated, Panorama, Patches, Refined
 
 Arrays = Mapping[str, NDArray[np.generic]]
 _KINDS = (
-    Contrast, Decision, Edge, FrameSpan, Halves, Located, NotLocated, Panorama, Patches, Place, Refined, Registered, Residuals,
-    Shaking, StartingMotion,
+    Agreements, Contrast, Decision, Edge, FrameSpan, Halves, Located, NotLocated, Panorama, Patches, Place, Refined, Registered,
+    Residuals, Shaking, StartingMotion,
 )  # fmt: skip
 # The dataclasses that can be read back.
 _BY_NAME: dict[str, Any] = {kind.__name__: kind for kind in _KINDS}
