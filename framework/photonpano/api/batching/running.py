@@ -1,8 +1,11 @@
-"""Do one run of a batch, in whatever process."""
+"""Do one run of a batch: `python -m photonpano.api.batching.running JOB ROW` reads a pickled job, and writes its row."""
 
 from __future__ import annotations
 
 import logging
+import pickle
+import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -113,3 +116,17 @@ def _thumbnail(picture: Path) -> str | None:
         return None
     small = shrunk(image, _THUMBNAIL_PIXELS)
     return jpeg_uri(small if small.ndim == 2 else small[..., ::-1])
+
+
+def main(job: Path, row: Path) -> None:
+    """Do the job in a file, and write its row to another. SIGTERM ends the run as Ctrl-C does."""
+    for each in (signal.SIGINT, signal.SIGHUP):  # a terminal sends them to all processes; the batch decides what ends
+        signal.signal(each, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    unfinished = row.with_suffix(".partial")
+    unfinished.write_bytes(pickle.dumps(run_job(pickle.loads(job.read_bytes()))))
+    unfinished.rename(row)
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))
