@@ -38,6 +38,7 @@ from harness import command, in_child, passing, simulator
 
 from photonpano import load_spec, parse_spec, run, simulate
 from photonpano.api.cli import main as program
+from photonpano.pipeline.checkpoints.work_folder import SUFFIX
 from photonpano.record import contents
 
 SPEC = """version: 1
@@ -109,18 +110,18 @@ def dying_at_change(number: int) -> None:
 
 
 def dying_in_file(number: int, part: float) -> None:
-    """Have this process kill itself when the archive of this number was written, of which only a part reaches the disk."""
-    write, left = np.savez, number
+    """Have this process kill itself in the record of this number, of which only a part reaches the disk."""
+    write, left = Path.write_bytes, number
 
-    def dying(path: Any, **arrays: Any) -> None:
+    def dying(path: Path, content: bytes) -> int:
         nonlocal left
-        write(path, **arrays)
-        left -= 1
+        left -= path.suffix == SUFFIX
         if not left:
-            os.truncate(path, int(part * Path(path).stat().st_size))
+            write(path, content[: int(part * len(content))])
             os.kill(os.getpid(), signal.SIGKILL)
+        return write(path, content)
 
-    mock.patch("numpy.savez", dying).start()
+    mock.patch.object(Path, "write_bytes", dying).start()
 
 
 def prepare(folder: Path) -> None:
@@ -324,7 +325,7 @@ def main(trial: Path, number: int = 20, seed: int = 0, at_once: int = 2, writing
         run(load_spec(study.folder / "scan.yaml"))  # so that those forked from this process find the machine code loaded
         more = {"races": {"at_once": at_once}, "resumes": {"writing": writing}}.get(str(trial), {})
         if "writing" in more:
-            mock.patch("photonpano.pipeline.checkpoints.store.FLUSH_S", 0.0).start()
+            mock.patch("photonpano.pipeline.checkpoints.work_folder.FLUSH_S", 0.0).start()
         wrong = TRIALS[str(trial)](study.folder, number, seed, **more)
     print(*wrong, sep="\n")
     return bool(wrong)

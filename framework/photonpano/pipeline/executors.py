@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,7 +11,7 @@ from functools import partial
 from typing import Any
 from uuid import uuid4
 
-from photonpano.capture import PluginSource, capture_of
+from photonpano.capture import Capture, PluginSource, capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, PhotonpanoError
 from photonpano.execution import CaptureElsewhere, Executor, LocalExecutor, differences
@@ -20,9 +19,9 @@ from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.pipeline.components import build_source, built
 from photonpano.plugins.contributions import ExecutorContext
 from photonpano.record.environment import library_versions, plugin_records
+from photonpano.record.fingerprint import frames_sha256
 from photonpano.specs.loading import parse_spec
 from photonpano.specs.plan import Plan
-from photonpano.values import FrameSpan
 
 
 @contextmanager
@@ -89,16 +88,8 @@ def met_elsewhere(opener: CaptureOpener) -> dict[str, str]:
 def met_by(needed: Iterable[str], source: PluginSource | None) -> dict[str, str]:
     """Return what this process has of what a run needs: versions of distributions by name, and a hash of the capture."""
     return {name: _version(name) for name in needed if name != "capture"} | {
-        "capture": "" if source is None else _hash_of(source)
+        "capture": "" if source is None else frames_sha256(Capture(source, source.info, source.valid))[:12]
     }
-
-
-def _hash_of(source: PluginSource) -> str:
-    """Return a hash of what describes a capture, and of its first, middle and last frame."""
-    digest, last = hashlib.sha256(repr(source.info).encode()), source.info.n_frames - 1
-    for frame in (0, last // 2, last):
-        digest.update(source.counts(FrameSpan(frame, frame + 1)).tobytes())
-    return digest.hexdigest()[:12]
 
 
 def _version(name: str) -> str:

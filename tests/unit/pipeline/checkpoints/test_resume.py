@@ -10,8 +10,7 @@ import pytest
 
 from photonpano import Plan, run
 from photonpano.corrections import Vignette
-from photonpano.pipeline.checkpoints.store import Store
-from photonpano.pipeline.checkpoints.work_folder import path_of
+from photonpano.pipeline.checkpoints.work_folder import Store, path_of
 from photonpano.pipeline.run import RunResult
 from photonpano.specs import parse_spec
 from photonpano.values import FrameSpan
@@ -28,7 +27,7 @@ class Killed(BaseException):
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write every result at once, so that a run can be killed after each."""
-    monkeypatch.setattr("photonpano.pipeline.checkpoints.store.FLUSH_S", 0.0)
+    monkeypatch.setattr("photonpano.pipeline.checkpoints.work_folder.FLUSH_S", 0.0)
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,31 @@
+"""The work folder: what a run keeps of its results, and which of it the next run takes."""
+
 import json
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from photonpano import InputError
+from photonpano import FrameSpan, Group, InputError, Located, NotLocated, parse_spec
 from photonpano.execution.context import Quiet
-from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, path_of, work_folder
+from photonpano.pipeline.checkpoints.fingerprint import differences, run_fingerprint
+from photonpano.pipeline.checkpoints.work_folder import (
+    Continuation,
+    Kept,
+    Store,
+    Work,
+    digest,
+    finished,
+    path_of,
+    work_folder,
+)
+from photonpano.record.fingerprint import CaptureRecord
+from photonpano.values import Decision
 
 RESUMING = Continuation(resume=True)
 LEVEL = {"scale": 1.0, "locate": {"use": "direct", "with": {"blur_px": 0.8}}, "code": {"photonpano_direct": "aa"}}
@@ -167,7 +184,7 @@ def test_changed_run_starts_again_and_says_why(
 
 
 @pytest.mark.parametrize(
-    "content", ["", "{", '{"format": 1}', '{"format": 2, "finished": false}', "[" * 10_000, "\xff", "null"]
+    "content", ["", "{", '{"format": 1}', '{"format": 3, "finished": false}', "[" * 10_000, "\xff", "null"]
 )
 def test_damaged_manifest_starts_again_and_says_why(place: Path, content: str, caplog: pytest.LogCaptureFixture) -> None:
     interrupt(place)
@@ -297,7 +314,7 @@ def test_folder_that_cannot_be_made_is_a_warning(
 
 def test_leftovers_of_a_killed_process_are_removed(place: Path) -> None:
     interrupt(place)
-    for name in (".level-1.aa.0000.0123abcd.partial.npz", ".work.0123abcd.partial.json"):
+    for name in (".level-1.aa.0000.0123abcd.partial.pickle", ".work.0123abcd.partial.json"):
         (path_of(place) / name).write_text("cut sh")
     with working(place, how=RESUMING):
         assert sorted(path.name for path in path_of(place).iterdir() if path.name.startswith(".")) == []
@@ -308,3 +325,185 @@ def test_work_stands_beside_the_run_folder(tmp_path: Path, monkeypatch: pytest.M
     assert path_of(Path("runs/scan")) == tmp_path / "runs" / "scan.work"
     assert path_of(Path("runs/v1.2")) == tmp_path / "runs" / "v1.2.work"
     assert path_of(Path()) == tmp_path.with_name(f"{tmp_path.name}.work")
+
+
+def test_digest_depends_on_every_value() -> None:
+    groups = (Group(FrameSpan(0, 10), 4.5), Group(FrameSpan(10, 20), 14.5))
+    homographies = np.random.default_rng(0).random((500, 3, 3))
+    changed = homographies.copy()
+    changed[400, 2, 1] = np.nextafter(changed[400, 2, 1], 1)
+    given = [
+        (groups, homographies),
+        (groups[:1], homographies),
+        (groups, changed),
+        (groups, homographies.reshape(-1, 3)),
+        (groups, homographies.astype(np.float32)),
+        (groups, None),
+        (homographies, groups),
+    ]
+    assert len({digest(*values) for values in given}) == len(given)
+    assert digest(*given[0]) == digest(groups, homographies.copy())
+
+
+VALUE = Located(np.random.default_rng(0).random((3, 3)), None, 0.25, {"matches": 7.0})
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path)
+
+
+def test_store_returns_what_was_saved(store: Store) -> None:
+    assert not store.holds_something
+    assert store.save("a.1", VALUE)
+    assert store.load("a.1").homography.tobytes() == VALUE.homography.tobytes()
+    assert store.load("a.2") is None
+    assert store.names("a.") == ["a.1"]
+    assert Store(store.folder).holds_something
+
+
+def test_damaged_record_is_reported_and_computed_again(store: Store, caplog: pytest.LogCaptureFixture) -> None:
+    store.save("a", VALUE)
+    path = store.folder / "a.pickle"
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    damages = [whole[: int(length)] for length in rng.integers(0, len(whole), 20)]
+    for place, bit in zip(rng.integers(0, len(whole), 100), rng.integers(0, 8, 100), strict=True):
+        damages.append(whole[:place] + bytes([whole[place] ^ (1 << bit)]) + whole[place + 1 :])
+    for damaged in damages:
+        path.write_bytes(damaged)
+        caplog.clear()
+        assert store.load("a") is None
+        assert caplog.messages == [f"{path} is damaged, and is computed again"]
+        assert not path.exists()
+
+
+@contextmanager
+def full_disk(monkeypatch: pytest.MonkeyPatch, free: int) -> Iterator[None]:
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+        yield
+
+
+def test_full_disk_is_one_warning_and_leaves_room_for_the_results(
+    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with full_disk(monkeypatch, free=300):
+        assert not store.save("a", VALUE)
+        assert not store.save("b", VALUE)
+    assert caplog.messages == [
+        f"{store.folder}: what was found is not kept, as the 300 B free are for the results; the run goes on, but if it is "
+        "interrupted, this is computed again"
+    ]
+    assert not store.holds_something
+    assert list(store.folder.iterdir()) == []
+    assert store.save("a", VALUE)
+
+
+def test_result_that_cannot_be_kept_is_a_warning(store: Store, caplog: pytest.LogCaptureFixture) -> None:
+    assert not store.save("a", NotLocated("dark", {"why": lambda: None}))
+    assert "the run goes on, but if it is interrupted, this is computed again" in caplog.text
+    assert list(store.folder.iterdir()) == []
+
+
+def test_once_computes_a_result_once_and_repeats_its_decisions(store: Store) -> None:
+    calls, decisions = [], []
+
+    def compute() -> Located:
+        calls.append(1)
+        decisions.append(Decision("chunks", 3, "short"))
+        return VALUE
+
+    kept = Kept(store, decisions)
+    given = np.eye(3), "x"
+    for _ in range(2):
+        assert kept.once("step", compute, *given).residual_px == VALUE.residual_px
+    assert len(calls) == 1
+    assert decisions == 2 * [Decision("chunks", 3, "short")]
+    kept.once("step", compute, np.eye(3), "y")
+    kept.once("other", compute, *given)
+    kept.within("vignette").once("step", compute, *given)
+    assert len(calls) == 4
+    for _ in range(2):
+        assert kept.once("nothing", lambda: calls.append(1)) is None
+    assert len(calls) == 5
+
+
+@pytest.fixture
+def written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("photonpano.pipeline.checkpoints.work_folder.FLUSH_S", 0.0)
+
+
+def test_log_goes_on_after_the_last_result_that_was_written(store: Store, written_at_once: None) -> None:
+    log = Kept(store, []).log("level-1", "given")
+    for number in range(5):
+        log.add(number)
+    again = Kept(store, []).log("level-1", "given")
+    assert again.found == [0, 1, 2, 3, 4]
+    again.add(5)
+    assert Kept(store, []).log("level-1", "given").found == [0, 1, 2, 3, 4, 5]
+    assert Kept(store, []).log("level-1", "other").found == []
+    assert Kept(store, []).log("level-1-revisits", "given").found == []
+    assert not finished(store, "level-1")
+    again.finish()
+    assert finished(store, "level-1")
+
+
+def test_log_waits_between_files_until_it_is_flushed(store: Store) -> None:
+    kept = Kept(store, [])
+    log = kept.log("level-1")
+    log.add(0)
+    log.add(1)
+    assert Kept(store, []).log("level-1").found == []
+    kept.flush()
+    assert Kept(store, []).log("level-1").found == [0, 1]
+    assert len(store.names("level-1")) == 1
+
+
+def test_log_ends_before_a_damaged_file(store: Store, written_at_once: None, caplog: pytest.LogCaptureFixture) -> None:
+    log = Kept(store, []).log("level-1")
+    for number in range(4):
+        log.add(number)
+    (store.folder / f"{store.names('level-1')[2]}.pickle").write_bytes(b"nonsense")
+    log = Kept(store, []).log("level-1")
+    assert log.found == [0, 1]
+    assert "is damaged" in caplog.text
+    log.add(2)
+    # What comes after it was found from the same results, and is still right.
+    assert Kept(store, []).log("level-1").found == [0, 1, 2, 3]
+
+
+def test_log_repeats_decisions_unless_they_are_taken_again(store: Store, written_at_once: None) -> None:
+    first, second = Decision("chunk_frames", 3, "short"), Decision("other", 1, "why")
+    decisions: list[Decision] = []
+    log = Kept(store, decisions).log("level-1")
+    decisions += [first, second]
+    log.add(0)
+    later: list[Decision] = [Decision("source", "npy", "suffix")]
+    log = Kept(store, later).log("level-1")
+    later.append(first)
+    log.finish()
+    assert later[1:] == [first, second]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("run", {"seed": 1}),
+        ("graph", {"skips": [1]}),
+        ("source", {"use": "simulator", "with": {"flux": 0.7}}),
+        ("levels", 3),
+        ("motion", {"model": "homography"}),
+        ("camera", {"focal_px": 500}),
+    ],
+    ids=["seed", "graph", "source", "levels", "motion", "camera"],
+)
+def test_fingerprint_tells_what_results_depend_on(key: str, value: object) -> None:
+    spec = {"version": 1, "source": {"use": "simulator"}, "levels": 2}
+    capture = CaptureRecord(files=[], frames_sha256="", pixels_sha256="")
+    one, same, other = (
+        run_fingerprint(parse_spec(each), capture, (8, 8))
+        for each in (spec, spec | {"run": {"threads": 1}}, spec | {key: value})
+    )
+    assert differences(one, same) == []
+    assert len(differences(one, other)) == 1
