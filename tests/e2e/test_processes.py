@@ -34,7 +34,7 @@ from photonpano.files.folders import staging_of
 class Hanging(SpecText):
     def plan(self, overrides, output, catalog=None):
         if output.name == "b":
-            with staging_of(output):
+            with staging_of(output, "b"):
                 (output.parent / "begun").touch()
                 time.sleep(60)
         return super().plan(overrides, output, catalog)

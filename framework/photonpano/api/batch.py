@@ -29,7 +29,7 @@ from photonpano.api.command import SPEC, DoubtfulError, WrongArgumentError, comm
 from photonpano.errors import InputError, OutputError, PhotonpanoError, Problem, SpecError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import thread_count
-from photonpano.files.locks import locked
+from photonpano.files.atomic import locked
 from photonpano.files.paths import Location
 from photonpano.notebooks import facts, from_here, table
 from photonpano.plugins.registry import discover
@@ -180,7 +180,7 @@ def run_batch(batch: Batch, jobs: int = 1, progress: Progress | None = None, *, 
     def write() -> None:
         write_summary(directory, rows, batch.spec.content, batch.common, batch.keys)
 
-    with locked(directory / ".batch.lock", f"the batch {directory}"):
+    with locked(directory / "batch", f"the batch {directory}"):
         if not overwrite:
             require_own(directory)
         write()  # proves that the folder can be written to

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import typer
 
 from photonpano.api.command import command
-from photonpano.errors import InputError
-from photonpano.files.atomic import remove
-from photonpano.files.folders import PENDING
-from photonpano.files.locks import claim, is_lock
-from photonpano.record.contents import finish_run_folder
+from photonpano.errors import InputError, OutputError
+from photonpano.files.atomic import in_use, is_lock, locked, remove
+from photonpano.files.folders import NEW, OLD, recover
 from photonpano.text import counted
 
+_OF_LOCKED = re.compile(rf"\.(.+)\.(lock|{NEW}|{OLD})")  # what the holder of a lock makes, and the file or folder that it locks
 _PARTIAL = re.compile(r"\.(.+\.)?[0-9a-f]{8}\.partial(\.\w+)?")
 _UNPACKED = ".unpacked.npy"
+_IDLE_S = 600.0  # an unfinished file to which nothing was written for this time is left over
 
 
 def _lines(found: list[Path], *, dry_run: bool = False) -> Iterator[str]:
@@ -35,9 +37,9 @@ def _lines(found: list[Path], *, dry_run: bool = False) -> Iterator[str]:
 def clean(directory: Path | str, dry_run: bool = False) -> list[Path]:
     """Remove what killed processes have left in a folder and those in it: unfinished files, locks, unpacked archives.
 
-    Files of a run that was killed while it put them in place are put there. An unpacked archive is removed if the archive is
-    there, from which it can be unpacked again. Nothing is removed that a process uses. Unfinished conversions (`.part`) are
-    kept, since `convert` continues them.
+    A folder that was put aside, and has no successor, is put back. An unfinished file is removed if nothing was written to it
+    for ten minutes, an unpacked archive if the archive is there, from which it can be unpacked again. What is locked is left
+    alone, and unfinished conversions (`.part`) are kept, since `convert` continues them.
 
     Args:
         directory: symbolic links in it are not followed.
@@ -52,29 +54,34 @@ def clean(directory: Path | str, dry_run: bool = False) -> list[Path]:
     folder = Path(directory)
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}; check the path")
-    found = []
-    for path in _candidates(folder, dry_run):
-        with claim(path) as nobody_else:
-            if nobody_else:
-                found.append(path)
-                if not dry_run:
-                    remove(path)
+    found = list(_leftovers(folder))
+    for path in () if dry_run else found:
+        if (locks := _locked_by(path)) is None:
+            remove(path)
+        else:
+            with suppress(OutputError), locked(locks, str(locks)):  # the lock file goes with the lock
+                recover(locks)
     return found
 
 
-def _candidates(folder: Path, dry_run: bool) -> Iterator[Path]:
-    """Yield what bears a name of unfinished or temporary files; it may be in use."""
+def _leftovers(folder: Path) -> Iterator[Path]:
     for inside, folders, files in os.walk(folder):
-        if PENDING in folders and not dry_run:
-            finish_run_folder(Path(inside))
-        named = [name for name in (*folders, *files) if _is_temporary(Path(inside, name))]
-        folders[:] = [name for name in folders if name not in named and name != PENDING]
+        named = [name for name in (*folders, *files) if _is_leftover(Path(inside, name))]
+        folders[:] = [name for name in folders if name not in named]
         yield from (Path(inside, name) for name in sorted(named))
 
 
-def _is_temporary(path: Path) -> bool:
+def _is_leftover(path: Path) -> bool:
     if path.is_symlink():
         return False
+    if (locks := _locked_by(path)) is not None:
+        return not in_use(locks) and (path.is_dir() or is_lock(path))
     if path.name.endswith(f".gz{_UNPACKED}"):
         return path.with_name(path.name.removesuffix(_UNPACKED)).is_file()
-    return _PARTIAL.fullmatch(path.name) is not None or is_lock(path)
+    return _PARTIAL.fullmatch(path.name) is not None and time.time() - path.stat().st_mtime > _IDLE_S
+
+
+def _locked_by(path: Path) -> Path | None:
+    """Return the file or folder whose lock protects what has this name; None for another name."""
+    found = _OF_LOCKED.fullmatch(path.name)
+    return None if found is None else path.with_name(found[1])

@@ -11,7 +11,7 @@ from photonpano.api.command import command
 from photonpano.errors import InputError, SpecError
 from photonpano.pipeline.components import open_source
 from photonpano.plugins.registry import Catalog
-from photonpano.record.contents import changed_files, finish_run_folder, recorded_contents
+from photonpano.record.contents import changed_files, recorded_contents
 from photonpano.record.fingerprint import CaptureRecord, changes, fingerprint
 from photonpano.record.run_json import read_record
 from photonpano.specs import parse_spec
@@ -48,8 +48,7 @@ def _lines(found: Verification) -> Iterator[str]:
 def verify(run_folder: Path | str, catalog: Catalog | None = None) -> Verification:
     """Verify that a run folder is as its run wrote it.
 
-    Compares the size and SHA-256 of each file with `run.json`, and the capture with its fingerprint there. If a run was
-    killed while it put its files in place, they are put there first.
+    Compares the size and SHA-256 of each file with `run.json`, and the capture with its fingerprint there.
 
     Args:
         run_folder: written by `run`.
@@ -59,7 +58,6 @@ def verify(run_folder: Path | str, catalog: Catalog | None = None) -> Verificati
         InputError: the folder is no run folder.
     """
     folder = Path(run_folder)
-    finish_run_folder(folder)
     record = read_record(folder)
     recorded, changed = recorded_contents(folder), changed_files(folder)
     if recorded is None or changed is None:

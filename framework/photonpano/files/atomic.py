@@ -1,38 +1,90 @@
-"""Write files whole or not at all: under a temporary name, which then becomes the final one."""
+"""Write files whole or not at all: under a temporary name, which then becomes the final one. Lock files and folders."""
 
 from __future__ import annotations
 
 import errno
 import os
-import re
 import secrets
 import shutil
+import socket
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from photonpano.errors import OutputError
-from photonpano.files.locks import claim, claimed, is_at
 from photonpano.text import byte_size
 
-_PARTIAL = re.compile("[0-9a-f]{8}")
-_unfinished: set[Path] = set()  # files and folders under temporary names, which are to become final
+_PATIENCE_S = 0.2  # how long to wait for a lock that may be given back right now
+_HOLDER = "process "  # how the note of the holder of a lock begins
 
 
-def discard_unfinished() -> None:
-    """Remove the files and folders that are being written, in a program that ends now. Never raises.
+def lock_path(final: Path) -> Path:
+    """Return the lock file of a file or folder: `.scan.lock` beside `scan`."""
+    return final.with_name(f".{final.name}.lock")
 
-    Each is renamed first. So a thread that still works finds nothing that it could give the final name to.
+
+@contextmanager
+def locked(final: Path, what: str, remedy: str = "choose another folder with --output") -> Iterator[None]:
+    """Hold the lock of a file or folder during the block. The system forgets it with the process.
+
+    Args:
+        final: the file or folder; it may be missing.
+        what: its name in the message, such as `the run folder runs/scan`.
+        remedy: what to do but to wait.
+
+    Raises:
+        OutputError: another process holds the lock.
+        OSError: the lock file cannot be made.
     """
-    for each in list(_unfinished):
-        doomed = each.with_name(f".{secrets.token_hex(4)}.partial")
-        with suppress(OSError):
-            each.rename(doomed)
-            if doomed.is_dir():
-                shutil.rmtree(doomed, ignore_errors=True)
-            else:
-                doomed.unlink()
+    if not final.parent.is_dir():  # the library would make it
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+    path = lock_path(final)
+    lock = FileLock(path, timeout=_PATIENCE_S)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise OutputError(f"{what} is in use: {_holder(path)}; wait for it, or {remedy}") from error
+    with_notes = type(lock) is FileLock  # on a file system without locks, it has become one that needs the file for itself
+    try:
+        if with_notes:
+            now = datetime.now().astimezone().isoformat(timespec="seconds")
+            path.write_text(
+                f"{_HOLDER}{os.getpid()} on {socket.gethostname()} has been writing it since {now}", encoding="utf-8"
+            )
+        yield
+    finally:
+        if with_notes:
+            path.unlink(missing_ok=True)
+        lock.release()
+
+
+def in_use(final: Path) -> bool:
+    """Return whether a process holds the lock of a file or folder."""
+    lock = FileLock(lock_path(final), timeout=0)
+    with suppress(Timeout):
+        if lock_path(final).exists():
+            lock.acquire()
+            lock.release()
+        return False
+    return True
+
+
+def is_lock(path: Path) -> bool:
+    """Return whether a file is a lock of this program."""
+    return path.is_file() and path.read_bytes().startswith(_HOLDER.encode())
+
+
+def _holder(path: Path) -> str:
+    """Say who holds a lock: the holder may write that a moment later."""
+    try:
+        note = path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        note = ""
+    return note if note.startswith(_HOLDER) else "another process is writing it"
 
 
 @contextmanager
@@ -46,9 +98,14 @@ def atomic_path(final: Path, *, flushed: bool = True) -> Iterator[Path]:
     Raises:
         OutputError: the file cannot be written. Every `OSError` of the block counts as one of writing.
     """
-    with _becoming(final), _lent(final, f".{final.stem}.", f".partial{final.suffix}") as temporary:
-        yield temporary
-        _rename(temporary, final, flushed=flushed)
+    temporary = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.partial{final.suffix}")
+    with _becoming(final):
+        try:
+            temporary.touch(exist_ok=False)
+            yield temporary
+            _rename(temporary, final, flushed=flushed)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def part_path(final: Path) -> Path:
@@ -66,74 +123,16 @@ def resumable_path(final: Path) -> Iterator[Path]:
         OutputError: as `atomic_path`; or another process writes the file.
     """
     part = part_path(final)
-    with _becoming(final):
+    with _becoming(final), locked(final, str(final), "choose another name"):
         if os.path.lexists(part) and not stat.S_ISREG(part.lstat().st_mode):
             raise OutputError(f"cannot write {final}: {part} is no regular file; remove it, or choose another name")
-        descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        part.open("ab").close()
         try:
-            if claimed(descriptor) is False or not is_at(descriptor, part):
-                raise OutputError(f"cannot write {final}: another process is writing it; wait for it, or choose another name")
             yield part
             _rename(part, final)
         finally:
-            if is_at(descriptor, part) and not os.fstat(descriptor).st_size:
+            if part.exists() and not part.stat().st_size:
                 part.unlink()
-            os.close(descriptor)
-
-
-@contextmanager
-def unfinished_folder(place: Path, start: str) -> Iterator[Path]:
-    """Lend a new folder beside `place` whose name begins with `start` and ends in `.partial`, and remove it after the block."""
-    with _lent(place, start, ".partial", folder=True) as temporary:
-        yield temporary
-
-
-@contextmanager
-def _lent(place: Path, start: str, end: str, *, folder: bool = False) -> Iterator[Path]:
-    """Make a file or folder beside `place`, lock it, so that others see that it is in use, and remove it after the block."""
-    for path in partial_paths(place.parent, start, end):
-        with claim(path) as mine:
-            if mine:
-                remove(path)
-    descriptor = None
-    while descriptor is None:
-        temporary = place.with_name(f"{start}{secrets.token_hex(4)}{end}")
-        try:
-            _unfinished.add(temporary)  # before it is there: a signal may come at any moment
-            descriptor = _created(temporary, folder)
-            if descriptor is not None:
-                yield temporary
-        finally:
-            if descriptor is not None:
-                os.close(descriptor)
-            with suppress(OSError):
-                remove(temporary)
-            _unfinished.discard(temporary)
-
-
-def _created(temporary: Path, folder: bool) -> int | None:
-    """Make and lock a file or folder; None if another process took it for abandoned before it was locked."""
-    if folder:
-        temporary.mkdir()
-    flags = os.O_RDONLY if folder else os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
-    descriptor = os.open(temporary, flags, 0o666)
-    if claimed(descriptor) is not False and temporary.exists():
-        return descriptor
-    os.close(descriptor)
-    return None
-
-
-def partial_paths(folder: Path, start: str, end: str) -> list[Path]:
-    """Return what bears a temporary name: `start`, eight hexadecimal digits, and `end`."""
-    try:
-        return [path for path in sorted(folder.iterdir()) if is_partial(path.name, start, end)]
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-
-
-def is_partial(name: str, start: str, end: str) -> bool:
-    """Return whether a name is a temporary one: see `partial_paths`."""
-    return bool(_PARTIAL.fullmatch(name[len(start) : len(name) - len(end)])) and name.startswith(start) and name.endswith(end)
 
 
 def remove(path: Path) -> None:
@@ -165,7 +164,7 @@ def writing(final: Path) -> Iterator[None]:
 
 
 def _rename(temporary: Path, final: Path, *, flushed: bool = True) -> None:
-    """Give a file or folder its final name, once it is on the disk if it is to be flushed."""
+    """Give a file its final name, once it is on the disk if it is to be flushed."""
     if flushed:
         flush(temporary)
     temporary.replace(final)

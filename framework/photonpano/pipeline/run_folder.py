@@ -1,4 +1,4 @@
-"""The run folder: it is locked, and its files change in one step; and the exposures of levels that are kept in it."""
+"""The run folder: it is locked, and replaced as a whole; and the exposures of levels that are kept in it."""
 
 from __future__ import annotations
 
@@ -18,39 +18,28 @@ from numpy.typing import NDArray
 from photonpano.errors import OutputError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import in_order
-from photonpano.files.folders import (
-    finish_replacement,
-    link_or_copy,
-    lock_path,
-    others_in,
-    remove_leftovers,
-    replace_folder,
-    require_harmless,
-    staging_of,
-)
-from photonpano.files.locks import locked
+from photonpano.files.atomic import flush
+from photonpano.files.folders import others_in, replace_folder, require_harmless, staging_of
 from photonpano.geometry import Canvas
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
-from photonpano.record.contents import MAPS, RECORD, contents_of, names_of_results, recorded_contents, recorded_json
+from photonpano.record.contents import MAPS, RECORD, content_of, contents_of, names_of_results, recorded_json
 from photonpano.record.picture_files import png_of
-from photonpano.record.schema import FileContent, RunRecord
+from photonpano.record.schema import RunRecord
 from photonpano.values import FluxImage, Panorama
 
+_REPORT = "report.html"
 SHOWN_FILES = 3  # files that a message names
 
 
 class RunFolder:
     """A folder, `staging`, in which the files of a run are gathered, and from which they replace those of the run before."""
 
-    def __init__(self, directory: Path, stack: ExitStack) -> None:
-        self.directory = directory
-        self._stack = stack
-        self.staging = stack.enter_context(staging_of(directory))
-        self._contents: dict[str, FileContent] = {}  # sizes and hashes of files that were committed before
+    def __init__(self, directory: Path, staging: Path) -> None:
+        self.directory, self.staging = directory, staging
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -87,34 +76,38 @@ class RunFolder:
             }
             np.savez(self.staging / "trajectory.npz", allow_pickle=False, **motion_arrays, **_of_camera(motion))
 
-    def write_report(self, page: str) -> None:
-        """Write report.html."""
-        path = self.staging / "report.html"
-        self._contents.pop(path.name, None)
-        try:
-            with self.writing():
-                path.write_text(page, encoding="utf-8")
-        except BaseException:
-            path.unlink(missing_ok=True)
-            raise
-
     def commit(self, record: RunRecord) -> RunRecord:
-        """Put the written files and run.json into the run folder, in one step; return the record with sizes and hashes."""
+        """Make the written files and run.json those of the run folder; return the record with sizes and hashes."""
         with self.writing():
-            self._contents = contents_of(self.staging, self._contents)
-            record = {**record, "files": self._contents}
-            text = json.dumps(record, indent=2, allow_nan=False) + "\n"
-            (self.staging / RECORD).write_text(text, encoding="utf-8")
+            record = {**record, "files": contents_of(self.staging)}
+            (self.staging / RECORD).write_text(_written(record), encoding="utf-8")
             replace_folder(self.staging, self.directory, names_of_results(self.directory))
         return record
 
-    def reopen(self) -> None:
-        """Gather the files of the next commit, which begin as those of the last one."""
+    def add_report(self, page: str) -> None:
+        """Write report.html beside the committed files; `update` lists it in run.json."""
+        self._put(_REPORT, page)
+
+    def update(self, record: RunRecord) -> RunRecord:
+        """Write run.json of the committed files again, with the report if there is one; return the record."""
+        report = self.directory / _REPORT
+        if report.exists():
+            record = {**record, "files": {**record["files"], _REPORT: content_of(report)}}
+        self._put(RECORD, _written(record))
+        return record
+
+    def _put(self, name: str, text: str) -> None:
+        """Write a file of the committed ones, whole or not at all."""
         with self.writing():
-            self.staging = self._stack.enter_context(staging_of(self.directory))
-            for name in recorded_contents(self.directory) or ():
-                (self.staging / name).parent.mkdir(parents=True, exist_ok=True)
-                link_or_copy(self.directory / name, self.staging / name)
+            self.staging.mkdir(exist_ok=True)
+            path = self.staging / name
+            path.write_text(text, encoding="utf-8")
+            flush(path)
+            path.replace(self.directory / name)
+
+
+def _written(record: RunRecord) -> str:
+    return json.dumps(record, indent=2, allow_nan=False) + "\n"
 
 
 @contextmanager
@@ -137,18 +130,15 @@ def run_folder(directory: Path, *, overwrite: bool = False, inputs: Sequence[Pat
             stack.enter_context(_made(directory.parent))
             if directory.exists() and not directory.is_dir():
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
-            stack.enter_context(locked(lock_path(directory), f"the run folder {directory}"))
-            finish_replacement(directory)
+            staging = stack.enter_context(staging_of(directory, f"the run folder {directory}"))
             if not overwrite and directory.is_dir():
                 _require_own(directory)
                 _require_same_capture(directory, inputs)
-            remove_leftovers(directory)
-            folder = RunFolder(directory, stack)
         except OSError as error:
             raise OutputError(
                 f"{directory}: the run folder cannot be written to ({error.strerror}); choose another one with --output"
             ) from error
-        yield folder
+        yield RunFolder(directory, staging)
 
 
 def _of_camera(motion: FrameMotion) -> dict[str, NDArray[Any]]:

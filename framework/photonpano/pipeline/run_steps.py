@@ -176,14 +176,13 @@ def _written_failure(path: Path, record: RunRecord, error: PhotonpanoError) -> P
 def _with_report(folder: RunFolder, record: RunRecord, draw: Callable[[RunRecord], str]) -> RunRecord:
     """Add the report to the run folder. The results are there already: what fails now is a warning."""
     try:
-        folder.reopen()
         try:
-            folder.write_report(draw(record))
+            folder.add_report(draw(record))
         except Exception as error:
             logger.debug("the report failed", exc_info=True)
             warning = f"the report could not be drawn ({type(error).__name__}: {error}); all other files of the run are written"
             record = {**record, "warnings": [*record["warnings"], warning]}
-        return folder.commit({**record, "peak_memory_bytes": peak_memory_bytes()})
+        return folder.update({**record, "peak_memory_bytes": peak_memory_bytes()})
     except OutputError as error:
         warning = f"the report could not be added ({error}); all other files of the run are written"
         return {**record, "warnings": [*record["warnings"], warning]}

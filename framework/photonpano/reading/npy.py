@@ -18,7 +18,6 @@ import numpy as np
 
 from photonpano.errors import InputError
 from photonpano.files.atomic import atomic_path, require_space
-from photonpano.files.locks import hold
 from photonpano.files.paths import Location, Url
 from photonpano.reading.files import is_gzip, read_start, reading, size_of
 from photonpano.reading.remote import read_range
@@ -178,7 +177,7 @@ def unpacked(path: Location) -> Path:
     """Return the path of a .npy file with the content of a .npy.gz file.
 
     For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. It is written, and a warning logged, unless it is there with the
-    checksum that the archive ends with. Until the process ends, it is locked for others who would remove it.
+    checksum that the archive ends with.
 
     Raises:
         InputError: the file is damaged, or holds something else.
@@ -192,7 +191,6 @@ def unpacked(path: Location) -> Path:
         logger.warning("%s is unpacked to %s, once", path, target.name)
         with atomic_path(target) as temporary:
             _unpack(path, temporary, promised)
-    hold(target)
     return target
 
 

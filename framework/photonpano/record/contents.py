@@ -7,14 +7,11 @@ import json
 import logging
 import stat
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from photonpano.contracts.protocols import Source
-from photonpano.errors import InputError, OutputError
-from photonpano.files.folders import PENDING, finish_replacement, lock_path
-from photonpano.files.locks import locked
+from photonpano.errors import InputError
 from photonpano.record.fingerprint import frames_sha256
 from photonpano.record.schema import FileContent
 
@@ -32,14 +29,11 @@ RESULTS = frozenset(
 )
 
 
-def contents_of(folder: Path, known: Mapping[str, FileContent] | None = None) -> dict[str, FileContent]:
-    """Return size and SHA-256 of the files in a folder by their paths in it, such as `sparse/images.txt`, without run.json.
-
-    Files that are `known` are not read.
-    """
+def contents_of(folder: Path) -> dict[str, FileContent]:
+    """Return size and SHA-256 of the files in a folder by their paths in it, such as `sparse/images.txt`, without run.json."""
     paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
     names = sorted(name for path in paths if (name := path.relative_to(folder).as_posix()) != RECORD)
-    return {name: (known or {}).get(name) or _content(folder / name) for name in names}
+    return {name: content_of(folder / name) for name in names}
 
 
 def recorded_json(folder: Path) -> Mapping[str, Any] | None:
@@ -65,23 +59,6 @@ def names_of_results(folder: Path) -> set[str]:
     return {*RESULTS, *(recorded_contents(folder) or ())}
 
 
-def finish_run_folder(folder: Path) -> None:
-    """Put the files of a run in place that was killed while it did so; while another process does that, let it.
-
-    Raises `InputError` if the folder cannot be written to.
-    """
-    if not (folder / PENDING).is_dir():
-        return
-    try:
-        with suppress(OutputError), locked(lock_path(folder.absolute()), f"the run folder {folder}"):
-            finish_replacement(folder)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: a run was stopped while it put its files in place, and they cannot be put there ({error.strerror}); "
-            f"the files in {folder / PENDING} are the new ones"
-        ) from error
-
-
 def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str] | None:
     """Return which of the named files, by default all, differ from what run.json lists; None if it lists none."""
     recorded = recorded_contents(folder)
@@ -95,7 +72,6 @@ def require_one_run(folder: Path, names: Iterable[str]) -> None:
     """Raise `InputError` if files are not those of the run.json beside them; warn if it lists no hashes."""
     if not folder.is_dir():
         return
-    finish_run_folder(folder)
     changed = changed_files(folder, names)
     if changed is None:
         logger.warning("%s: run.json lists no hashes, as in older versions, so the files may be of several runs", folder)
@@ -116,12 +92,13 @@ def require_same_frames(folder: Path, record: Mapping[str, Any], source: Source)
 
 def _differs(path: Path, recorded: FileContent) -> bool:
     try:
-        return path.lstat().st_size != recorded.get("bytes") or _content(path) != recorded
+        return path.lstat().st_size != recorded.get("bytes") or content_of(path) != recorded
     except OSError:
         return True
 
 
-def _content(path: Path) -> FileContent:
+def content_of(path: Path) -> FileContent:
+    """Return size and SHA-256 of a file; nothing of what is no regular file."""
     if not stat.S_ISREG(path.lstat().st_mode):
         return {"bytes": 0, "sha256": ""}
     with path.open("rb") as file:

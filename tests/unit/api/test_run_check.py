@@ -1,6 +1,5 @@
 """Finished runs are compared, checked, verified, and cleaned up after."""
 
-import fcntl
 import json
 import os
 import re
@@ -16,9 +15,9 @@ import pytest
 from photonpano import InputError, OutputError, check_run, clean, compare, parse_spec, run, verify
 from photonpano.evaluation import RunTrajectory
 from photonpano.evaluation.comparison import motion_difference, on_canvas
+from photonpano.files.atomic import locked
 from photonpano.geometry import Canvas, translation
 from photonpano.pipeline.run import RunResult
-from photonpano.reading.npy import unpacked
 from photonpano.residuals.verdict import REPEATS
 
 
@@ -133,25 +132,20 @@ def test_clean_removes_leftovers_only(tmp_path: Path) -> None:
 
     with gzip.open(tmp_path / "cube.npy.gz", "wb") as file:
         np.save(file, np.zeros((4, 5, 6), np.uint8))
-    shutil.copy(tmp_path / "cube.npy.gz", tmp_path / "used.npy.gz")
     (tmp_path / "cube.npy.gz.unpacked.npy").write_bytes(b"old")
     (tmp_path / "lost.npy.gz.unpacked.npy").write_bytes(b"its archive is gone")
-    unpacked(tmp_path / "used.npy.gz")
-    left = [".scan.0123abcd.partial/panorama.tiff", ".cube.0123abcd.partial.npy", ".scan.lock", "run/.0123abcd.partial/a"]
-    kept = [".used.0123abcd.partial.npy", "cube.npy.part", ".mine.lock", ".partial", ".x.partial", "notes.partial", "run/.lock"]
+    left = [".scan.photonpano-new/panorama.tiff", ".cube.0123abcd.partial.npy", ".scan.lock", "runs/.old.photonpano-old/a"]
+    kept = [".new.0123abcd.partial.npy", "cube.npy.part", ".mine.lock", ".partial", ".used.photonpano-new/a", "runs/old/a"]
     for name in (*left, *kept):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text("content")
-    (tmp_path / ".scan.lock").write_text(json.dumps({"host": "a", "pid": 1, "process_start": "", "since": ""}))
-    (tmp_path / ".link.0123abcd.partial").symlink_to(tmp_path / "notes.partial")
+        (tmp_path / name).write_text("process 1 on a" if name == ".scan.lock" else "content")
+    os.utime(tmp_path / ".cube.0123abcd.partial.npy", (0, 0))
+    (tmp_path / ".link.0123abcd.partial").symlink_to(tmp_path / ".partial")
     before = {path for path in tmp_path.rglob("*") if path.is_file() or path.is_symlink()}
-    expected = sorted(
-        tmp_path / name.removesuffix("/panorama.tiff").removesuffix("/a") for name in (*left, "cube.npy.gz.unpacked.npy")
-    )
-    with (tmp_path / ".used.0123abcd.partial.npy").open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    places = [str(Path(name).parent if name.endswith(("tiff", "/a")) else name) for name in left]
+    expected = sorted(tmp_path / name for name in (*places, "cube.npy.gz.unpacked.npy"))
+    with locked(tmp_path / "used", "used"):
         assert sorted(clean(tmp_path, dry_run=True)) == expected
-        assert {path for path in tmp_path.rglob("*") if path.is_file() or path.is_symlink()} == before
         assert sorted(clean(tmp_path)) == expected
     removed = before - {path for path in tmp_path.rglob("*") if path.is_file() or path.is_symlink()}
     assert removed == {tmp_path / name for name in (*left, "cube.npy.gz.unpacked.npy")}
@@ -160,15 +154,11 @@ def test_clean_removes_leftovers_only(tmp_path: Path) -> None:
     assert str(caught.value) == f"there is no folder {tmp_path}/nowhere; check the path"
 
 
-def test_clean_finishes_a_run_that_was_killed_in_its_step(copied: Path) -> None:
-    pending = copied / ".photonpano-pending"
-    pending.mkdir()
-    for path in copied.glob("*.*"):
-        if path.is_file():
-            path.rename(pending / path.name)
-    clean(copied.parent)
-    assert not pending.exists()
-    assert verify(copied).problems == ()
+def test_clean_puts_back_a_folder_that_was_put_aside(tmp_path: Path) -> None:
+    (tmp_path / ".scan.photonpano-old").mkdir()
+    (tmp_path / ".scan.photonpano-old" / "run.json").write_text("{}")
+    assert clean(tmp_path) == [tmp_path / ".scan.photonpano-old"]
+    assert [path.name for path in tmp_path.rglob("*")] == ["scan", "run.json"]
 
 
 @pytest.fixture(scope="module")

@@ -1,3 +1,4 @@
+import os
 import shutil
 import subprocess
 import sys
@@ -267,7 +268,8 @@ def test_second_process_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(OutputError) as caught:
         write_packed(RandomSource(20, 6, 19), path, write_again, resumed=lambda _: None)
-    assert str(caught.value) == f"cannot write {path}: another process is writing it; wait for it, or choose another name"
+    assert str(caught.value).startswith(f"{path} is in use: process {os.getpid()} on ")
+    assert str(caught.value).endswith("; wait for it, or choose another name")
 
 
 def test_full_disk_leaves_a_resumable_file(tmp_path: Path) -> None:

@@ -4,8 +4,6 @@ import errno
 import os
 import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +17,7 @@ from photonpano import (
     Url,
 )
 from photonpano import text as words
-from photonpano.api.clean import clean
-from photonpano.files.atomic import atomic_path, discard_unfinished, unfinished_folder
-from photonpano.files.folders import atomic_folder, is_ours
+from photonpano.files.atomic import atomic_path
 from photonpano.files.paths import location
 from photonpano.filtering import exceeding_noise
 
@@ -222,30 +218,6 @@ def test_atomic_path_reports_a_full_disk_and_keeps_the_old_file(tmp_path: Path, 
     assert str(caught.value) == (f"cannot write {final}: No space left on device; free some space or choose another folder")
     assert final.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [final]
-
-
-@pytest.mark.parametrize("lend", [atomic_path, atomic_folder])
-def test_interrupt_while_the_temporary_file_is_made_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lend: Callable[[Path], AbstractContextManager[Path]]
-) -> None:
-    def interrupted(_: int) -> bool:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("photonpano.files.atomic.claimed", interrupted)
-    with pytest.raises(KeyboardInterrupt), lend(tmp_path / "cube.npy"):
-        pass
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_a_stopped_program_had_no_time_to_remove_is_a_leftover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch, unfinished_folder(tmp_path / "scan", ".scan."):
-        patch.setattr("photonpano.files.atomic.shutil.rmtree", lambda *_, **__: None)
-        discard_unfinished()
-        (left,) = tmp_path.iterdir()
-        assert clean(tmp_path) == []  # its process holds it until it ends
-    assert is_ours(left.name)
-    assert clean(tmp_path) == [left]
-    assert list(tmp_path.iterdir()) == []
 
 
 STEPS = np.arange(1000)

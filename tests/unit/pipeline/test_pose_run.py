@@ -195,21 +195,6 @@ def test_panorama_in_the_same_folder_replaces_the_poses(
     assert not (folder / "panorama.tiff").exists()
 
 
-def test_folder_that_cannot_be_renamed_gets_the_same_files(
-    plan_of: Callable[..., Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The current folder keeps its name: the files are moved into it one by one."""
-    folder = tmp_path / "run"
-    run(plan_of(output={"exposures": True}))
-    (folder / "images" / "mine.png").write_text("a user's")
-    monkeypatch.chdir(folder)
-    run(plan_of(), overwrite=True)
-    assert [path.name for path in (folder / "images").iterdir()] == ["mine.png"]
-    assert {path.name for path in (folder / "sparse").iterdir()} == {"cameras.txt", "images.txt", "points3D.txt"}
-    assert changed_files(folder) == []
-    assert not [path for path in folder.iterdir() if path.name.startswith(".") and path.name != ".lock"]
-
-
 def test_record_that_lists_files_elsewhere_is_not_followed(plan_of: Callable[..., Plan], tmp_path: Path) -> None:
     folder, other = tmp_path / "run", tmp_path / "precious.txt"
     run(plan_of())

@@ -46,10 +46,3 @@ def test_unpacking_replaces_no_symbolic_link(archive: Path, tmp_path: Path) -> N
         unpacked(archive)
     assert str(caught.value) == f"cannot write {link}: it is a symbolic link; remove it, or choose another name"
     assert (tmp_path / "precious").read_text() == "content"
-
-
-def test_unpacking_removes_what_a_killed_process_has_left(archive: Path, tmp_path: Path) -> None:
-    left = tmp_path / ".cube.npy.gz.unpacked.0123abcd.partial.npy"
-    left.write_bytes(b"half")
-    unpacked(archive)
-    assert not left.exists()

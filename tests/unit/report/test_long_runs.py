@@ -55,10 +55,9 @@ class End:
     def written(self, directory: Path) -> None:
         with run_folder(directory) as folder:
             folder.write_results(self.panorama, self.motion)
-            folder.commit(self.record)
-            folder.reopen()
-            folder.write_report("<html></html>")
-            folder.commit(self.record)
+            record = folder.commit(self.record)
+            folder.add_report("<html></html>")
+            folder.update(record)
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,7 @@ from photonpano.contracts.rules import attributing
 from photonpano.errors import InputError, OutputError, PhotonpanoError, described
 from photonpano.execution.context import Context, Progress
 from photonpano.execution.threads import one_thread_inside, thread_count
-from photonpano.files.folders import lock_path
-from photonpano.files.locks import locked
+from photonpano.files.atomic import locked
 from photonpano.pipeline.following.arrivals import Arrivals, Spool
 from photonpano.pipeline.following.live_run import Every, LiveRun
 from photonpano.pipeline.following.picture import PAGE, LivePage, PictureSoFar, rehearse
@@ -62,7 +61,7 @@ def followed(plan: Plan, progress: Progress, *, overwrite: bool, end_after: floa
     look = _followable(plan)
     with ExitStack() as stack:
         stack.enter_context(_made(folder))
-        stack.enter_context(locked(lock_path(folder), f"the folder {folder}"))
+        stack.enter_context(locked(folder, f"the folder {folder}"))
         what = look(plan.source.config)
         spool: Spool | None = None
         spooled = folder / SPOOL

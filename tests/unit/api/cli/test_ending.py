@@ -23,7 +23,7 @@ from photonpano.files.folders import staging_of
 
 @app.command(cls=Command)
 def work():
-    with atomic_path(Path("cube.npy")), staging_of(Path("run").absolute()) as folder:
+    with atomic_path(Path("cube.npy")), staging_of(Path("run").absolute(), "run") as folder:
         (folder / "run.json").write_text("{}")
         print("working", flush=True)
         WORK
