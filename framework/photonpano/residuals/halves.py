@@ -13,8 +13,8 @@ from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source
@@ -211,8 +211,8 @@ def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreeme
         whole = np.maximum(lit[first : first + 2].sum(axis=0) / weight[first : first + 2].sum(axis=0), _DARKEST)
         noise = noise + frame_variance(whole, response) / weight[first : first + 2].sum(axis=0)
     for number, blur_px in enumerate(_BLURS_PX):
-        within = np.maximum(gaussian_filter(known, (blur_px, blur_px, 0)), np.float32(1e-6))
-        smooth = gaussian_filter(lit / weight * known, (0, blur_px, blur_px, 0)) / within
+        within = np.maximum(_blurred(known, blur_px), np.float32(1e-6))
+        smooth = np.stack([_blurred(picture, blur_px) for picture in lit / weight * known]) / within
         along_x, along_y = (np.asarray(np.gradient(smooth, axis=axis)) for axis in (2, 1))
         gradients = np.stack([along_x, along_y], axis=1) * known / np.sqrt(noise)
         coarser = _agreement(gradients, widest_px, round(_SQUARE_PX * blur_px))
@@ -221,6 +221,11 @@ def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreeme
         if weak < widest_px:
             break
     return found
+
+
+def _blurred(picture: FluxImage, blur_px: float) -> FluxImage:
+    blurred = cv2.GaussianBlur(picture, (0, 0), blur_px, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(blurred.reshape(picture.shape))
 
 
 def _agreement(gradients: FluxImage, widest_px: float, square_px: int) -> _Agreement:
