@@ -8,4 +8,14 @@ A name is imported when it is first used, so that the help of the command line n
 import lazy_loader
 
 __version__ = "0.2.0"
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_REMOVED = ("LensedSource", "LinearlyCorrectedSource", "LitSource", "WeightedSource")  # until 0.2
+
+
+def __getattr__(name: str) -> object:
+    if name in _REMOVED:
+        raise ImportError(
+            f"photonpano.{name} was removed after 0.2: a component reads `corrects_sums`, `weight`, `light` and `camera` "
+            "of the `photonpano.Capture` that it gets"
+        )
+    return _public(name)

@@ -42,9 +42,6 @@ from .contracts.protocols import Interpolator as Interpolator
 from .contracts.protocols import KeepsHypotheses as KeepsHypotheses
 from .contracts.protocols import KnowsSharpViews as KnowsSharpViews
 from .contracts.protocols import KnowsTruth as KnowsTruth
-from .contracts.protocols import LensedSource as LensedSource
-from .contracts.protocols import LinearlyCorrectedSource as LinearlyCorrectedSource
-from .contracts.protocols import LitSource as LitSource
 from .contracts.protocols import LocatesTurns as LocatesTurns
 from .contracts.protocols import Locator as Locator
 from .contracts.protocols import Merger as Merger
@@ -57,7 +54,6 @@ from .contracts.protocols import Renderer as Renderer
 from .contracts.protocols import Resampler as Resampler
 from .contracts.protocols import Source as Source
 from .contracts.protocols import Trajectory as Trajectory
-from .contracts.protocols import WeightedSource as WeightedSource
 from .errors import CanvasTooLargeError as CanvasTooLargeError
 from .errors import CaptureUnreadError as CaptureUnreadError
 from .errors import InputError as InputError

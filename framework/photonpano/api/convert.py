@@ -16,7 +16,7 @@ from rich.filesize import decimal
 from photonpano.api.command import command, warn
 from photonpano.capture import capture_of
 from photonpano.capture.writing import truth_path, write_folder, write_packed
-from photonpano.contracts.protocols import KnowsTruth, Source
+from photonpano.contracts.protocols import Source
 from photonpano.errors import OutputError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import thread_count
@@ -152,10 +152,10 @@ def require_new_capture(source: Source, plan: Plan, output: Path, overwrite: boo
     """
     files, truth = capture_files(plan), truth_path(output)
     require_new(output, overwrite, files)
-    if not isinstance(source, KnowsTruth) and truth.absolute() in map(truth_path, files):
+    if not capture_of(source).knows_truth and truth.absolute() in map(truth_path, files):
         return  # it is the truth of the frames that are converted
     require_new(truth, overwrite, files)
-    if truth.exists() and not isinstance(source, KnowsTruth):
+    if truth.exists() and not capture_of(source).knows_truth:
         raise OutputError(
             f"{truth} is the truth of the capture that {output} would replace; move it away, or choose another name"
         )

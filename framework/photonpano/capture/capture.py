@@ -184,9 +184,14 @@ class Capture(Closing):
         """Return the flux of a clear pixel, as factors of the flux of red, green and blue ones, whose sum it is: (3,)."""
         return np.ones(3) if self.colour is None else self.colour.clear_mix
 
+    @property
+    def knows_truth(self) -> bool:
+        """Whether `truth` returns the ground truth."""
+        return self.gather is None and self.source.offers("truth")
+
     def truth(self) -> Mapping[str, NDArray[np.generic]] | None:
         """Return the ground truth of a simulated capture, see `photonpano.KnowsTruth`; None if it is not known."""
-        if not self._offers("truth"):
+        if not self.knows_truth:
             return None
         truth = self.source.truth()
         frames = slice(self.first, self.first + self.info.n_frames)
@@ -195,7 +200,7 @@ class Capture(Closing):
     @property
     def has_sharp_views(self) -> bool:
         """Whether `sharp_view` returns frames without noise."""
-        return self._offers("sharp_view")
+        return self.gather is None and self.colour is None and self.source.offers("sharp_view")
 
     def sharp_view(self, frame: int) -> FluxImage:
         """Return the flux of a frame of a simulated capture without noise, see `photonpano.KnowsSharpViews`.
@@ -221,21 +226,6 @@ class Capture(Closing):
 
     def _gathered(self, frames: Any) -> Any:
         return frames if self.gather is None else self.gather(frames)
-
-    def _offers(self, member: str) -> bool:
-        """Return whether a member that only some sources have applies here: `isinstance` with their protocols asks."""
-        offered = {
-            "packed": self.is_packed,
-            "corrected": self.corrects_sums,
-            "weights": self.weight is not None,
-            "colours": self.colour is not None,
-            "clear_mix": self.colour is not None,
-            "light": self.light is not None,
-            "camera": self.camera is not None,
-            "truth": self.gather is None and self.source.offers("truth"),
-            "sharp_view": self.gather is None and self.colour is None and self.source.offers("sharp_view"),
-        }
-        return offered[member]
 
 
 def capture_of(source: Source, origin: str | None = None) -> Capture:
@@ -290,13 +280,4 @@ def _capture_of(source: PluginSource) -> Capture:
     if source.offers("colours"):
         parts = {name: _capture_of(each) for name, each in source.colours().items()}
         colour = Colours(parts, source.clear_mix())
-    return Capture(
-        source,
-        source.info,
-        source.valid,
-        steps=(source.corrected,) if source.offers("corrected") else (),
-        weight=source.weights() if source.offers("weights") else None,
-        light=source.light if source.offers("light") else None,
-        camera=source.camera if source.offers("camera") else None,
-        colour=colour,
-    )
+    return Capture(source, source.info, source.valid, colour=colour)

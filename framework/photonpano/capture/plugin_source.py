@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,31 +16,22 @@ from photonpano.contracts.protocols import (
     ColouredSource,
     KnowsSharpViews,
     KnowsTruth,
-    LensedSource,
-    LinearlyCorrectedSource,
-    LitSource,
     PackedSource,
     Source,
-    WeightedSource,
 )
 from photonpano.contracts.rules import BrokenContract, attributing
 from photonpano.contracts.sources import IMAGE, INFO, RANGE, READ, RESPONSE, TRUTH, VALID, Asked
 from photonpano.errors import PluginError
+from photonpano.geometry import Camera
+from photonpano.text import listed
 from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Light, Response, StreamInfo
-
-if TYPE_CHECKING:
-    from photonpano.geometry import Camera
 
 logger = logging.getLogger(__name__)
 
 _ALWAYS, _EVERY = 16, 32  # values are checked in the first 16 reads, then in every 32nd: all would double reading time
 _OPTIONAL: dict[str, Any] = {
     "packed": PackedSource,
-    "corrected": LinearlyCorrectedSource,
-    "weights": WeightedSource,
     "colours": ColouredSource,
-    "light": LitSource,
-    "camera": LensedSource,
     "truth": KnowsTruth,
     "sharp_view": KnowsSharpViews,
 }
@@ -71,6 +62,7 @@ class PluginSource:
         self._own: set[str] = set()
         self._of: tuple[PluginSource, str] | None = None
         with self._attributing("opening"):
+            self._warn_of_removed()
             self._offered = [name for name, protocol in _OPTIONAL.items() if isinstance(source, protocol)]
             checked = origin is not None
             self.info: StreamInfo = INFO.require(source.info) if checked else source.info
@@ -100,30 +92,6 @@ class PluginSource:
         height, width = self.info.frame_shape
         packed: NDArray[np.uint8] = self._read("packed", span, (len(span), height, -(-width // 8)), 255)
         return packed
-
-    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
-        """Take everything but the flux out of a sum of frames: see `photonpano.LinearlyCorrectedSource`."""
-        with self._attributing("correcting"):
-            return self._image("corrected", self.given.corrected(counts, n_frames), counts.shape)
-
-    def weights(self) -> FluxImage:
-        """Return the statistical weight of a frame of each pixel: see `photonpano.WeightedSource`."""
-        with self._attributing("weights()"):
-            return self._image("weights", self.given.weights(), self.info.frame_shape)
-
-    @property
-    def light(self) -> Light:
-        """The gain of each frame."""
-        with self._attributing("light"):
-            light: Light = self.given.light
-            return light
-
-    @property
-    def camera(self) -> Camera:
-        """The camera of all frames."""
-        with self._attributing("camera"):
-            camera: Camera = self.given.camera
-            return camera
 
     def colours(self) -> Mapping[str, PluginSource]:
         """Return a source for each colour: see `photonpano.ColouredSource`."""
@@ -159,6 +127,19 @@ class PluginSource:
                 self.given.close()
         except PluginError as error:
             logger.warning("%s", error)
+
+    def _warn_of_removed(self) -> None:
+        """Warn of what sources offered until 0.2: a run would miss a correction without a word."""
+        given = self.given
+        used = {name: callable(getattr(given, name, None)) for name in ("corrected", "weights")}
+        used |= {"light": isinstance(getattr(given, "light", None), Light)}
+        used |= {"camera": isinstance(getattr(given, "camera", None), Camera)}
+        if names := [name for name, is_used in used.items() if is_used]:
+            logger.warning(
+                "%s: no longer used of a source: %s; correct its frames, or write `corrections` or `light` in the spec",
+                self._origin or type(given).__name__,
+                listed(names),
+            )
 
     @property
     def _highest(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache, partial
 from typing import ClassVar
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from photonpano.capture import Capture, capture_of
 from photonpano.contracts.loop import EXPOSURE, Asked
 from photonpano.contracts.protocols import Merger, Source, Trajectory
 from photonpano.errors import InputError
@@ -53,7 +55,7 @@ class MergerConformance(AnswerConformance):
 
     def merged(
         self,
-        source: MemorySource,
+        source: Source,
         group: Group = GROUP,
         trajectory: Trajectory | None = None,
         scale: float = 1.0,
@@ -122,7 +124,7 @@ class MergerConformance(AnswerConformance):
         """A merger that cannot subtract dark counts raises an InputError."""
         known = float(lit_probability(still_flux()).mean())
         for trajectory in (None, KnownMotion(lambda _: np.eye(3))):
-            source = DarkSource(still_frames())
+            source = dark_source(still_frames())
             try:
                 exposure = self.merged(source, GROUP, trajectory)
             except InputError:
@@ -130,7 +132,7 @@ class MergerConformance(AnswerConformance):
             mean = float(exposure.response.mean_count(exposure.flux).mean())
             assert abs(mean / known - 1) < 0.02, (
                 f"dark counts, which source.corrected subtracts, must not be part of the flux; the mean count is {mean:.4f}, "
-                f"not {known:.4f}. Use `photonpano.merging.accumulate`, or raise an InputError for a LinearlyCorrectedSource"
+                f"not {known:.4f}. Use `photonpano.merging.accumulate`, or raise an InputError if `source.corrects_sums`"
             )
 
     def test_masked_pixels_have_no_influence(self) -> None:
@@ -229,17 +231,14 @@ class MergerConformance(AnswerConformance):
             pytest.skip("compensates = False")
 
 
-class DarkSource(MemorySource):
-    """Adds dark counts to frames and subtracts them from sums: a `photonpano.LinearlyCorrectedSource`."""
+def dark_source(frames: NDArray[np.uint8]) -> Capture:
+    """Return a capture with dark counts, which it subtracts from sums of frames."""
+    dark = np.random.default_rng(9).random(frames.shape) < lit_probability(_DARK_RATE)
+    return replace(capture_of(MemorySource(frames | dark)), steps=(_without_dark_counts,))
 
-    def __init__(self, frames: NDArray[np.uint8]) -> None:
-        dark = np.random.default_rng(9).random(frames.shape) < lit_probability(_DARK_RATE)
-        super().__init__(frames | dark)
 
-    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
-        """See `photonpano.LinearlyCorrectedSource`."""
-        dark_frames = n_frames - counts.astype(np.float32)
-        return np.asarray(n_frames - dark_frames * np.exp(_DARK_RATE), np.float32)
+def _without_dark_counts(counts: Counts, n_frames: int) -> FluxImage:
+    return np.asarray(n_frames - (n_frames - counts.astype(np.float32)) * np.exp(_DARK_RATE), np.float32)
 
 
 def _merged_by(merger: Merger, source: Source, trajectory: Trajectory | None, thread: int) -> object:

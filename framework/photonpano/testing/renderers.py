@@ -21,7 +21,7 @@ from photonpano.testing.mergers import (
     MOTION,
     SCENE,
     SHAPE,
-    DarkSource,
+    dark_source,
     dead_pixels,
     displacement_and_contrast,
     lit_probability,
@@ -138,7 +138,7 @@ class RendererConformance(AnswerConformance):
 
     def test_dark_counts_are_subtracted_or_source_is_refused(self) -> None:
         """A renderer that cannot subtract dark counts raises an InputError."""
-        source, canvas = DarkSource(moving_frames()), canvas_at(1.0)
+        source, canvas = dark_source(moving_frames()), canvas_at(1.0)
         try:
             panorama = self.built(source.info).render(source, MOTION, SPAN, canvas, TOLERANCE_PX, lambda _: None)
         except InputError:

@@ -1,26 +1,17 @@
 """The record of a capture: optional members, the plugin that errors name, and what functions change."""
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from photonpano import (
-    Capture,
-    ColouredSource,
     FrameSpan,
     InputError,
-    KnowsSharpViews,
-    KnowsTruth,
-    LensedSource,
     Light,
-    LinearlyCorrectedSource,
-    LitSource,
-    PackedSource,
     PluginError,
-    WeightedSource,
     capture_of,
 )
 from photonpano.capture import in_light, part_of, seen_through
@@ -30,16 +21,6 @@ from photonpano.testing import MemorySource
 
 SHAPE, N = (8, 16), 40
 FRAMES = np.random.default_rng(0).integers(0, 2, (N, *SHAPE), dtype=np.uint8)
-OPTIONAL = (
-    PackedSource,
-    LinearlyCorrectedSource,
-    WeightedSource,
-    ColouredSource,
-    LitSource,
-    LensedSource,
-    KnowsTruth,
-    KnowsSharpViews,
-)
 LIGHT = Light.of_frames(np.linspace(0.5, 1.5, N))
 GAIN = Vignette(np.full(SHAPE, 0.5, np.float32), np.full(SHAPE, 0.3, np.float32), (), np.full(SHAPE, 0.1, np.float32))
 
@@ -58,44 +39,15 @@ class Simulated(MemorySource):
         return np.full(SHAPE, frame, np.float32)
 
 
-@pytest.mark.parametrize(
-    ("change", "gains", "loses"),
-    [
-        (capture_of, (), ()),
-        (partial(in_light, light=LIGHT), (LitSource,), ()),
-        (partial(seen_through, camera=Camera.of(40.0, SHAPE)), (LensedSource,), ()),
-        (partial(part_of, span=FrameSpan(2, 9)), (), ()),
-        (partial(divided_by, vignette=GAIN), (LinearlyCorrectedSource, WeightedSource), ()),
-        (partial(corrected_source, corrections=[CORRECTIONS["rot180"]()]), (), (KnowsTruth, KnowsSharpViews)),
-        (
-            partial(corrected_source, corrections=[ColourFilter(pattern="rggb", keep="all")]),
-            (LinearlyCorrectedSource, WeightedSource, ColouredSource),
-            (KnowsSharpViews,),
-        ),
-    ],
-)
-def test_isinstance_says_what_applies(
-    change: Callable[[Any], Capture], gains: tuple[type, ...], loses: tuple[type, ...]
-) -> None:
-    simulated = {PackedSource, KnowsTruth, KnowsSharpViews}
-    for source, own in ((MemorySource(FRAMES), set[type]()), (Simulated(FRAMES), simulated)):
-        assert {each for each in OPTIONAL if isinstance(source, each)} == own
-        changed = change(source)
-        assert {each for each in OPTIONAL if isinstance(changed, each)} == (own | set(gains)) - set(loses)
-
-
-class Tenfold(Simulated):
-    """A source whose correction multiplies sums, as those of plugins may."""
-
-    def corrected(self, counts: np.ndarray, n_frames: int) -> np.ndarray:
-        return (counts * np.uint8(10)).astype(np.float32)
+def tenfold(counts: np.ndarray, _: int) -> np.ndarray:
+    return (counts * np.uint8(10)).astype(np.float32)
 
 
 @pytest.mark.parametrize(("n_frames", "kind"), [(3, np.uint8), (255, np.uint8), (256, np.uint32)])
 def test_chunk_is_the_sum_in_the_smallest_type_that_holds_it(n_frames: int, kind: type) -> None:
     lit = np.ones((300, *SHAPE), np.uint8)
     lit[:, 2, 3] = 0
-    capture, span = capture_of(Tenfold(lit)), FrameSpan(7, 7 + n_frames)
+    capture, span = replace(capture_of(Simulated(lit)), steps=(tenfold,)), FrameSpan(7, 7 + n_frames)
     chunk = capture.chunk(span)
     assert chunk.dtype == kind
     np.testing.assert_array_equal(chunk, capture.counts(span))
@@ -165,7 +117,6 @@ def source(memory_source: type) -> Any:
     """Frames in memory, with some of the optional methods."""
     source: Any = memory_source(np.random.default_rng(0).random((8, 4, 6)) < 0.5)
     source.packed = lambda span: np.packbits(source.frames(span), axis=-1)
-    source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
     source.truth = lambda: {"scene": np.ones((4, 6))}
     source.sharp_view = lambda frame: source.frames(FrameSpan(frame, frame + 1))[0].astype(np.float32)
     return source
@@ -185,7 +136,6 @@ def test_capture_reads_what_the_source_reads(source: Any) -> None:
     assert named.valid is source.valid
     for method, given in (("counts", SPAN), ("frames", SPAN), ("packed", SPAN), ("sharp_view", 2)):
         np.testing.assert_array_equal(getattr(named, method)(given), getattr(source, method)(given))
-    np.testing.assert_array_equal(named.corrected_counts(SPAN), source.counts(SPAN) - np.float32(3))
     truth = named.truth()
     assert truth is not None
     assert set(truth) == {"scene"}
@@ -213,20 +163,6 @@ def test_sources_of_colours_name_the_plugin_too(source: Any, memory_source: type
         ("counts", (SPAN,), "frames 2 to 4", np.zeros((6, 4)), "expected the shape (4, 6), got (6, 4)"),
         ("frames", (SPAN,), "frames 2 to 4", np.zeros((6, 4)), "expected the shape (3, 4, 6), got (6, 4)"),
         ("packed", (SPAN,), "frames 2 to 4", np.zeros((6, 4)), "expected the shape (3, 4, 1), got (6, 4)"),
-        (
-            "corrected",
-            (np.ones((4, 6), np.uint32), 3),
-            "correcting",
-            np.ones((4, 6), np.uint32),
-            "corrected() returns (4, 6) of float32, got (4, 6) of uint32",
-        ),
-        (
-            "corrected",
-            (np.ones((4, 6), np.uint32), 3),
-            "correcting",
-            np.where(np.arange(24).reshape(4, 6) < 2, np.float32(np.nan), np.float32(1)),
-            "corrected() returns finite numbers, masked pixels included; 2 of 24 pixels are NaN or infinite",
-        ),
         ("truth", (), "truth()", [1], "truth() returns a mapping of arrays by name, got a list"),
         (
             "sharp_view",
@@ -247,7 +183,7 @@ def test_plugin_is_named_on_exception_and_on_a_wrong_answer(
     ):
         setattr(source, method, reply)
         with pytest.raises(PluginError) as caught:
-            getattr(capture_of(source, ORIGIN) if method == "corrected" else named, method)(*given)
+            getattr(named, method)(*given)
         assert str(caught.value) == said
 
 
@@ -259,28 +195,23 @@ def test_errors_written_for_users_pass(source: Any) -> None:
     assert caught.value is error
 
 
-@pytest.mark.parametrize("method", ["counts", "frames", "packed"])
-def test_array_that_changes_after_it_was_returned_is_refused(source: Any, method: str) -> None:
-    buffer, read = np.zeros(10_000, np.uint8), getattr(source, method)
-
-    def reusing(span: FrameSpan) -> np.ndarray:
-        found = read(span).astype(np.uint8)
-        buffer[: found.size] = found.ravel()
-        return buffer[: found.size].reshape(found.shape)
-
-    setattr(source, method, reusing)
-    with pytest.raises(PluginError) as caught:
-        getattr(capture_of(source, ORIGIN), method)(SPAN)
-    assert str(caught.value) == (
-        f"{ORIGIN} broke its contract at frames 2 to 4: "
-        f"the array that {method}() returned changed when other frames were read; return a new array"
-    )
+def test_source_of_0_2_that_corrects_its_sums_is_read_with_a_warning(source: Any, caplog: pytest.LogCaptureFixture) -> None:
+    source.corrected, source.light = lambda counts, _: counts / 2, LIGHT
+    named = capture_of(source, ORIGIN)
+    np.testing.assert_array_equal(named.corrected_counts(SPAN), source.counts(SPAN))
+    assert caplog.messages == [
+        f"{ORIGIN}: no longer used of a source: corrected and light; correct its frames, or write `corrections` or `light` "
+        "in the spec"
+    ]
 
 
-def test_values_of_later_reads_are_checked_now_and_then(source: Any) -> None:
-    named, good = capture_of(source, ORIGIN), source.counts(SPAN)
-    for _ in range(20):
-        named.counts(SPAN)
+def test_name_of_0_2_that_was_removed_says_what_to_read_instead() -> None:
+    with pytest.raises(ImportError, match=r"LitSource was removed after 0.2: a component reads `corrects_sums`, `weight`"):
+        from photonpano import LitSource  # noqa: F401
+
+
+def test_values_are_checked_at_the_first_read(source: Any) -> None:
+    good = source.counts(SPAN)
     source.counts = lambda _: good + np.uint32(9)
     with pytest.raises(PluginError, match=r"counts\(\) returns numbers from 0 to 3 for these frames, got 1"):
-        [named.counts(SPAN) for _ in range(32)]
+        capture_of(source, ORIGIN).counts(SPAN)

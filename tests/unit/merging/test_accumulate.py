@@ -1,10 +1,12 @@
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Light
+from photonpano.capture import capture_of
 from photonpano.corrections.lighting import in_light
 from photonpano.geometry import from_parameters, rescaling, translation
 from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of, divided
@@ -178,12 +180,9 @@ def test_accumulate_is_exact_for_shifts_below_opencv_4_rounding(memory_source: t
     np.testing.assert_allclose(photons.counts[inside], np.arange(SHAPE[1])[None, 1:-1].repeat(28, 0) - shift_px, atol=2e-4)
 
 
-class Halved(MemorySource):
-    """A source whose correction halves sums and subtracts an offset."""
-
-    def corrected(self, counts: np.ndarray, n_frames: int) -> np.ndarray:
-        assert counts.dtype == np.uint32
-        return counts.astype(np.float32) / 2 - n_frames
+def halved_less_an_offset(counts: np.ndarray, n_frames: int) -> np.ndarray:
+    assert counts.dtype == np.uint32
+    return counts.astype(np.float32) / 2 - n_frames
 
 
 @pytest.mark.parametrize("scale", [1, 0.5])
@@ -192,9 +191,11 @@ def test_accumulate_corrects_each_chunk_once(scale: float) -> None:
     frames = frames_of(FLUX, 50)
     valid = np.random.default_rng(0).random(SHAPE) > 0.1
     shape = round(scale * SHAPE[0]), round(scale * SHAPE[1])
+    source = MemorySource(frames, valid)
+    corrected = replace(capture_of(source), steps=(halved_less_an_offset,))
     plain, halved = (
-        accumulate(source, HALVES, rescaling(scale), shape, counts_of=counts_of)
-        for source, counts_of in ((MemorySource(frames, valid), None), (Halved(frames, valid), MemorySource(frames).counts))
+        accumulate(each, HALVES, rescaling(scale), shape, counts_of=counts_of)
+        for each, counts_of in ((source, None), (corrected, MemorySource(frames).counts))
     )
     np.testing.assert_array_equal(halved.weight, plain.weight)
     np.testing.assert_allclose(halved.counts, plain.counts / 2 - plain.weight, atol=1e-3)

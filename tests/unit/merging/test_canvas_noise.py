@@ -9,7 +9,7 @@ import pytest
 from scipy import ndimage
 
 from photonpano import FrameSpan
-from photonpano.capture import capture_of
+from photonpano.capture import Capture, capture_of
 from photonpano.corrections.colour_filter import with_colours
 from photonpano.geometry import Canvas, rescaling, translation
 from photonpano.merging import accumulate, canvas_noise
@@ -66,15 +66,13 @@ SPAN = FrameSpan(0, N)
 CANVAS = Canvas(8, 12, np.eye(3))
 
 
-class DarkCounts(MemorySource):
-    """Subtracts dark counts that differ from pixel to pixel."""
+def dark_counts(rates: np.ndarray) -> Capture:
+    """Return a capture that subtracts dark counts, which differ from pixel to pixel."""
 
-    def __init__(self, rates: np.ndarray) -> None:
-        super().__init__(np.zeros((N, *rates.shape)))
-        self.rates = rates.astype(np.float32)
+    def corrected(counts: np.ndarray, n_frames: int) -> np.ndarray:
+        return np.asarray(n_frames - (n_frames - counts.astype(np.float32)) * np.exp(rates.astype(np.float32)), np.float32)
 
-    def corrected(self, counts: np.ndarray, n_frames: int) -> np.ndarray:
-        return np.asarray(n_frames - (n_frames - counts.astype(np.float32)) * np.exp(self.rates), np.float32)
+    return replace(capture_of(MemorySource(np.zeros((N, *rates.shape)))), steps=(corrected,))
 
 
 def image(value: float, shape: tuple[int, ...] = CANVAS.shape) -> np.ndarray:
@@ -88,14 +86,14 @@ def test_noise_of_uncorrected_source_is_that_of_its_response(pan: Callable) -> N
 
 def test_noise_of_still_camera_follows_dark_counts_of_each_pixel(pan: Callable) -> None:
     rates = np.linspace(0.01, 0.5, 96).reshape(8, 12)
-    std = CanvasNoise.of(DarkCounts(rates), pan(0), SPAN, CANVAS).std(image(0.1), image(1e6))
+    std = CanvasNoise.of(dark_counts(rates), pan(0), SPAN, CANVAS).std(image(0.1), image(1e6))
     np.testing.assert_allclose(std, np.sqrt(np.expm1(0.1 + rates) / 1e6), rtol=0.01)
 
 
 def test_noise_of_moving_camera_follows_mean_dark_counts(pan: Callable) -> None:
     """Every pixel of the sensor passes by the middle of the canvas."""
     rates = np.tile(np.where(np.arange(12) % 2, 0.02, 0.04), (8, 1))
-    noise = CanvasNoise.of(DarkCounts(rates), pan(1), SPAN, Canvas(8, 12 + N, translation(0, 0)))
+    noise = CanvasNoise.of(dark_counts(rates), pan(1), SPAN, Canvas(8, 12 + N, translation(0, 0)))
     std = noise.std(image(0.1, (8, 4)), image(1e6, (8, 4)), left=24)
     np.testing.assert_allclose(std, np.sqrt(np.expm1(0.13) / 1e6), rtol=0.01)
 
@@ -105,7 +103,7 @@ def test_noise_of_colours_is_that_of_their_pixels(pan: Callable, even: bool) -> 
     """The grey source that all colours make multiplies counts by the gains of the colours, which must not count."""
     rates = np.full((8, 12), 0.2) if even else np.linspace(0.01, 0.5, 96).reshape(8, 12)
     colour = np.tile(np.int8([[0, 1], [1, 2]]), (4, 6))
-    noise = CanvasNoise.of(with_colours(DarkCounts(rates), colour), pan(0), SPAN, CANVAS)
+    noise = CanvasNoise.of(with_colours(dark_counts(rates), colour), pan(0), SPAN, CANVAS)
     std = noise.std(image(0.1, (8, 12, 3)), image(1e6, (8, 12, 3)))
     own = np.take_along_axis(std, colour[..., None].astype(int), axis=-1)[..., 0]
     np.testing.assert_allclose(own, np.sqrt(np.expm1(0.1 + rates) / 1e6), rtol=0.01)
@@ -145,7 +143,7 @@ def test_dynamic_range_of_nothing_is_unknown() -> None:
 def test_noise_of_weighted_pixels_is_that_of_their_counts(pan: Callable) -> None:
     """The weight of a frame of weight w is w, but its photons say as much as before."""
     rates, weights = np.full((8, 12), 0.2), np.linspace(0.3, 1, 96).reshape(8, 12).astype(np.float32)
-    noise = CanvasNoise.of(replace(capture_of(DarkCounts(rates)), weight=weights), pan(0), SPAN, CANVAS)
+    noise = CanvasNoise.of(replace(capture_of(dark_counts(rates)), weight=weights), pan(0), SPAN, CANVAS)
     std = noise.std(image(0.1), weights * np.float32(1e6))
     np.testing.assert_allclose(std, np.sqrt(np.expm1(0.3) / 1e6), rtol=0.01)
 

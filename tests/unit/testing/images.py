@@ -6,7 +6,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from photonpano import FrameSpan, InputError, LinearlyCorrectedSource, discover
+from photonpano import FrameSpan, InputError, discover
 from photonpano.geometry import Canvas, inverse, translation
 from photonpano.merging import MergeRenderer
 from photonpano.testing import KnownMotion, MemorySource
@@ -65,7 +65,7 @@ def uncorrected(source: Any) -> MemorySource:
 
 
 def refusing_dark_counts(source: Any, *rest: Any) -> tuple[Any, ...]:
-    if isinstance(source, LinearlyCorrectedSource):
+    if source.corrects_sums:
         raise InputError("no")
     return source, *rest
 

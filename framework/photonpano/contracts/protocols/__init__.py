@@ -20,12 +20,8 @@ from .sources import Closing as Closing
 from .sources import ColouredSource as ColouredSource
 from .sources import KnowsSharpViews as KnowsSharpViews
 from .sources import KnowsTruth as KnowsTruth
-from .sources import LensedSource as LensedSource
-from .sources import LinearlyCorrectedSource as LinearlyCorrectedSource
-from .sources import LitSource as LitSource
 from .sources import PackedSource as PackedSource
 from .sources import Piped as Piped
 from .sources import Source as Source
-from .sources import WeightedSource as WeightedSource
 from .sources import camera_of as camera_of
 from .sources import light_of as light_of

@@ -38,7 +38,7 @@ class Renderer(Protocol):
             and no lens.
 
         Args:
-            source: the capture. Pixels outside of its mask are left out; sums of a `LinearlyCorrectedSource` are corrected.
+            source: the capture. Pixels outside of its mask are left out; sums are corrected by `Capture.corrected`.
             trajectory: frame pixels to reference pixels.
             span: the frames to render.
             canvas: the pixel grid.

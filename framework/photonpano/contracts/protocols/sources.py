@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,7 @@ from numpy.typing import NDArray
 from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, FrameSpan, Light, Response, StreamInfo
 
 if TYPE_CHECKING:
-    from abc import ABCMeta as _ProtocolMeta
-
     from photonpano.geometry import Camera
-else:
-    _ProtocolMeta = type(Protocol)
 
 
 class Source(Protocol):
@@ -88,21 +84,8 @@ class Piped:
     frame_bytes: int
 
 
-class _Optional(_ProtocolMeta):
-    """Metaclass of the protocols of optional methods.
-
-    A `photonpano.Capture` has all methods, and says itself which of them apply: a capture in steady light is no `LitSource`.
-    """
-
-    def __instancecheck__(cls, instance: Any) -> bool:  # noqa: N805 - of a metaclass
-        offers = getattr(instance, "_offers", None)
-        if offers is None:
-            return super().__instancecheck__(instance)
-        return all(offers(name) for name in vars(cls) if not name.startswith("_"))
-
-
 @runtime_checkable
-class PackedSource(Source, Protocol, metaclass=_Optional):
+class PackedSource(Source, Protocol):
     """Gives packed frames, so that copying and summing need no unpacking."""
 
     def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
@@ -115,30 +98,7 @@ class PackedSource(Source, Protocol, metaclass=_Optional):
 
 
 @runtime_checkable
-class LinearlyCorrectedSource(Source, Protocol, metaclass=_Optional):
-    """Its sums of frames contain more than the flux, such as dark counts, and it can subtract that."""
-
-    def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
-        """Correct a sum of frames, (H, W): see `Capture.corrected`.
-
-        Returns:
-            (H, W) float32.
-        """
-
-
-@runtime_checkable
-class WeightedSource(Source, Protocol, metaclass=_Optional):
-    """Its pixels carry different amounts of information, as those behind filters of different colours do."""
-
-    def weights(self) -> FluxImage:
-        """Return the statistical weight of a frame of each pixel, 1 for an ordinary one: (H, W) float32; see `Capture`.
-
-        Mergers weight the (corrected) counts of a pixel with it, and the number of frames in which it was seen.
-        """
-
-
-@runtime_checkable
-class ColouredSource(Source, Protocol, metaclass=_Optional):
+class ColouredSource(Source, Protocol):
     """A source in colour. By itself it is grey, for the motion; the panorama is rendered from the sources of its colours.
 
     Behind a colour filter array, each pixel has one colour, and corrected sums are those of pixels of one colour. In binary
@@ -156,30 +116,6 @@ class ColouredSource(Source, Protocol, metaclass=_Optional):
         """Return the flux of a clear pixel, as factors of the flux of red, green and blue ones, whose sum it is: (3,)."""
 
 
-@runtime_checkable
-class LitSource(Source, Protocol, metaclass=_Optional):
-    """A source in changing light, which is known. A source in steady light does not have this property.
-
-    What is summed over frames counts each frame by its gain; what predicts a frame multiplies the flux by it.
-    """
-
-    @property
-    def light(self) -> Light:
-        """The gain of each frame."""
-
-
-@runtime_checkable
-class LensedSource(Source, Protocol, metaclass=_Optional):
-    """A source whose camera is known.
-
-    Frames are warped through its lens: homographies then map ideal pixels, those without distortion, to ideal pixels.
-    """
-
-    @property
-    def camera(self) -> Camera:
-        """The camera of all frames."""
-
-
 def light_of(source: Source) -> Light | None:
     """Return the changing light of a capture; None if it is steady, or not known."""
     return getattr(source, "light", None)
@@ -191,7 +127,7 @@ def camera_of(source: Source) -> Camera | None:
 
 
 @runtime_checkable
-class KnowsTruth(Protocol, metaclass=_Optional):
+class KnowsTruth(Protocol):
     """A source with ground truth, such as a simulator: a `Source` with one more method.
 
     `photonpano simulate` stores the truth as an .npz archive, for `photonpano evaluate`.
@@ -217,7 +153,7 @@ class KnowsTruth(Protocol, metaclass=_Optional):
 
 
 @runtime_checkable
-class KnowsSharpViews(KnowsTruth, Protocol, metaclass=_Optional):
+class KnowsSharpViews(KnowsTruth, Protocol):
     """A source that can return its frames without noise, such as a simulator.
 
     `photonpano simulate --sharp-every` stores them as pictures.

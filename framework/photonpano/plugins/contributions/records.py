@@ -235,10 +235,10 @@ class RendererContribution(StageContribution, kind="renderer", section="render",
     # peak memory of rendering for a pixel of the canvas. The framework renders a canvas that exceeds the memory of the run in
     # tiles.
     bytes_per_pixel: int = 40
-    # whether it divides by the gains of a `LitSource`, as `photonpano.merging.accumulate` does. If not, a run in changing light
-    # warns that the panorama shows the light of the moment.
+    # whether it divides by the gains of `Capture.light`, as `photonpano.merging.accumulate` does. If not, a run in changing
+    # light warns that the panorama shows the light of the moment.
     divides_by_light: bool = False
-    # whether it renders on a canvas of any projection, and a `LensedSource` through its lens, as
+    # whether it renders on a canvas of any projection, and frames through the lens of their camera, as
     # `photonpano.merging.accumulate` does. If not, a run that needs it is refused.
     renders_on_any_canvas: bool = False
 

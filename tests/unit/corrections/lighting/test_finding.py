@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError
-from photonpano.contracts.protocols import WeightedSource
 from photonpano.corrections import Vignette, divided_by
 from photonpano.corrections.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
 from photonpano.corrections.lighting.finding import flicker_frequency, gain_of_frames
@@ -192,7 +191,6 @@ def rendered(source: MemorySource, found: PixelGain | None) -> np.ndarray:
     if found is not None:
         mean = (source.counts(whole) / N_FIELD).astype(np.float32)
         source = divided_by(source, Vignette(found.gain, mean, found.spans, found.std))
-        assert isinstance(source, WeightedSource)
     canvas = Canvas(60, 80, translation(-8, -2))
     return render(source, CROSSING, whole, canvas, 0.1, Context()).flux
 
