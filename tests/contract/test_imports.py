@@ -14,9 +14,12 @@ import pytest
 import photonpano
 import photonpano.geometry
 import photonpano.locating
-from photonpano.testing import conformance
 
-HEAVY = conformance.HEAVY | {"aiohttp", "fsspec", "numcodecs", "s3fs"}
+# Libraries that take long to import; numpy is allowed.
+HEAVY = {
+    *("PIL", "aiohttp", "av", "cv2", "dask", "distributed", "fsspec", "h5py", "imageio", "kornia", "matplotlib", "numba"),
+    *("numcodecs", "pandas", "pycolmap", "s3fs", "scipy", "skimage", "sklearn", "tifffile", "torch", "torchvision", "zarr"),
+}
 COMMANDS = ["--help", "plugins list", "plugins show direct", "schema", "check scan.yaml"]
 HELP_SECONDS = 0.5
 ROOT = Path(__file__).parents[2]

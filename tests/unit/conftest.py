@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, Located, NotLocated, Source, Trajectory, VirtualExposure
+from photonpano.contracts.attribution import attributed
 from photonpano.execution.threads import one_thread_inside
 from photonpano.geometry import inverse, normalised, rescaled, translation
 from photonpano.motion.level import Level, NamedLocator
@@ -112,8 +113,12 @@ def make_level() -> Callable[..., Level]:
         **components: Any,
     ) -> Level:
         named = {"toy": locator or Knowing(motion, answer)} | (fallbacks or {})
-        locators = tuple(NamedLocator(name, each, f"locator {name!r} of toys 1.0") for name, each in named.items())
+
+        def of_toys(component: Any, kind: str, name: str = "toy") -> Any:
+            return attributed(component, f"{kind} {name!r} of toys 1.0", f"level {number}")
+
+        locators = tuple(NamedLocator(name, of_toys(each, "locator", name)) for name, each in named.items())
         toys = {"resampler": SideBySide(), "merger": Noise(), "interpolator": Linear()} | components
-        return Level(number, scale, locators=locators, **toys, origins={kind: f"{kind} 'toy' of toys 1.0" for kind in toys})
+        return Level(number, scale, locators=locators, **{kind: of_toys(each, kind) for kind, each in toys.items()})
 
     return make

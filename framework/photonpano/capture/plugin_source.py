@@ -6,12 +6,12 @@ import logging
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
-from itertools import count
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photonpano.contracts.attribution import attributing
 from photonpano.contracts.protocols import (
     ColouredSource,
     KnowsSharpViews,
@@ -19,8 +19,15 @@ from photonpano.contracts.protocols import (
     PackedSource,
     Source,
 )
-from photonpano.contracts.rules import BrokenContract, attributing
-from photonpano.contracts.sources import IMAGE, INFO, RANGE, READ, RESPONSE, TRUTH, VALID, Asked
+from photonpano.contracts.requirements import (
+    require_info,
+    require_mask,
+    require_range,
+    require_read,
+    require_response,
+    require_sharp_view,
+    require_truth,
+)
 from photonpano.errors import PluginError
 from photonpano.geometry import Camera
 from photonpano.text import listed
@@ -28,7 +35,6 @@ from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Frames, 
 
 logger = logging.getLogger(__name__)
 
-_ALWAYS, _EVERY = 16, 32  # values are checked in the first 16 reads, then in every 32nd: all would double reading time
 _OPTIONAL: dict[str, Any] = {
     "packed": PackedSource,
     "colours": ColouredSource,
@@ -41,7 +47,7 @@ class PluginSource:
     """A source as its plugin gives it.
 
     Reading a span raises a `PluginError` if the source failed with an exception that is not for users, or broke its contract:
-    if an array has another shape or type, or values that frames of this depth cannot have, or changes after it was returned.
+    if an array has another shape or type, or at the first read values that frames of this depth cannot have.
 
     Attributes:
         given: what the plugin has built.
@@ -58,16 +64,15 @@ class PluginSource:
         """
         self.given: Any = source
         self._origin = origin
-        self._reads = count()
-        self._own: set[str] = set()
+        self._read_before: set[str] = set()
         self._of: tuple[PluginSource, str] | None = None
         with self._attributing("opening"):
             self._warn_of_removed()
             self._offered = [name for name, protocol in _OPTIONAL.items() if isinstance(source, protocol)]
             checked = origin is not None
-            self.info: StreamInfo = INFO.require(source.info) if checked else source.info
-            self.valid: BoolArray = VALID.require(source.valid, self.info.frame_shape) if checked else source.valid
-            self.response: Response = RESPONSE.require(source.response) if checked else source.response
+            self.info: StreamInfo = require_info(source.info) if checked else source.info
+            self.valid: BoolArray = require_mask(source.valid, self.info.frame_shape) if checked else source.valid
+            self.response: Response = require_response(source.response) if checked else source.response
 
     def __reduce__(self) -> Any:
         """Travel as what was given; the source of a colour as a colour of the capture, which is opened in each process."""
@@ -113,12 +118,12 @@ class PluginSource:
     def truth(self) -> Mapping[str, NDArray[np.generic]]:
         """Return the ground truth: see `photonpano.KnowsTruth`."""
         with self._attributing("truth()"):
-            return TRUTH.require(self.given.truth())
+            return require_truth(self.given.truth())
 
     def sharp_view(self, frame: int) -> FluxImage:
         """Return the flux of a frame without noise: see `photonpano.KnowsSharpViews`."""
         with self._attributing("sharp_view()"):
-            return self._image("sharp_view", self.given.sharp_view(frame), self.info.frame_shape)
+            return require_sharp_view(self.given.sharp_view(frame), self.info.frame_shape)
 
     def close(self) -> None:
         """Close the source; a failure is logged, since what was read from it is not affected."""
@@ -148,38 +153,17 @@ class PluginSource:
     def _attributing(self, where: str) -> AbstractContextManager[None]:
         return nullcontext() if self._origin is None else attributing(self._origin, where)
 
-    def _image(self, what: str, found: Any, shape: tuple[int, ...]) -> FluxImage:
-        """Check an image of numbers; `what` is the name of the method that returned it."""
-        image: FluxImage = found if self._origin is None else IMAGE.require(found, Asked(what, shape))
-        return image
-
     def _read(self, what: str, span: FrameSpan, shape: tuple[int, ...], highest: int) -> Any:
         """Read a span with a method of the source, and check the array."""
         method: Callable[[FrameSpan], Any] = getattr(self.given, what)
         if self._origin is None:
             return method(span)
         with self._attributing(str(span)):
-            asked = Asked(what, shape, highest)
-            found = READ.require(method(span), asked)
-            read = next(self._reads)
-            if read < _ALWAYS or read % _EVERY == 0:
-                RANGE.require(found, asked)
-            if what not in self._own:
-                self._own.add(what)
-                self._require_kept(what, method, span, found)
+            found = require_read(method(span), what, shape)
+            if what not in self._read_before:
+                require_range(found, what, highest)
+                self._read_before.add(what)
             return found
-
-    def _require_kept(self, what: str, method: Callable[[FrameSpan], Any], span: FrameSpan, found: NDArray[Any]) -> None:
-        """Refuse a source that changes an array after it has returned it, as one with a single buffer does."""
-        kept = found.copy()
-        last = self.info.n_frames - 1
-        for frame in {min(span.stop, last), max(span.start - 1, 0)}:
-            try:
-                method(FrameSpan(frame, frame + 1))
-            except Exception:
-                return  # it is raised again where that frame is needed
-        if not np.array_equal(kept, found):
-            raise BrokenContract(f"the array that {what}() returned changed when other frames were read; return a new array")
 
 
 def _colour_of(capture: PluginSource, name: str) -> PluginSource:

@@ -1,1 +1,1 @@
-"""What components may return: tables of rules, one for each kind, that runs and the conformance kit share."""
+"""What components must have and may return, and whose errors name them: shared by runs and the conformance kit."""

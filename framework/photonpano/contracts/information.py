@@ -6,7 +6,6 @@ from contextlib import suppress
 
 import numpy as np
 
-from photonpano.contracts.rules import is_real
 from photonpano.geometry import corners, jacobian
 from photonpano.values import FloatArray, Located
 
@@ -18,7 +17,7 @@ _ASYMMETRY = 1e-3  # largest relative asymmetry that counts as rounding
 
 def is_inverse_covariance(matrix: object) -> bool:
     """Return whether a value is an (8, 8) array of real numbers, finite, symmetric and positive definite."""
-    if not isinstance(matrix, np.ndarray) or not is_real(matrix) or matrix.shape != (8, 8):
+    if not (isinstance(matrix, np.ndarray) and matrix.dtype.kind in "fiu" and matrix.shape == (8, 8)):
         return False
     if not np.isfinite(matrix).all() or np.diagonal(matrix).min() <= 0:
         return False

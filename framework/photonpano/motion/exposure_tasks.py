@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import islice
 from typing import Any, TypeAlias
 
+from photonpano.contracts.attribution import blaming
 from photonpano.contracts.information import why_undetermined
-from photonpano.contracts.loop import require_no_standstill, require_valid
-from photonpano.contracts.protocols import KeepsHypotheses
+from photonpano.contracts.requirements import require_no_standstill
 from photonpano.execution.threads import Guard, Stopwatch
 from photonpano.geometry import why_implausible
 from photonpano.motion.closures import exposure_similarity
@@ -148,12 +147,11 @@ class ExposureTasks:
         if known[moving].contrast.blank or known[fixed].contrast.blank:
             return []
         for number, named in enumerate(level.locators):
-            if isinstance(named.component, KeepsHypotheses):
+            if hasattr(named.component, "hypotheses"):
                 features = [self._features(index, number, known, clock) for index in (moving, fixed)]
-                with clock("locate"), level.attributing(named):
-                    listed = list(islice(named.component.hypotheses(*features), MAX_HYPOTHESES))
-                    found = [require_valid(Located(each)) for each in listed]
-                return [level.in_frame_px(each).homography for each in found if isinstance(each, Located)]
+                with clock("locate"):
+                    found = named.component.hypotheses(*features)[:MAX_HYPOTHESES]
+                return [level.in_frame_px(Located(each)).homography for each in found]
         return []
 
     def _registered(self, pairs: Sequence[Pair], known: Descriptions, clock: Stopwatch) -> list[Edge]:
@@ -188,17 +186,17 @@ class ExposureTasks:
     ) -> Located | NotLocated:
         """Return the motion of a pair as one locator finds it from where it is expected."""
         level, shape = self.exposures.level, self.exposures.frame_shape
-        starts = not pair.guessed or isinstance(named.component, KeepsHypotheses)
+        starts = not pair.guessed or hasattr(named.component, "hypotheses")
         expected = pair.expected if starts else None
         initial = None if expected is None else level.in_exposure_px(expected)
         moving, fixed = (self._features(index, number, known, clock) for index in (pair.moving, pair.fixed))
         with clock("locate"):
-            with level.attributing(named):
-                motion = require_valid(named.component.register(moving, fixed, initial))
-                if isinstance(motion, Located) and not pair.closure:
-                    require_no_standstill(motion, expected, shape)
+            motion = named.component.register(moving, fixed, initial)
             if isinstance(motion, NotLocated):
                 return motion
+            if not pair.closure:
+                with blaming(named.component):
+                    require_no_standstill(motion, expected, shape)
             motion = level.in_frame_px(motion)
             if reason := why_implausible(motion.homography, shape) or why_undetermined(motion, shape):
                 return NotLocated(reason, motion.evidence)
@@ -215,7 +213,7 @@ class ExposureTasks:
 
     def _features_of(self, exposure: VirtualExposure, locator: int, clock: Stopwatch) -> Any:
         named = self.exposures.level.locators[locator]
-        with clock("locate"), self.exposures.level.attributing(named):
+        with clock("locate"):
             return named.component.describe(exposure)
 
     def _notes(self, clock: Stopwatch) -> Notes:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NewType
 
 import numpy as np
 
 from photonpano.capture import capture_of
-from photonpano.contracts.loop import EXPOSURE, Asked
-from photonpano.contracts.protocols import Interpolator, LocatesTurns, Locator, Merger, Resampler, Source, Trajectory
-from photonpano.contracts.rules import attributing
+from photonpano.contracts.protocols import Interpolator, Locator, Merger, Resampler, Source, Trajectory
 from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import Camera, inverse, rescaled, scaled_ahead
 from photonpano.motion.timeline import Timeline
@@ -61,12 +58,11 @@ class NamedLocator:
 
     name: str  # as in the spec; the second of a level with the same name is numbered, such as "opencv-sift 2"
     component: Locator
-    origin: str  # who provides it, such as "locator 'opencv-sift' of photonpano 0.1.0"
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """The components of one level, built."""
+    """The components of one level, built: see `photonpano.contracts.attribution`."""
 
     number: int  # from 1
     scale: float  # pixels of the level's exposures per pixel of a frame
@@ -74,20 +70,13 @@ class Level:
     merger: Merger
     locators: tuple[NamedLocator, ...]  # at least one; a pair that one of them does not locate is passed to the next
     interpolator: Interpolator
-    # who provides each of the other components, by its kind, such as "merger 'photon-mle' of photonpano 0.1.0"
-    origins: Mapping[str, str]
     recorder: Recorder = field(default_factory=Recorder)  # records what they decide
     handles_movers: bool = False  # whether the merger does: see `MergerContribution`
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave out what only the process of the loop needs: the resampler and the interpolator."""
         components = None, self.merger, self.locators, None
-        return Level, (self.number, self.scale, *components, self.origins, self.recorder, self.handles_movers)
-
-    def attributing(self, component: str | NamedLocator) -> AbstractContextManager[None]:
-        """Attribute errors of the block to a component, given by its kind (such as "merger") or as a locator: `attributing`."""
-        origin = self.origins[component] if isinstance(component, str) else component.origin
-        return attributing(origin, f"level {self.number}")
+        return Level, (self.number, self.scale, *components, self.recorder, self.handles_movers)
 
     def turning(self, camera: Camera | None) -> Level:
         """Return the level for a camera that only turns, which locators use if they can; None if it is not known."""
@@ -95,9 +84,8 @@ class Level:
             return self
         matrix, locators = camera.scaled(self.scale).matrix, []
         for locator in self.locators:
-            if isinstance(locator.component, LocatesTurns):
-                with self.attributing(locator):
-                    locator = replace(locator, component=locator.component.turning(matrix))
+            if hasattr(locator.component, "turning"):
+                locator = replace(locator, component=locator.component.turning(matrix))
             locators.append(locator)
         return replace(self, locators=tuple(locators))
 
@@ -166,6 +154,5 @@ class VirtualExposures:
         """
         level, group = self.level, self.groups[index]
         source = self.source if level.handles_movers else capture_of(self.source).masked_in(group.span)
-        with (clock or self.clock)("merge"), level.attributing("merger"):
-            exposure = level.merger.merge(source, group, self.previous or self.start, level.scale)
-            return EXPOSURE.require(exposure, Asked(group, level.scale, self.frame_shape))
+        with (clock or self.clock)("merge"):
+            return level.merger.merge(source, group, self.previous or self.start, level.scale)

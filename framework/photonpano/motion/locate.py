@@ -8,8 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from photonpano.contracts.loop import why_still
+from photonpano.contracts.attribution import label_of
 from photonpano.contracts.protocols import Source, camera_of
+from photonpano.contracts.requirements import why_still
 from photonpano.errors import PluginError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import thread_pool
@@ -131,7 +132,7 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
         located = [(edge.locator, edge.motion.homography) for edge in edges if isinstance(edge.motion, Located)]
         if problem := why_still([homography for _, homography in located], shape, partial(_seen_px, groups, edges, start)):
             names = {name for name, _ in located}
-            origins = listed(locator.origin for locator in level.locators if locator.name in names)
+            origins = listed(label_of(locator.component) for locator in level.locators if locator.name in names)
             raise PluginError(
                 f"{origins} broke {'its' if len(names) == 1 else 'their'} contract at level {level.number}: {problem}; "
                 "a failure is NotLocated"

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from photonpano.capture import capture_of, seen_through
-from photonpano.contracts.loop import KNOTS, AttributedTrajectory, knot_errors, require_groups
+from photonpano.contracts.attribution import blaming
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
+from photonpano.contracts.requirements import require_near_knots
 from photonpano.execution.threads import Stopwatch
 from photonpano.filtering import smooth_share
 from photonpano.geometry import align_planes, corner_displacements, corners, inverse, moving_corners, transform_points
@@ -147,8 +148,8 @@ def through_lens(source: Source, model: MotionModel) -> Source:
 
 def resample(level: Level, n_frames: int, clock: Stopwatch) -> tuple[Group, ...]:
     """Choose the groups of a level (paper, section 4, "Re-sample"), or raise a `PluginError`."""
-    with clock("resample"), level.attributing("resampler"):
-        return require_groups(level.resampler.groups(n_frames, level.number), n_frames)
+    with clock("resample"):
+        return level.resampler.groups(n_frames, level.number)
 
 
 def interpolate(
@@ -167,7 +168,7 @@ def interpolate(
         PluginError: the interpolator failed, or its trajectory has nothing to do with these instants.
     """
     measured = Knots.of(located)
-    with exposures.clock("interpolate"), exposures.level.attributing("interpolator"):
+    with exposures.clock("interpolate"):
         knots, trajectory = measured, _through(measured, exposures, located, timeline, reference, refined)
         for _ in range(_CENTRED):
             displaced = exposures.off_centre(trajectory)[located.solution.located]
@@ -223,9 +224,9 @@ def _through(
     instants, homographies, information, rotations = knots if known is None else known.corrections(knots)
 
     def kept(found: Trajectory, knots: slice, times: FloatArray, homographies: FloatArray) -> Trajectory:
-        free = AttributedTrajectory(found, level.origins["interpolator"], level.number)
-        KNOTS.require(knot_errors(free, times, homographies, located.std_px[knots], shape))
-        return free
+        with blaming(level.interpolator):
+            require_near_knots(found, times, homographies, located.std_px[knots], shape)
+        return found
 
     def fitted(knots: slice, times: FloatArray) -> Trajectory:
         of_knots = None if information is None else information[knots].copy()

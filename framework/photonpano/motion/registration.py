@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from threading import Lock
 from typing import TypeVar
 
-from photonpano.contracts.protocols import KeepsHypotheses
 from photonpano.execution.context import Context, Log
 from photonpano.execution.threads import batched, in_order, lagging
 from photonpano.geometry import inverse
@@ -62,7 +61,7 @@ class Registrar:
         self._from_plane = None if self.to_plane is None else inverse(self.to_plane)
         # Only locators that keep hypotheses start from a motion at the first level.
         self._tracks = exposures.previous is None and any(
-            isinstance(locator.component, KeepsHypotheses) for locator in exposures.level.locators
+            hasattr(locator.component, "hypotheses") for locator in exposures.level.locators
         )
         self._start = context.executor.share(start) if self._tracks else None
         self._places: dict[int, Place] = {}

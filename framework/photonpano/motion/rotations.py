@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from photonpano.contracts.protocols import InterpolatesTurns, Interpolator, Trajectory
+from photonpano.contracts.protocols import Interpolator, Trajectory
 from photonpano.geometry import Camera, inverse, nearest_rotations, rotation_matrices, rotation_vectors, scaled_ahead
 from photonpano.motion.rotation_graph import Rotations
 from photonpano.values import FloatArray
@@ -69,13 +69,13 @@ def fit_rotations(
     """Interpolate N rotations by any angle at increasing instants, in frames.
 
     A coarse path passes some of the knots, 30 degrees apart; the interpolator gets the rotations of the others beyond it,
-    which are small: as rotation vectors if it `InterpolatesTurns`, else as homographies. `information` (N, 3, 3) is of their
+    which are small: as rotation vectors if it has `fit_turns`, else as homographies. `information` (N, 3, 3) is of their
     rotation vectors, each in its own frame. `checked` wraps what was fitted, given the (N, 3, 3) `homographies` of the knots.
     """
     path, camera = CoarsePath(instants, knots.rotations), knots.camera
     vectors = rotation_vectors(np.swapaxes(path.at(instants), -1, -2) @ knots.rotations)
     homographies = scaled_ahead(camera.homographies(rotation_matrices(vectors)))
-    if isinstance(interpolator, InterpolatesTurns):
+    if hasattr(interpolator, "fit_turns"):
         fitted: Trajectory = _RotationVectors(interpolator.fit_turns(instants, vectors, information), camera)
     else:
         fitted = interpolator.fit(instants, homographies, None)

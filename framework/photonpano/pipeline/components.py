@@ -11,9 +11,9 @@ from functools import cached_property, partial
 from typing import Any
 
 from photonpano.capture import Capture, capture_of, part_of
-from photonpano.contracts.loop import require_groups
+from photonpano.contracts.attribution import attributed
 from photonpano.contracts.protocols import PoseEstimator, Resampler, Source, light_of
-from photonpano.contracts.rules import attributing, shown
+from photonpano.contracts.requirements import shown
 from photonpano.corrections import Mask, corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
 from photonpano.execution.threads import in_order, thread_count
@@ -143,17 +143,17 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision], shortene
         made.append((choice, value))
         return value
 
+    def of_level(choice: Choice, number: int) -> Any:
+        return attributed(component(choice), choice.label, f"level {number}")
+
     return tuple(
         Level(
             number,
             scale_of(plan, number, source.info.frame_shape),
-            component(level.resample),
-            component(level.merge),
-            tuple(
-                NamedLocator(name, component(choice), choice.label) for name, choice in _named((level.locate, *level.fallbacks))
-            ),
-            component(level.interpolate),
-            {choice.contribution.kind: choice.label for choice in (level.resample, level.merge, level.interpolate)},
+            of_level(level.resample, number),
+            of_level(level.merge, number),
+            tuple(NamedLocator(name, of_level(each, number)) for name, each in _named((level.locate, *level.fallbacks))),
+            of_level(level.interpolate, number),
             recorder,
             isinstance(level.merge.contribution, MergerContribution) and level.merge.contribution.handles_movers,
         )
@@ -167,7 +167,7 @@ def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) 
 
     assert plan.pose is not None
     capture = _Once(lambda: summarise(source, thread_count(plan.run.threads)))
-    estimator: PoseEstimator = built(plan.pose, stage_context(plan, source, Recorder(decisions), capture))
+    estimator: PoseEstimator = built(plan.pose, stage_context(plan, source, Recorder(decisions), capture), "the capture")
     return estimator
 
 
@@ -189,10 +189,9 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
     context = StageContext(source.info, source.response, plan.run.seed)
     foreseen: list[tuple[Group, ...] | str] = []
     for number, level in enumerate(plan.levels, start=1):
-        resampler: Resampler = built(level.resample, context)
+        resampler: Resampler = built(level.resample, context, f"level {number}")
         try:
-            with attributing(level.resample.label, f"level {number}"):
-                foreseen.append(require_groups(resampler.groups(source.info.n_frames, number), source.info.n_frames))
+            foreseen.append(resampler.groups(source.info.n_frames, number))
         except CaptureUnreadError as error:
             foreseen.append(str(error))
     return foreseen
@@ -201,10 +200,9 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
 def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> list[Decision]:
     """Return the decisions of the first level's resampler, such as its group size, for a capture with this summary."""
     decisions: list[Decision] = []
-    choice = plan.levels[0].resample
-    resampler: Resampler = built(choice, stage_context(plan, source, Recorder(decisions), lambda: capture))
-    with attributing(choice.label, "level 1"):
-        require_groups(resampler.groups(source.info.n_frames, 1), source.info.n_frames)
+    context = stage_context(plan, source, Recorder(decisions), lambda: capture)
+    resampler: Resampler = built(plan.levels[0].resample, context, "level 1")
+    resampler.groups(source.info.n_frames, 1)
     return decisions
 
 
@@ -249,8 +247,12 @@ def _named(choices: Iterable[Choice]) -> Iterator[tuple[str, Choice]]:
         yield (name if seen[name] == 1 else f"{name} {seen[name]}"), choice
 
 
-def built(choice: Choice, context: SourceContext | StageContext | ExecutorContext) -> Any:
-    """Build a component; `PluginError` if a library is missing, or the plugin failed in its own way."""
+def built(choice: Choice, context: SourceContext | StageContext | ExecutorContext, where: str = "") -> Any:
+    """Build a component, `attributed` if the run says `where` it works.
+
+    Raises:
+        PluginError: a library is missing, or the plugin failed in its own way.
+    """
     contribution = choice.contribution
     who = choice.label
     for requirement in contribution.requires:
@@ -265,4 +267,4 @@ def built(choice: Choice, context: SourceContext | StageContext | ExecutorContex
         raise PluginError(f"{who} could not be built: {described(error)}") from error
     if lacking:
         raise PluginError(f"{who} could not be built: build returned {shown(component)}, which has no {listed(lacking, 'nor')}")
-    return component
+    return attributed(component, who, where) if where else component

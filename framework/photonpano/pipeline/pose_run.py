@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from photonpano.contracts.results import POSES
-from photonpano.contracts.rules import attributing
 from photonpano.errors import OutputError
 from photonpano.geometry import Camera, positions_of
 from photonpano.photometry import tone_mapped
@@ -60,8 +58,7 @@ def _estimated(run: BegunRun) -> PoseEstimate:
     assert plan.pose is not None
     require_centre(plan, source)
     estimator = build_pose_estimator(plan, source, run.journal)
-    with attributing(plan.pose.label, "the capture"):
-        return in_standard_world(POSES.require(estimator.estimate(source, camera_guess(plan), run.progress), source.info))
+    return in_standard_world(estimator.estimate(source, camera_guess(plan), run.progress))
 
 
 def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:

@@ -8,9 +8,8 @@ from functools import partial
 
 import numpy as np
 
+from photonpano.contracts.attribution import label_of
 from photonpano.contracts.protocols import Source
-from photonpano.contracts.results import REFINED
-from photonpano.contracts.rules import attributing
 from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, likely_rotations
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.level import Recorder
@@ -32,7 +31,7 @@ _BLURRED_PX = 1.0  # mean correction by which the exposures were blurred so that
 def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
     """Build the refiners of a plan, in order; `decisions` receives their choices."""
     context = stage_context(plan, source, Recorder(decisions))
-    return tuple(NamedRefiner(choice.contribution.name, built(choice, context), choice.label) for choice in plan.refine)
+    return tuple(NamedRefiner(choice.contribution.name, built(choice, context, "the refinement")) for choice in plan.refine)
 
 
 def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Explained]:
@@ -62,7 +61,7 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Expla
 def _corrected(state: State, refiner: NamedRefiner, place: int, number: int) -> Proposal | None:
     """Propose the motion that a refiner finds at a round, from 1; `place` is its own among those of the run."""
     given = place, number, state.motion.homographies, state.motion.noise_px
-    found = state.view.context.checkpoints.once("refined", partial(_refined, refiner, state, number), *given)
+    found = state.view.context.checkpoints.once("refined", partial(_refined, refiner, state), *given)
     if found is None:
         return None
     remaining_px = REMAINING_SHARE * _moved_px(state.motion, found.homographies)
@@ -71,27 +70,25 @@ def _corrected(state: State, refiner: NamedRefiner, place: int, number: int) -> 
     motion = replace(state.motion, trajectory=trajectory, homographies=homographies, std_px=std_px, remaining_px=remaining_px)
     if number > 1 and _change_px(state.motion, motion) < _LINEAR_PX:
         return Proposal(lambda: replace(state, refined=motion, known_fit=state.fit.moved(motion)), None, summary=found.summary)
-    rejection = f"a correction of {refiner.origin} is not used"
+    rejection = f"a correction of {label_of(refiner.component)} is not used"
     return Proposal(lambda: replace(state, refined=motion, known_fit=None), rejection=rejection, summary=found.summary)
 
 
-def _refined(refiner: NamedRefiner, state: State, number: int) -> Refined | None:
-    """Call a refiner, check what it returns, and make the homography of the reference frame the identity."""
+def _refined(refiner: NamedRefiner, state: State) -> Refined | None:
+    """Call a refiner, and make the homography of the reference frame the identity."""
     motion, fit = state.motion, state.fit
-    with attributing(refiner.origin, f"round {number}"):
-        std_px = motion.noise_px
-        found = refiner.component.refine(state.view.source, motion.trajectory, std_px, fit.residuals.steps(), fit.predictions)
-        if found is None:
-            return None
-        found = REFINED.require(found, motion.std_px)
-        homographies = inverse(found.homographies[motion.reference]) @ found.homographies
-        if (rotations := motion.rotations) is not None and (camera := motion.camera) is not None:
-            # Each correction is a small step of its frame, whose homography may be far from any of a plane.
-            steps = likely_rotations(camera, inverse(motion.homographies) @ found.homographies, motion.frame_shape)
-            turned = rotations @ steps
-            return replace(found, homographies=camera.homographies(turned[motion.reference].T @ turned))
-        homographies /= homographies[:, 2:, 2:].copy()
-        return replace(found, homographies=homographies)
+    given = state.view.source, motion.trajectory, motion.noise_px, fit.residuals.steps(), fit.predictions
+    found = refiner.component.refine(*given)
+    if found is None:
+        return None
+    homographies = inverse(found.homographies[motion.reference]) @ found.homographies
+    if (rotations := motion.rotations) is not None and (camera := motion.camera) is not None:
+        # Each correction is a small step of its frame, whose homography may be far from any of a plane.
+        steps = likely_rotations(camera, inverse(motion.homographies) @ found.homographies, motion.frame_shape)
+        turned = rotations @ steps
+        return replace(found, homographies=camera.homographies(turned[motion.reference].T @ turned))
+    homographies /= homographies[:, 2:, 2:].copy()
+    return replace(found, homographies=homographies)
 
 
 def _change_px(before: FrameMotion, after: FrameMotion) -> float:

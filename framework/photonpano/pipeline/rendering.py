@@ -14,9 +14,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from photonpano.capture import capture_of
+from photonpano.contracts.attribution import attributing, blaming, label_of
 from photonpano.contracts.protocols import Exporter, Renderer, Source, Trajectory, camera_of, light_of
-from photonpano.contracts.results import FILES, require_panorama
-from photonpano.contracts.rules import BrokenContract, attributing
+from photonpano.contracts.requirements import BrokenContract, require_files
 from photonpano.corrections import Vignette, write_vignette
 from photonpano.corrections.lighting import write_light
 from photonpano.corrections.moments import showing
@@ -72,7 +72,7 @@ def render_into(
 
 
 def _rendered(
-    folder: RunFolder, plan: Plan, source: Source, motion: FrameMotion, context: Context, renderer: AttributedRenderer
+    folder: RunFolder, plan: Plan, source: Source, motion: FrameMotion, context: Context, renderer: ChosenRenderer
 ) -> RenderedPanorama:
     """Render the frames of a motion, in tiles if the panorama exceeds the memory, and write these."""
     start, settings, memory = time.perf_counter(), plan.render, int(plan.run.memory)
@@ -115,14 +115,10 @@ def naming_key_of_canvas(plan: Plan) -> Iterator[None]:
 
 
 @dataclass(frozen=True, slots=True)
-class AttributedRenderer:
-    """A renderer whose errors name its `origin`, and whose panoramas are checked.
-
-    Unless it renders on `any_canvas`, it needs a planar one and a lens without distortion.
-    """
+class ChosenRenderer:
+    """The renderer of a plan. Unless it renders on `any_canvas`, it needs a planar one and a lens without distortion."""
 
     component: Renderer
-    origin: str
     bytes_per_pixel: int
     any_canvas: bool = True
 
@@ -137,35 +133,33 @@ class AttributedRenderer:
     ) -> Panorama:
         """Render the frames of a span on a canvas; `InputError` if it renders no such canvas, or not through a lens."""
         self._require_renderable(source, trajectory, span, canvas)
-        with attributing(self.origin, "the panorama"):
-            return require_panorama(self.component.render(source, trajectory, span, canvas, tolerance_px, advance), canvas)
+        return self.component.render(source, trajectory, span, canvas, tolerance_px, advance)
 
     def _require_renderable(self, source: Source, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> None:
         """Refuse what only a renderer on any canvas renders."""
         if self.any_canvas:
             return
+        label = label_of(self.component)
         if not canvas.planar:
             raise InputError(
-                f"{self.origin} renders on a plane only, and this panorama is {canvas.projection}; write render.use: merge, or "
+                f"{label} renders on a plane only, and this panorama is {canvas.projection}; write render.use: merge, or "
                 "render.projection: planar"
             )
         camera = camera_of(source)
         if camera is not None and camera.distorts:
-            raise InputError(f"{self.origin} does not render through a lens that distorts; write render.use: merge")
+            raise InputError(f"{label} does not render through a lens that distorts; write render.use: merge")
         homographies = trajectory.at(np.arange(span.start, span.stop))
         if not by_homographies(canvas, camera, homographies, source.info.frame_shape):
-            raise InputError(f"{self.origin} does not leave out frames that reach behind the plane; write render.use: merge")
+            raise InputError(f"{label} does not leave out frames that reach behind the plane; write render.use: merge")
 
     def require_seen(self, coverage_share: float) -> None:
         """Raise `PluginError` if nothing of the panorama was seen, although frames were located."""
-        with attributing(self.origin, "the panorama"):
-            if not coverage_share:
+        if not coverage_share:
+            with blaming(self.component):
                 raise BrokenContract("no pixel has a positive weight")
 
 
-def build_renderer(
-    plan: Plan, source: Source, decisions: list[Decision], in_order: InOrder | None = None
-) -> AttributedRenderer:
+def build_renderer(plan: Plan, source: Source, decisions: list[Decision], in_order: InOrder | None = None) -> ChosenRenderer:
     """Build the renderer of a plan; `decisions` receives its choices. Without `in_order`, threads share the work."""
     choice, contribution = plan.renderer, plan.renderer.contribution
     context = stage_context(plan, source, Recorder(decisions))
@@ -178,7 +172,7 @@ def build_renderer(
             "the frames that saw it; render with {use: merge} to divide by it"
         )
     any_canvas = contribution.renders_on_any_canvas
-    return AttributedRenderer(built(choice, context), choice.label, contribution.bytes_per_pixel, any_canvas)
+    return ChosenRenderer(built(choice, context, "the panorama"), contribution.bytes_per_pixel, any_canvas)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,7 +238,7 @@ class AttributedExporter:
                     f"{reason}; what was in the run folder before is unchanged. Make room, or choose another folder with "
                     "--output"
                 ) from error
-            FILES.require({each.name for each in folder.iterdir()} - before, path)
+            require_files({each.name for each in folder.iterdir()} - before, path)
 
 
 def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[AttributedExporter, ...]:

@@ -132,7 +132,6 @@ class NamedRefiner:
 
     name: str
     component: Refiner
-    origin: str  # who provides it, such as "refiner 'short-spans' of photonpano 0.1.0"
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,12 +5,12 @@ from .captures import photographed as photographed
 from .captures import recorded as recorded
 from .executors import ExecutorConformance as ExecutorConformance
 from .exporters import ExporterConformance as ExporterConformance
-from .interpolators import InterpolatorConformance as InterpolatorConformance
+from .images import MergerConformance as MergerConformance
+from .images import RendererConformance as RendererConformance
 from .locators import LocatorConformance as LocatorConformance
-from .mergers import MergerConformance as MergerConformance
+from .motions import InterpolatorConformance as InterpolatorConformance
+from .motions import RefinerConformance as RefinerConformance
+from .motions import ResamplerConformance as ResamplerConformance
 from .pose_estimators import PoseEstimatorConformance as PoseEstimatorConformance
-from .refiners import RefinerConformance as RefinerConformance
-from .renderers import RendererConformance as RendererConformance
-from .resamplers import ResamplerConformance as ResamplerConformance
 from .scenes import Scene as Scene
 from .sources import SourceConformance as SourceConformance

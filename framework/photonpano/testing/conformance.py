@@ -1,69 +1,43 @@
-"""Checks of every contribution, whatever its kind."""
+"""Checks of every contribution, and of the components that are built for a capture."""
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import json
-import subprocess
-import sys
 import typing
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import pytest
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
-from photonpano.contracts.rules import BrokenContract
-from photonpano.errors import PluginError
-from photonpano.plugins.contributions import Contribution, install_command
+from photonpano.contracts.requirements import BrokenContract
+from photonpano.errors import CaptureUnreadError, PluginError
+from photonpano.photometry import BinaryResponse
+from photonpano.plugins.contributions import Contribution, StageContext, StageContribution, install_command
 from photonpano.plugins.registry import KINDS
-from photonpano.plugins.registry.plugins import contributions_of
+from photonpano.values import CaptureSummary, StreamInfo
 
-# Libraries that take long to import; numpy is allowed.
-HEAVY = frozenset(
-    {
-        *("PIL", "av", "cupy", "cv2", "dask", "distributed", "h5py", "imageio", "jax", "kornia", "matplotlib", "numba"),
-        *("pandas", "pycolmap", "scipy", "skimage", "sklearn", "tensorflow", "tifffile", "torch", "torchvision", "zarr"),
-    }
-)
-
-_MODULES_OF = """
-import importlib, importlib.util, json, runpy, sys
-module, file, sys.path[:] = json.loads(sys.argv[1])
-before = set(sys.modules)
-try:
-    found = importlib.util.find_spec(module)
-except ModuleNotFoundError:
-    found = None
-if found:
-    importlib.import_module(module)
-else:
-    runpy.run_path(file)
-print(json.dumps(sorted({name.partition(".")[0] for name in set(sys.modules) - before})))
-"""
+STREAM = StreamInfo(2000, 254, 496, frame_rate_hz=96_800.0)  # the capture for which components are built by default
+SUMMARY = CaptureSummary(flux=0.5, speed_px=0.15, how="set by the conformance kit")
+# What a component returned, described for messages; the value; and what a run requires of it.
+Answer: TypeAlias = tuple[str, Any, Callable[[Any], object]]
 
 
 @pytest.mark.usefixtures("photonpano_one_thread_inside")
 class Conformance:
-    """Checks of summaries, configs and imports. Subclasses for each kind add checks of its components.
+    """Checks of the config. Subclasses for each kind add checks of its components.
 
     Attributes:
         contribution: the contribution under test; set it in a subclass.
         config: the keys under `with`. Set it on `self` in a fixture with `autouse=True` if it needs files.
-        hook_module: the module that offers the contribution; by default the one in which its `build` is defined.
-        heavy: top-level modules that must not be imported before a component is built, in addition to those that it requires.
     """
 
     kind: ClassVar[str]
-    attributes: ClassVar[tuple[str, ...]] = ()
 
     contribution: Contribution
     config: Mapping[str, Any] = {}
-    hook_module: str | None = None
-    heavy: frozenset[str] = HEAVY
 
     def settings(self) -> Any:
         """Return the config under test."""
@@ -77,92 +51,64 @@ class Conformance:
 
     def test_contribution_has_the_kind_of_this_class(self) -> None:
         """Specs look up components by kind."""
-        wanted = KINDS[self.kind].contribution
-        assert isinstance(self.contribution, wanted), (
-            f"{type(self).__name__} tests a {self.kind}: contribution must be a {wanted.__name__}, "
-            f"got {type(self.contribution).__name__}"
-        )
-
-    def test_summary_is_one_line_without_full_stop(self) -> None:
-        """`photonpano plugins list` prints each on one line."""
-        summary = self.contribution.summary
-        assert summary == " ".join(summary.split()), f"the summary must be one line without spaces around it, got {summary!r}"
-        assert summary, f"the summary of {self.contribution.name!r} is empty; describe the component in one line"
-        assert not summary.endswith("."), f"the summary must not end with a full stop: {summary!r}"
+        assert isinstance(self.contribution, KINDS[self.kind].contribution), f"{type(self).__name__} tests a {self.kind}"
 
     def test_config_is_closed_and_frozen(self) -> None:
         """A misspelt key is an error, and no component can modify a config that others share."""
         for model in models_in(self.contribution.config):
             extra, frozen = model.model_config.get("extra"), model.model_config.get("frozen")
-            assert (extra, frozen) == ("forbid", True), (
-                f"{model.__name__} must be closed and frozen: derive it from photonpano.Config; "
-                f"its model_config has extra={extra!r}, frozen={frozen!r}"
-            )
-
-    def test_config_keys_have_descriptions(self) -> None:
-        """Users see descriptions in `plugins show`, in messages and in editors."""
-        missing = [
-            f"{model.__name__}.{key}"
-            for model in models_in(self.contribution.config)
-            for key, field in model.model_fields.items()
-            if not field.description
-        ]
-        assert not missing, (
-            f"every key needs a description with its unit: add Field(..., description='...') to {', '.join(missing)}"
-        )
-
-    def test_config_refuses_unknown_key(self) -> None:
-        """Typing errors are reported, not ignored."""
-        try:
-            self.contribution.config.model_validate({**self.config, "no-such-key": 1})
-            problems = "nothing"
-        except ValidationError as error:
-            problems = ", ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors())
-        assert problems == "no-such-key: Extra inputs are not permitted", (
-            f"the config must refuse an unknown key, and accept the config under test; problems found: {problems}"
-        )
+            assert (extra, frozen) == ("forbid", True), f"derive {model.__name__} from photonpano.Config"
 
     def test_config_survives_json_round_trip(self) -> None:
         """`run.json` contains the spec, from which a run can be repeated."""
         settings = self.settings()
         written = json.loads(json.dumps(settings.model_dump(mode="json")))
-        again = must_not_raise(
-            f"reading the config from the record {written}", self.contribution.config.model_validate, written
-        )
-        assert again == settings, (
-            f"a config that is written as JSON must be read as the same config; {settings!r} was written as {written}, which "
-            f"was read as {again!r}"
-        )
-
-    def test_hook_module_imports_no_heavy_library(self) -> None:
-        """It is imported whenever plugins are listed; `build` imports libraries."""
-        module = self.hook_module or self.contribution.build.__module__
-        heavy = self.heavy | {requirement.module.partition(".")[0] for requirement in self.contribution.requires}
-        imported = sorted(modules_of(module) & heavy)
-        assert not imported, (
-            f"importing {module} imports {', '.join(imported)}; move that import into the function `build`, or into a module "
-            "that `build` imports"
-        )
-
-    def test_hooks_of_module_can_be_called(self) -> None:
-        """A plugin whose hooks raise, or do not end, offers nothing."""
-        name = self.hook_module or self.contribution.build.__module__
-        module = sys.modules.get(name) or importlib.import_module(name)
-        with passing(f"the hooks of {name}"):
-            contributions_of(module)
-
-    def require_methods(self, component: object) -> None:
-        """Require the methods of the kind."""
-        missing = [name for name in (*KINDS[self.kind].methods, *self.attributes) if not hasattr(component, name)]
-        assert not missing, f"build() must return a {self.kind}; {type(component).__name__} has no {' and no '.join(missing)}"
+        assert self.contribution.config.model_validate(written) == settings
 
 
-def must_not_raise(what: str, work: Callable[..., Any], *arguments: Any) -> Any:
-    """Call `work`; fail with a message if it raises."""
-    try:
-        return work(*arguments)
-    except Exception as error:
-        raise AssertionError(f"{what} must not raise; it raised {type(error).__name__}: {error}") from error
+class StageConformance(Conformance):
+    """Checks of components that are built for a capture."""
+
+    contribution: StageContribution
+
+    def built(self, stream: StreamInfo = STREAM, threads: int = 1) -> Any:
+        """Build the component for a capture; its summary is available only afterwards."""
+        self.require_libraries()
+        is_built = False
+
+        def summary() -> CaptureSummary:
+            if not is_built:
+                raise CaptureUnreadError("build() must not call context.capture(); call it when the component is used")
+            return SUMMARY
+
+        context = StageContext(stream, BinaryResponse(), seed=0, threads=threads, capture=summary)
+        component = self.contribution.build(self.settings(), context)
+        is_built = True
+        return component
+
+    def test_build_reads_no_frames(self) -> None:
+        """`photonpano check` and `explain` build components without reading frames."""
+        component = self.built()
+        missing = [name for name in KINDS[self.kind].methods if not callable(getattr(component, name, None))]
+        assert not missing, f"a {self.kind} needs these methods"
+
+    def test_check_accepts_config_under_test(self) -> None:
+        """`check` returns a sequence of sentences, empty if there is no problem."""
+        assert [*self.contribution.check(self.settings(), STREAM)] == []
+
+
+class AnswerConformance(StageConformance):
+    """Checks of components whose answers a run checks."""
+
+    def answers(self) -> Iterator[Answer]:
+        """Yield what the component returns for several inputs."""
+        raise NotImplementedError
+
+    def test_answers_keep_the_contract(self) -> None:
+        """A run refuses what breaks it: see `photonpano.contracts`. Arguments are read-only: copy an array to change it."""
+        for what, found, require in self.answers():
+            with passing(what):
+                require(found)
 
 
 @contextmanager
@@ -187,16 +133,3 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
         yield annotation
     for argument in typing.get_args(annotation):
         yield from _models(argument)
-
-
-@cache
-def modules_of(module: str) -> frozenset[str]:
-    """Return the top-level modules that a fresh interpreter imports with a module; runs its file if it is on no path."""
-    file = getattr(sys.modules.get(module), "__file__", None)
-    argument = json.dumps([module, file, sys.path])
-    done = subprocess.run([sys.executable, "-c", _MODULES_OF, argument], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, (
-        f"the hook module {module} cannot be imported in a fresh interpreter; set hook_module if the contribution comes from "
-        f"another module:\n{done.stderr}"
-    )
-    return frozenset(json.loads(done.stdout.splitlines()[-1]))

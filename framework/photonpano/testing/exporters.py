@@ -15,8 +15,7 @@ from photonpano.pipeline.rendering import AttributedExporter, StoredPanorama
 from photonpano.plugins.contributions import ExporterContribution
 from photonpano.record.contents import contents_of
 from photonpano.record.schema import FileContent
-from photonpano.testing.conformance import passing
-from photonpano.testing.stages import StageConformance
+from photonpano.testing.conformance import StageConformance, passing
 
 SHAPE = (37, 53)
 

@@ -12,8 +12,7 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_KINDS = "sources resamplers mergers locators interpolators refiners renderers exporters pose_estimators executors"
-for _name in ("conformance", "stages", *_KINDS.split()):
+for _name in ("conformance", "sources", "images", "locators", "motions", "exporters", "pose_estimators", "executors"):
     pytest.register_assert_rewrite(f"photonpano.testing.{_name}")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import CameraGuess, FrameSpan, Group, LocationError, StageContext
-from photonpano.contracts.results import POSES
+from photonpano.contracts.requirements import require_poses
 from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
 from photonpano.geometry import Camera, positions_of, rotation_matrices
@@ -330,7 +330,7 @@ def test_frames_that_an_early_level_does_not_locate_are_lost_and_named(monkeypat
     source, config = capture(), StratifiedPoseConfig(group_size=20, levels=3)
     context = StageContext(source.info, source.response, 0, 2)
     estimate = StratifiedEstimator(config, context).estimate(source, CameraGuess(FOCAL_PX), Quiet())
-    assert POSES.require(estimate, source.info) is estimate
+    assert require_poses(estimate, source) is estimate
     assert [each.span for each in estimate.lost] == [FrameSpan(140, 160)]
     np.testing.assert_array_equal(np.flatnonzero(~estimate.located), np.arange(140, 160))
 

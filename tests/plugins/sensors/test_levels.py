@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError
-from photonpano.contracts.sources import RESPONSE
+from photonpano.contracts.requirements import require_response
 from photonpano.photometry import srgb_to_linear
 from photonpano_sensors.intensity.contributions import FastcamMrawConfig, ResponseConfig
 from photonpano_sensors.intensity.mraw import FastcamMrawSource
@@ -101,7 +101,7 @@ def test_curve_and_curve_file_together_are_refused() -> None:
 
 @pytest.mark.parametrize("curve", ["linear", "srgb"])
 def test_response_of_the_fewest_photons_is_one_that_captures_may_have(curve: Any) -> None:
-    RESPONSE.require(levels(saturation_photons=1.0, curve=curve).response)
+    require_response(levels(saturation_photons=1.0, curve=curve).response)
     with pytest.raises(ValidationError, match="greater than or equal to 1"):
         ResponseConfig(saturation_photons=0.2)
 

@@ -163,13 +163,13 @@ def test_sources_of_colours_name_the_plugin_too(source: Any, memory_source: type
         ("counts", (SPAN,), "frames 2 to 4", np.zeros((6, 4)), "expected the shape (4, 6), got (6, 4)"),
         ("frames", (SPAN,), "frames 2 to 4", np.zeros((6, 4)), "expected the shape (3, 4, 6), got (6, 4)"),
         ("packed", (SPAN,), "frames 2 to 4", np.zeros((6, 4)), "expected the shape (3, 4, 1), got (6, 4)"),
-        ("truth", (), "truth()", [1], "truth() returns a mapping of arrays by name, got a list"),
+        ("truth", (), "truth()", [1], "expected Mapping, got a list"),
         (
             "sharp_view",
             (2,),
             "sharp_view()",
             np.zeros((2, 2), np.float32),
-            "sharp_view() returns (4, 6) of float32, got (2, 2) of float32",
+            "the result of sharp_view() must be (4, 6) of float32, got (2, 2) of float32",
         ),
     ],
 )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, PluginError
-from photonpano.contracts.loop import AttributedTrajectory
+from photonpano.contracts.attribution import attributed
 from photonpano.execution.context import Context, Quiet
 from photonpano.geometry import from_parameters, inverse, normalised, translation
 from photonpano.motion.level import Level
@@ -156,6 +156,7 @@ def test_component_that_raises_is_named_and_errors_for_users_pass_unchanged(
 ) -> None:
     second = make_level(number=2)
     component = second.locators[0].component if kind == "locator" else getattr(second, kind)
+    component = component.component
     setattr(component, method, raising(ZeroDivisionError("by nothing")))
     with pytest.raises(PluginError) as caught:
         run(make_level(), second)
@@ -193,7 +194,7 @@ def test_referenced_trajectory_is_the_identity_at_the_reference_and_keeps_pairwi
 
 def test_attributed_trajectory_returns_what_the_trajectory_returns(pan: Callable) -> None:
     motion = pan(0.3)
-    named = AttributedTrajectory(motion, "interpolator 'toy' of toys 1.0", 2)
+    named = attributed(motion, "interpolator 'toy' of toys 1.0", "level 2")
     for frames in ([3], [0, 2.5, 7], np.arange(4), 3):
         np.testing.assert_array_equal(named.at(frames), motion.at(frames))
 
@@ -202,7 +203,10 @@ def test_attributed_trajectory_returns_what_the_trajectory_returns(pan: Callable
     ("answer", "problem"),
     [
         (raising(KeyError("knot")), "failed at level 2: KeyError: 'knot'"),
-        (lambda _: np.eye(3), "broke its contract at level 2: expected homographies of the shape (2, 3, 3), got (3, 3)"),
+        (
+            lambda _: np.eye(3),
+            "broke its contract at level 2: the result of at() must be (2, 3, 3) of float64, got (3, 3) of float64",
+        ),
         (
             lambda _: [np.eye(3), np.diag([1.0, 1.0, 0.0])],
             "broke its contract at level 2: a homography is finite with h33 = 1, that of frame 7.5 is "
@@ -218,7 +222,7 @@ def test_attributed_trajectory_names_interpolator_on_exception_or_broken_contrac
         at = staticmethod(answer)
 
     with pytest.raises(PluginError) as caught:
-        AttributedTrajectory(Odd(), "interpolator 'toy' of toys 1.0", 2).at([3, 7.5])
+        attributed(Odd(), "interpolator 'toy' of toys 1.0", "level 2").at([3, 7.5])
     assert str(caught.value) == f"interpolator 'toy' of toys 1.0 {problem}"
 
 

@@ -23,13 +23,14 @@ from photonpano import (
     StreamInfo,
 )
 from photonpano.capture import seen_through
+from photonpano.contracts.attribution import attributed, label_of
 from photonpano.contracts.protocols import Renderer
 from photonpano.corrections.lighting import in_light
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, canvas_around, covered_by, rotation_matrices
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
 from photonpano.pipeline.forecast import TRIAL_GROUPS, forecast
-from photonpano.pipeline.rendering import AttributedRenderer, build_renderer
+from photonpano.pipeline.rendering import ChosenRenderer, build_renderer
 from photonpano.plugins.registry import Catalog, Origin
 from photonpano.plugins.registry.catalog import make_entry
 from photonpano.specs import Plan, parse_spec
@@ -83,12 +84,10 @@ def test_components_receive_their_config_and_context() -> None:
     assert level.locators[0].component.context == StageContext(source.info, source.response, seed=7, threads=3)
     for stage in (level.resampler, level.merger, level.interpolator):
         assert stage.context.response == source.response
-    assert level.locators[0].origin == "locator 'toy' of toys 1.0"
-    assert level.origins == {
-        "resampler": "resampler 'toy' of toys 1.0",
-        "merger": "merger 'toy' of toys 1.0",
-        "interpolator": "interpolator 'toy' of toys 1.0",
-    }
+    assert label_of(level.locators[0].component) == "locator 'toy' of toys 1.0"
+    assert [label_of(each) for each in (level.resampler, level.merger, level.interpolator)] == [
+        f"{kind} 'toy' of toys 1.0" for kind in ("resampler", "merger", "interpolator")
+    ]
 
 
 class Curious(Built):
@@ -133,9 +132,9 @@ def test_foreseen_groups_reads_no_frames() -> None:
 def test_levels_with_the_same_choice_share_a_component() -> None:
     made = plan(levels=[{"scale": 0.5}, {"locate": {"with": {"size": 2}}}, {}])
     first, second, third = build_levels(made, build_source(made), [])
-    locators = [level.locators[0].component for level in (first, second, third)]
+    locators = [level.locators[0].component.component for level in (first, second, third)]
     assert locators[0] is locators[2] is not locators[1]
-    assert first.merger is second.merger is third.merger
+    assert first.merger.component is second.merger.component is third.merger.component
     assert [level.number for level in (first, second, third)] == [1, 2, 3]
     assert [level.scale for level in (first, second, third)] == [0.5, 1, 1]
     assert locators[1].config == Keys(size=2)
@@ -152,9 +151,9 @@ def test_fallbacks_follow_the_locator_in_order_and_share_components() -> None:
     first, second = build_levels(made, build_source(made), [])
     assert [(each.name, each.component.config.size) for each in first.locators] == [("toy", 1), ("toy 2", 2)]
     assert [(each.name, each.component.config.size) for each in second.locators] == [("toy", 2), ("toy 2", 1), ("toy 3", 3)]
-    assert {each.origin for each in second.locators} == {"locator 'toy' of toys 1.0"}
-    assert first.locators[0].component is second.locators[1].component
-    assert first.locators[1].component is second.locators[0].component
+    assert {label_of(each.component) for each in second.locators} == {"locator 'toy' of toys 1.0"}
+    assert first.locators[0].component.component is second.locators[1].component.component
+    assert first.locators[1].component.component is second.locators[0].component.component
 
 
 def broken(*_: Any) -> Any:
@@ -295,7 +294,9 @@ def test_renderer_on_planes_is_not_called_for_other_canvases(
 ) -> None:
     turn = FrameTrajectory(CAMERA.homographies(rotation_matrices([[0, 0, 0], [0, np.radians(degrees), 0]])))
     source = seen_through(MemorySource(np.zeros((2, *SHAPE), np.uint8)), camera)
-    renderer = AttributedRenderer(cast("Renderer", None), "renderer 'flat' of a plugin", 40, any_canvas=False)
+    renderer = ChosenRenderer(
+        attributed(cast("Renderer", None), "renderer 'flat' of a plugin", "the panorama"), 40, any_canvas=False
+    )
     with pytest.raises(InputError) as caught:
         renderer.render(source, turn, FrameSpan(0, 2), canvas, 0.25, lambda _: None)
     assert str(caught.value) == f"renderer 'flat' of a plugin {reason}"

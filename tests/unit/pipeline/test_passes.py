@@ -13,6 +13,7 @@ import pytest
 
 from photonpano import FrameSpan, LocationError, Refined
 from photonpano.capture import before, capture_of
+from photonpano.contracts.attribution import attributed
 from photonpano.errors import CanvasTooLargeError
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, corner_displacements, inverse, likely_rotations, translation
@@ -190,7 +191,7 @@ def run(source: ReadOnlySource) -> Callable[..., Explained]:
             camera,
         )
         component = answer if isinstance(answer, Answering) else Answering(answer)
-        named = NamedRefiner("odd", component, "refiner 'odd' of toys 1.0")
+        named = NamedRefiner("odd", attributed(component, "refiner 'odd' of toys 1.0", "the refinement"))
         state = State(PLAN, source, Context(), FRAMES // 2, (), Timeline.regular(FRAMES), refined=motion)
         return refine(state, [named])[1]
 

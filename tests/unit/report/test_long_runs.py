@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from photonpano import Refined
-from photonpano.contracts.results import REFINED
+from photonpano.contracts.requirements import require_refined
 from photonpano.geometry import FrameTrajectory, nearest_rotations, steps_px
 from photonpano.merging import chunks_of
 from photonpano.merging.canvas_plan import plan_canvas
@@ -102,7 +102,7 @@ def bytes_a_frame(work: Callable[[End], object], ends: tuple[End, End]) -> float
         pytest.param(lambda end: bounded_std_px(end.motion.std_px, end.residuals), 80, id="bounds"),
         pytest.param(End.refined, 150, id="refinement"),
         pytest.param(
-            lambda end: REFINED.require(Refined(end.motion.homographies, end.motion.std_px, ""), end.motion.std_px),
+            lambda end: require_refined(Refined(end.motion.homographies, end.motion.std_px, ""), None, None, end.motion.std_px),
             40,
             id="check",
         ),

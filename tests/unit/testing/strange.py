@@ -41,11 +41,6 @@ class Keys(Config):
     """No keys."""
 
 
-def without_config(build: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:
-    """Return the build function of a contribution without keys; checks of the kit import its module alone."""
-    return lambda _, context: build(context)
-
-
 class SpeechlessError(Exception):
     def __str__(self) -> str:
         raise RuntimeError("no words")

@@ -52,7 +52,7 @@ PLACES: Mapping[str, tuple[str, Callable[[Exception], Callable[[Any], Any]], str
     "counts of a short span": ("source", lambda error: failing_at(40, 44, error), "failed at frames 40 to 43: "),
     "counts of a group": ("source", lambda error: failing_at(40, 80, error), "failed at frames 40 to 79: "),
     "counts of a rendered frame": ("source", lambda error: failing_at(150, 151, error), "failed at frame 150: "),
-    "refine": ("refiner", lambda error: instead("refine", raising(error)), "failed at round 1: "),
+    "refine": ("refiner", lambda error: instead("refine", raising(error)), "failed at the refinement: "),
     "render": ("renderer", lambda error: instead("render", raising(error)), "failed at the panorama: "),
     "build a pose estimator": ("pose-estimator", raising, "could not be built: "),
     "estimate": ("pose-estimator", lambda error: instead("estimate", raising(error)), "failed at the capture: "),

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from photonpano.compiling import notify_on_first_compile
+from photonpano.contracts.attribution import attributing
 from photonpano.contracts.protocols import Piped
-from photonpano.contracts.rules import attributing
 from photonpano.errors import InputError, OutputError, PhotonpanoError, described
 from photonpano.execution.context import Context, Progress
 from photonpano.execution.threads import one_thread_inside, thread_count

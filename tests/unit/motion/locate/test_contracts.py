@@ -11,15 +11,14 @@ import pytest
 
 from photonpano import Group, Located, LocationError, NotLocated, PluginError, Trajectory
 from photonpano.contracts.information import why_undetermined
-from photonpano.contracts.loop import KNOTS, knot_errors, require_valid
-from photonpano.contracts.rules import BrokenContract
+from photonpano.contracts.requirements import BrokenContract, require_motion, require_near_knots
 from photonpano.geometry import jacobian, rescaled, translation
 from photonpano.motion.registration import BRIDGE
 from photonpano.specs.settings import GraphSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 FIRST, SECOND = "locator 'toy' of toys 1.0", "locator 'second' of toys 1.0"
-BROKEN = "broke its contract at level 1: expected Located or NotLocated, got NoneType"
+BROKEN = "broke its contract at level 1: expected Located or NotLocated, got a NoneType"
 STILL = (
     "broke its contract at level 1: every pair that was located is exactly the identity, which a camera that stands still does "
     "not give; a failure is NotLocated"
@@ -33,7 +32,7 @@ def test_valid_motion_is_accepted() -> None:
         Located(translation(3, 1), evidence={"inliers": np.int64(3), "ncc": np.float32(0.5)}),
         NotLocated("lost", {"matches": 3}),
     ):
-        assert require_valid(motion) is motion
+        assert require_motion(motion) is motion
 
 
 def failing_with(error: Exception) -> Callable[..., Any]:
@@ -151,7 +150,7 @@ PLACES = np.array([translation(5.0 * index, 0) for index in range(9)])
 
 
 def knots_kept(trajectory: Trajectory, std_px: float = 0.05) -> None:
-    KNOTS.require(knot_errors(trajectory, np.arange(0, 90, 10.0), PLACES, np.full(9, std_px), (40, 60)))
+    require_near_knots(trajectory, np.arange(0, 90, 10.0), PLACES, np.full(9, std_px), (40, 60))
 
 
 def test_trajectory_may_smooth_its_knots_and_miss_outliers(known_motion: type) -> None:

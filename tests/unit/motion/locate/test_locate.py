@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import repeat
 from typing import Any
 
 import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, Homography, Located, LocationError, NotLocated, PluginError
+from photonpano.contracts.attribution import attributed
 from photonpano.geometry import corners, from_parameters, inverse, jacobian, normalised, rotation_matrices, translation
 from photonpano.motion.level import Level, NamedLocator
 from photonpano.motion.locate import _ambiguity
@@ -129,7 +129,13 @@ def hypothesising(make_level: Callable) -> Callable[..., Level]:
                     return NotLocated("lost")
                 return named.component.register(moving, fixed, initial)
 
-        return replace(made, locators=(NamedLocator("toy", Hypothesising(), named.origin), *made.locators[1:]))
+        return replace(
+            made,
+            locators=(
+                NamedLocator("toy", attributed(Hypothesising(), "locator 'toy' of toys 1.0", "level 1")),
+                *made.locators[1:],
+            ),
+        )
 
     return make
 
@@ -195,10 +201,11 @@ def test_pair_that_does_not_overlap_by_the_motion_known_so_far_is_no_pair(
 
 @pytest.mark.parametrize("hypothesis", ["left", np.eye(2), translation(np.nan, 0)], ids=["text", "shape", "NaN"])
 def test_hypotheses_that_are_no_homographies_are_refused(run: Callable, hypothesising: Callable, hypothesis: Any) -> None:
-    """Also if they have no end."""
     made = hypothesising(2.0)
-    made.locators[0].component.hypotheses = lambda *_: repeat(hypothesis)
-    with pytest.raises(PluginError, match=r"^locator 'toy' of toys 1\.0 broke its contract at level 1: a homography is a "):
+    made.locators[0].component.component.hypotheses = lambda *_: [hypothesis]
+    with pytest.raises(
+        PluginError, match=r"^locator 'toy' of toys 1\.0 broke its contract at level 1: a homography (is|must be) "
+    ):
         run(made, graph=GraphSettings())
 
 
