@@ -1,22 +1,20 @@
 """What plugins are made of: the records that offer components, their configs, and what components are told."""
 
-from .configs import Config as Config
-from .configs import FrameRange as FrameRange
-from .configs import SpecLocation as SpecLocation
-from .configs import SpecPath as SpecPath
-from .contexts import ExecutorContext as ExecutorContext
-from .contexts import SourceContext as SourceContext
-from .contexts import StageContext as StageContext
-from .kinds import KINDS as KINDS
-from .kinds import PROJECT as PROJECT
-from .kinds import Kind as Kind
-from .kinds import hookimpl as hookimpl
-from .kinds import hookspec as hookspec
+from .given import Config as Config
+from .given import ExecutorContext as ExecutorContext
+from .given import FrameRange as FrameRange
+from .given import SourceContext as SourceContext
+from .given import SpecLocation as SpecLocation
+from .given import SpecPath as SpecPath
+from .given import StageContext as StageContext
 from .records import API_VERSION as API_VERSION
+from .records import KINDS as KINDS
+from .records import PROJECT as PROJECT
 from .records import Contribution as Contribution
 from .records import ExecutorContribution as ExecutorContribution
 from .records import ExporterContribution as ExporterContribution
 from .records import InterpolatorContribution as InterpolatorContribution
+from .records import Kind as Kind
 from .records import LocatorContribution as LocatorContribution
 from .records import MergerContribution as MergerContribution
 from .records import PartOfCapture as PartOfCapture
@@ -29,4 +27,6 @@ from .records import ResamplerContribution as ResamplerContribution
 from .records import SourceContribution as SourceContribution
 from .records import StageContribution as StageContribution
 from .records import WriteFrames as WriteFrames
+from .records import hookimpl as hookimpl
+from .records import hookspec as hookspec
 from .records import install_command as install_command

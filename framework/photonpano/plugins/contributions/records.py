@@ -1,14 +1,16 @@
-"""The frozen records with which a plugin offers its components."""
+"""The frozen records with which a plugin offers its components, the kinds of components, and the marks of hooks."""
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, get_args, get_type_hints
 
 import numpy as np
+import pluggy
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
@@ -26,11 +28,42 @@ from photonpano.contracts.protocols import (
     Source,
 )
 from photonpano.execution import Executor
-from photonpano.plugins.contributions.configs import Config, FrameRange
-from photonpano.plugins.contributions.contexts import ExecutorContext, SourceContext, StageContext
-from photonpano.plugins.contributions.kinds import KINDS, Kind
+from photonpano.plugins.contributions.given import Config, ExecutorContext, FrameRange, SourceContext, StageContext
 from photonpano.text import install_line
 from photonpano.values import StreamInfo
+
+PROJECT = "photonpano"  # the project name of pluggy, and the entry-point group
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One kind of component. Hooks, the reader of specs, the JSON Schema and the conformance kit go by this row."""
+
+    name: str  # what a component of this kind is, such as `locator`
+    section: str  # where a spec chooses it, such as `locate` or `output.formats`
+    # the record that the hook yields; what its `build` returns is the interface of the component
+    contribution: type[Any] = field(repr=False)
+    default: str | None = None  # the component that a spec uses if it names none
+    of_level: bool = False  # whether each level of a run has one
+    several: bool = False  # whether the section is a list of components
+    meaning: str = ""  # what the section chooses, for editors; empty if its keys say so
+
+    @property
+    def hook(self) -> str:
+        """The hook that offers it, such as `photonpano_locators`."""
+        return f"{PROJECT}_{self.name.replace('-', '_')}s"
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The methods of the component."""
+        interface = get_args(get_type_hints(self.contribution)["build"])[-1]
+        return tuple(name for name, member in vars(interface).items() if inspect.isfunction(member) and name[0] != "_")
+
+
+KINDS: dict[str, Kind] = {}
+"""All kinds by name, in the order in which a run needs them; each contribution class adds its own."""
 
 API_VERSION = 1
 """The version of the contract with plugins: hooks, contributions, protocols. It changes only when plugins must change."""

@@ -9,4 +9,4 @@ from .catalog import DisabledPlugin as DisabledPlugin
 from .catalog import Entry as Entry
 from .catalog import Observer as Observer
 from .catalog import Origin as Origin
-from .discovery import discover as discover
+from .catalog import discover as discover
