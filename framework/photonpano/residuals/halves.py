@@ -95,7 +95,10 @@ class Halves:
         if not len(self.stretches.firsts):
             return np.asarray(across_px)
         stretch = np.searchsorted(self.stretches.firsts, frames, side="right").clip(1) - 1
-        return np.asarray(np.maximum(across_px, self.stretches.std_px[stretch, 1]))
+        # The noise of any short stretch is in the expected error of its exposures.
+        alone_px2 = self.stretches.std_px[:, 1] ** 2
+        beyond_px = np.sqrt(np.maximum(alone_px2 - np.median(alone_px2), 0))
+        return np.asarray(np.maximum(across_px, beyond_px[stretch]))
 
 
 class _Block(NamedTuple):
