@@ -26,7 +26,7 @@ from browser import Page, browser
 from photonpano import batch, parse_spec, simulate
 
 RATE_HZ, SHAPE, SHOWN_S = 800, (254, 496), 8
-"""The camera, and when the page of the run is drawn, in seconds after the first frame."""
+"""The camera, and when the page of the run is drawn: when the picture shows half of the frames of that time, in seconds."""
 NAMES, CUT = ("bridge", "castle", "harbour", "market", "mill", "station", "tower"), "mill"
 WIDTH, PHONE = 1100, 400
 
@@ -44,7 +44,7 @@ def live(page: Page, folder: Path) -> None:
             time.sleep(0.1)
         camera = threading.Thread(target=write, args=(cube, program.stdin))
         camera.start()
-        while json.loads((out / "live.json").read_text())["frames"] < SHOWN_S * RATE_HZ:
+        while json.loads((out / "live.json").read_text())["shown"] < SHOWN_S * RATE_HZ / 2:
             time.sleep(0.05)
         seen = shutil.copytree(out, folder / "seen")
         program.kill()

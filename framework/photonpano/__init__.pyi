@@ -97,7 +97,6 @@ from .plugins.contributions import hookimpl as hookimpl
 from .plugins.registry import Catalog as Catalog
 from .plugins.registry import discover as discover
 from .record.batch_row import BatchRow as BatchRow
-from .report import LiveFigures as LiveFigures
 from .specs import Plan as Plan
 from .specs import capture_plan as capture_plan
 from .specs import load_spec as load_spec

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from photonpano import SpecError, parse_spec, run
-from photonpano.capture import part_of
 from photonpano.geometry import corners, inverse, transform_points, translation
 from photonpano.pipeline.components import build_source
-from photonpano.pipeline.following.live_run import ArrivedFrames
 from photonpano.record.fingerprint import fingerprint
 from photonpano.testing.scenes import detected, seen_along, textured
 from photonpano.values import FloatArray, FrameSpan
@@ -106,10 +104,3 @@ def test_a_mask_beyond_the_recording_is_an_error_and_other_frames_are_another_ca
             hashes.add(fingerprint(of(frames), capture)["pixels_sha256"])
             assert capture.masked_in(FrameSpan(0, 1200)).valid.sum() == SHAPE[0] * 96
     assert len(hashes) == 2
-
-
-def test_a_mask_holds_while_the_capture_is_followed(spec: dict[str, Any]) -> None:
-    plan = parse_spec(spec)
-    with build_source(plan) as whole:
-        arrived = ArrivedFrames(plan).of(part_of(whole.source.given, FrameSpan(0, 500)), None)
-        assert [arrived.masked_in(FrameSpan(*each)).valid.all() for each in ((0, 400), (399, 401))] == [True, False]

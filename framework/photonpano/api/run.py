@@ -15,7 +15,6 @@ from photonpano.motion.timeline import CUT, DARK_FRAMES, DARK_JUMP, REPEATED, SH
 from photonpano.pipeline.estimate import START
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
 from photonpano.record.schema import PanoramaRecord
-from photonpano.report import LiveFigures
 from photonpano.specs import load_spec
 from photonpano.text import byte_size, counted, duration
 
@@ -30,8 +29,6 @@ def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
         logger.info("took %s%s", duration(record["seconds"]), f" and at most {byte_size(memory)} of memory" if memory else "")
     if result.was_finished:
         yield "finished  this run was finished before; nothing was left to do"
-    if result.followed is not None:
-        yield f"followed  {_delays(result.followed)}"
     if result.verdict is not None:
         yield from verdict_lines(result.verdict)
     for warning in record["warnings"]:
@@ -96,8 +93,8 @@ def _run(
         resume: go on with a run of this spec that was interrupted.
         from_level: take the levels before N from the run before, whose work was kept, and compute N and what follows.
         keep_work: keep what each level has found, for --from-level, in the folder DIR.work.
-        follow: follow a capture that is still being written, or comes on standard input: locate its frames as they arrive, and
-            write a page with the picture so far, DIR.live/live.html. Run the whole once it is complete.
+        follow: follow a capture that is still being written, or comes on standard input: run the frames that are there, and
+            write a page with the panorama so far, DIR.live/live.html. Run the whole once it is complete.
         end_after: with --follow, a growing file is complete when nothing has come for this time; by default 5.
         progress: receives stages and messages.
 
@@ -123,14 +120,6 @@ def _run(
         follow=follow,
         end_after=END_AFTER_S if end_after is None else end_after,
     )
-
-
-def _delays(figures: LiveFigures) -> str:
-    """Describe how fast frames were located."""
-    text = f"{figures.located:,} of {counted(figures.frames, 'frame')} were located as they arrived"
-    if figures.delay_mean_s is None or figures.delay_longest_s is None:
-        return text
-    return f"{text}, {duration(figures.delay_mean_s)} later on average and {duration(figures.delay_longest_s)} at most"
 
 
 def _range(panorama: PanoramaRecord | None) -> str:

@@ -30,7 +30,7 @@ from photonpano.plugins.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
-from photonpano.values import CaptureSummary, Decision, FrameSpan, Group, StreamInfo
+from photonpano.values import CaptureSummary, Decision, FrameSpan, Group
 
 HALVED_LEVELS = 2  # with `scale: auto`, the first two levels are located at half size
 LARGE_FRAME_PX = 192  # minimum shorter side of frames located at half size: the pyramids of locators need pixels
@@ -45,21 +45,13 @@ def open_source(plan: Plan, look: bool = True) -> Iterator[Capture]:
     """
     with build_source(plan, look) as opened:
         capture = without_still_pixels(opened, look) if plan.corrects_itself else opened
-        require_suitable(plan, capture, capture.info)
+        problems = check_stream(plan, capture.info)
+        if plan.render.white_balance != "none" and capture.colour is None:
+            message = "the capture is grey; remove this key, or name the colour filter: corrections: [{colour-filter: {...}}]"
+            problems.append(plan.place("render.white_balance").problem(message))
+        if problems:
+            raise SpecError(problems)
         yield capture
-
-
-def require_suitable(plan: Plan, capture: Capture, info: StreamInfo) -> None:
-    """Raise `SpecError` if a stage does not suit a capture, or it is grey and the spec balances its colours.
-
-    `info` describes the frames that the capture will have, which may be more than those that are there.
-    """
-    problems = check_stream(plan, info)
-    if plan.render.white_balance != "none" and capture.colour is None:
-        message = "the capture is grey; remove this key, or name the colour filter: corrections: [{colour-filter: {...}}]"
-        problems.append(plan.place("render.white_balance").problem(message))
-    if problems:
-        raise SpecError(problems)
 
 
 def build_source(plan: Plan, look: bool = True) -> Capture:
@@ -83,11 +75,6 @@ def build_source(plan: Plan, look: bool = True) -> Capture:
             raise
         # The spec says `auto`, so the message explains how this source was chosen.
         raise InputError(f"{error} (source {found.value}: {found.reason})") from error
-    return with_corrections(plan, capture, look)
-
-
-def with_corrections(plan: Plan, capture: Capture, look: bool = True) -> Capture:
-    """Return a capture with the corrections of a plan; it is closed if one of them raises `SpecError`."""
     if not plan.corrections:
         return capture
 

@@ -10,12 +10,12 @@ from photonpano.capture import capture_of
 from photonpano.contracts.protocols import light_of
 from photonpano.corrections.movers import decision_of
 from photonpano.errors import InputError
-from photonpano.execution.context import Progress, usual
+from photonpano.execution.context import Progress, Quiet, usual
 from photonpano.pipeline.alternatives import beside_alternatives
 from photonpano.pipeline.checkpoints.work_folder import Continuation
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
-from photonpano.pipeline.following.follow import followed
+from photonpano.pipeline.follow import followed
 from photonpano.pipeline.obstacles import naming_obstacles
 from photonpano.pipeline.pose_run import find_poses
 from photonpano.pipeline.refiners import build_refiners, refine
@@ -26,7 +26,7 @@ from photonpano.pipeline.shots import run_others
 from photonpano.record.run_json import record_of
 from photonpano.record.run_warnings import TIME_LIMIT
 from photonpano.record.schema import RunRecord
-from photonpano.report import LiveFigures, OpenCapture, render_report
+from photonpano.report import OpenCapture, render_report
 from photonpano.report.notebook import ShownReport, run_html
 from photonpano.residuals.verdict import judge
 from photonpano.specs.plan import Plan
@@ -45,7 +45,6 @@ class RunResult:
         record: the content of its `run.json`.
         verdict: whether motion and panorama, or the poses, explain the photons.
         was_finished: whether `resume` found that nothing was left to do.
-        followed: how fast the frames of a capture were located that was followed.
         others: the runs of the other shots of the capture, longer ones first; those that failed are missing.
     """
 
@@ -53,7 +52,6 @@ class RunResult:
     record: RunRecord = field(repr=False)
     verdict: Verdict | None
     was_finished: bool = False
-    followed: LiveFigures | None = None
     others: tuple[RunResult, ...] = ()
 
     def _repr_html_(self) -> str:
@@ -94,8 +92,8 @@ def run(
         from_level: take the levels before this one from the run before, whose work was kept; compute this one and what follows.
             The work is kept again. A run of poses keeps no work.
         keep_work: keep what each level has found, beside the run folder, for `from_level`.
-        follow: follow a capture that is still being written: locate its frames as they arrive, and write a page with the
-            picture so far to the folder `DIR.live` beside the run folder. Once the capture is complete, it is run as any other.
+        follow: follow a capture that is still being written: run the frames that are there, and write a page with the panorama
+            so far to the folder `DIR.live` beside the run folder. Once the capture is complete, it is run as any other.
         end_after: with `follow`, the seconds without a new frame after which a growing file counts as complete.
 
     Raises:
@@ -109,9 +107,9 @@ def run(
     if follow:
         if resume or from_level is not None:
             raise InputError("a run that follows a capture begins anew: without resume and from_level")
-        with followed(plan, usual(progress), overwrite=overwrite, end_after=end_after) as (complete, figures):
-            result = run(complete, progress, overwrite=overwrite, keep_work=keep_work)
-            return replace(result, followed=figures)
+        so_far = partial(run, progress=Quiet(), overwrite=True)
+        with followed(plan, so_far, usual(progress), overwrite=overwrite, end_after=end_after) as complete:
+            return run(complete, progress, overwrite=overwrite, keep_work=keep_work)
     result = _run_one(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite)
     again = partial(run, progress=progress, overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work)
     return replace(result, others=tuple(run_others(plan, result.record, again, usual(progress))))

@@ -189,7 +189,7 @@ class SourceContribution(Contribution, kind="source", section="source"):
     # the problems of the sources with its ending.
     suffixes: tuple[str, ...] = ()
     # opens what is there of a capture that is still being written, or says that it comes from a pipe, for `photonpano run
-    # --follow`; None if this source cannot. It is called some fifty times a second. A file that is not there yet is no error,
+    # --follow`; None if this source cannot. It is called twice a second. A file that is not there yet is no error,
     # one that will never be a capture is an `InputError`.
     arrived: Callable[[Any], Arrived | Piped] | None = None
 

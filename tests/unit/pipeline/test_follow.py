@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,11 @@ def moving_frames(simulated: Callable[..., Path]) -> np.ndarray:
 
 
 @pytest.fixture
-def pipe_on_stdin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
-    """Let a thread write to what a run takes for standard input, and then close it."""
+def pipe_on_stdin() -> Iterator[Callable[..., None]]:
+    """Let a thread write to standard input, and then close it."""
     threads: list[threading.Thread] = []
-    reading, writing = os.pipe()
-    monkeypatch.setattr("photonpano.pipeline.following.follow._standard_input", lambda: reading)
+    before, (reading, writing) = os.dup(0), os.pipe()
+    os.dup2(reading, 0)
 
     def begin(data: bytes, pieces: int = 1, seconds: float = 0.0) -> None:
         def write() -> None:
@@ -48,6 +48,8 @@ def pipe_on_stdin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Non
 
     yield begin
     threads[0].join()
+    os.dup2(before, 0)
+    os.close(before)
     os.close(reading)
 
 
@@ -87,70 +89,45 @@ def write_slowly(path: Path, frames: np.ndarray, n_frames: int, seconds: float) 
     return thread
 
 
-@dataclass(frozen=True)
-class Grown:
-    """A run that followed a file, the run of the same file when it was complete, and pages on the way."""
-
-    followed: RunResult
-    complete: RunResult
-    states: list[str]
-
-
 @pytest.fixture(scope="module")
-def grown(moving_frames: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Grown:
+def grown(moving_frames: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, RunResult]:
+    """A run that followed a file, and the run of the same file when it was complete."""
     folder = tmp_path_factory.mktemp("grown")
-    document, states = spec("packed-npy", path=str(folder / "capture.npy")), []
-    patch = pytest.MonkeyPatch()
-    patch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
-    patch.setattr("photonpano.pipeline.following.follow._REFRESH_S", 0.05)
-
-    def render(figures: LiveFigures, *_: object) -> str:
-        states.append(figures.state)
-        return "<html></html>"
-
-    patch.setattr("photonpano.pipeline.following.picture.render_live", render)
-    writer = write_slowly(folder / "capture.npy", moving_frames, 300, 1.5)
-    try:
+    document = spec("packed-npy", path=str(folder / "capture.npy"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
+        writer = write_slowly(folder / "capture.npy", moving_frames, 300, 4.0)
         followed = follow(document, folder / "followed")
         writer.join()
-        return Grown(followed, run(parse_spec(document, output=folder / "complete")), states)
-    finally:
-        patch.undo()
+        return followed, run(parse_spec(document, output=folder / "complete"))
 
 
-def test_result_of_a_followed_capture_is_that_of_the_complete_one(grown: Grown) -> None:
+def test_result_of_a_followed_capture_is_that_of_the_complete_one(grown: tuple[RunResult, RunResult]) -> None:
+    followed, complete = grown
     for name in RESULTS:
-        assert (grown.followed.directory / name).read_bytes() == (grown.complete.directory / name).read_bytes(), name
+        assert (followed.directory / name).read_bytes() == (complete.directory / name).read_bytes(), name
 
 
-def test_frames_are_located_as_they_arrive(grown: Grown) -> None:
-    figures = grown.followed.followed
-    assert figures is not None
-    assert (figures.frames, figures.promised, figures.located, figures.message) == (300, 300, 300, "")
-    assert figures.delay_mean_s is not None
-    assert figures.delay_longest_s is not None
-    assert 0 < figures.delay_mean_s <= figures.delay_longest_s < 10
-    assert grown.complete.followed is None
-
-
-def test_page_shows_how_far_the_run_is(grown: Grown) -> None:
-    states = list(dict.fromkeys(grown.states))
-    assert states == ["waiting", "following", "finishing", "finished"]
-    folder = grown.followed.directory.with_name("followed.live")
-    assert {file.name for file in folder.iterdir()} == {"live.html", "live.png", "live.json"}
-    assert json.loads((folder / "live.json").read_text())["state"] == "finished"
-
-
-def test_picture_so_far_shows_the_panorama(grown: Grown) -> None:
-    picture = cv2.imread(str(grown.followed.directory.with_name("followed.live") / "live.png"), cv2.IMREAD_GRAYSCALE)
-    panorama = cv2.imread(str(grown.followed.directory / "panorama.png"), cv2.IMREAD_GRAYSCALE)
-    best = cv2.matchTemplate(panorama.astype(np.float32), picture[8:-8, 8:-8].astype(np.float32), cv2.TM_CCOEFF_NORMED).max()
-    assert best > 0.95
-    assert abs(picture.shape[1] - panorama.shape[1]) <= 3
+def test_page_shows_the_panorama_so_far_and_links_to_the_whole(grown: tuple[RunResult, RunResult]) -> None:
+    followed, _ = grown
+    folder = followed.directory.with_name("followed.live")
+    assert {each.name for each in folder.iterdir()} == {"live.html", "live.json", "so-far"}
+    figures = json.loads((folder / "live.json").read_text())
+    assert (figures["state"], figures["frames"], figures["promised"], figures["message"]) == ("finished", 300, 300, "")
+    assert 0 < figures["shown"] < 300
+    page = (folder / "live.html").read_text()
+    assert '<a href="../followed/report.html">' in page
+    assert 'http-equiv="refresh"' not in page
+    so_far, whole = (cv2.imread(str(each / "panorama.png"), 0) for each in (folder / "so-far", followed.directory))
+    assert so_far is not None
+    assert whole is not None
+    assert so_far.shape[1] < whole.shape[1]
+    best = cv2.matchTemplate(whole.astype(np.float32), so_far[8:-8, 8:-8].astype(np.float32), cv2.TM_CCOEFF_NORMED).max()
+    assert best > 0.8
 
 
 def test_frames_of_a_pipe_are_kept_and_give_the_same_result(
-    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], grown: Grown, tmp_path: Path
+    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], grown: tuple[RunResult, RunResult], tmp_path: Path
 ) -> None:
     pipe_on_stdin(moving_frames.tobytes(), 7, 0.3)  # pieces that end within frames
     result = follow(PIPED, tmp_path / "piped")
@@ -158,7 +135,7 @@ def test_frames_of_a_pipe_are_kept_and_give_the_same_result(
     assert kept.read_bytes() == moving_frames.tobytes()
     assert result.record["spec"]["source"]["with"]["path"] == str(kept)
     for name in RESULTS:
-        assert (result.directory / name).read_bytes() == (grown.complete.directory / name).read_bytes(), name
+        assert (result.directory / name).read_bytes() == (grown[1].directory / name).read_bytes(), name
     with pytest.raises(OutputError, match=r"frames\.raw holds the frames of an earlier capture: run them with source"):
         follow(PIPED, tmp_path / "piped")
     assert kept.stat().st_size == moving_frames.nbytes
@@ -183,7 +160,7 @@ def test_pipe_that_ends_within_a_frame(
     assert "stopped" in page
     assert 'http-equiv="refresh"' not in page
     assert sorted(each.name for each in tmp_path.iterdir()) == ["piped.live"]
-    assert threading.active_count() == len([each for each in threading.enumerate() if each.name not in ("spool", "arrivals")])
+    assert "spool" not in [each.name for each in threading.enumerate()]
 
 
 @pytest.mark.parametrize("data", [b"", b"not a frame"])
@@ -253,12 +230,13 @@ def test_source_that_fails_while_frames_arrive_is_named_and_ends_the_run(
 ) -> None:
     np.save(tmp_path / "a.npy", moving_frames)
     plan = parse_spec(spec("packed-npy", path=str(tmp_path / "a.npy")), output=tmp_path / "run")
-    main = threading.get_ident()
+    looks = iter([Arrived(None)] * (not at_first))
 
     def arrived(_: object) -> Arrived:
-        if at_first or threading.get_ident() != main:
-            raise ValueError("no luck")
-        return Arrived(None)
+        try:
+            return next(looks)
+        except StopIteration:
+            raise ValueError("no luck") from None
 
     contribution = plan.source.contribution
     assert isinstance(contribution, SourceContribution)
@@ -273,7 +251,7 @@ def test_array_without_frames_is_refused(tmp_path: Path) -> None:
         follow(spec("packed-npy", path=str(tmp_path / "a.npy")), tmp_path / "run", end_after=60)
 
 
-def test_spec_that_does_not_suit_the_frames_is_refused_while_they_arrive(
+def test_spec_that_does_not_suit_the_frames_is_refused(
     moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], tmp_path: Path
 ) -> None:
     pipe_on_stdin(moving_frames[:60].tobytes())
@@ -310,17 +288,19 @@ def test_run_that_begins_anew_resumes_nothing(tmp_path: Path) -> None:
         follow(PIPED, tmp_path / "run", resume=True)
 
 
-def test_frames_that_cannot_be_located_are_run_all_the_same(
-    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
+def test_frames_that_give_no_panorama_are_run_all_the_same(
+    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise InputError("no luck")
+    """The first frames are fewer than a group."""
+    pipe_on_stdin(moving_frames.tobytes(), 15, 6.0)
+    figures = []
 
-    monkeypatch.setattr("photonpano.pipeline.following.located.State", fail)
-    pipe_on_stdin(moving_frames.tobytes())
-    with caplog.at_level(logging.WARNING, "photonpano"):
-        result = follow(PIPED, tmp_path / "piped")
-    assert caplog.messages[0] == "frames are no longer located as they arrive: no luck"
-    assert result.followed is not None
-    assert (result.followed.frames, result.followed.located) == (300, 0)
-    assert result.record["status"] == "done"
+    def render(found: LiveFigures, *_: object) -> str:
+        figures.append(found)
+        return "<html></html>"
+
+    monkeypatch.setattr("photonpano.pipeline.follow.render_live", render)
+    result = follow(PIPED, tmp_path / "piped")
+    assert any(each.message.startswith("20 frames gave no panorama: ") for each in figures)
+    assert figures[-1].message == ""
+    assert result.record["source"]["n_frames"] == 300

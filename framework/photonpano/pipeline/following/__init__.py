@@ -1,1 +1,0 @@
-"""Follow a capture that is still being written: locate its frames as they arrive, and show the picture so far."""
