@@ -58,24 +58,13 @@ class RadianceExporter:
     """Writes flux as .hdr, with an error of 0.4 % of the brightest colour of a pixel at most; unseen pixels are black."""
 
     def export(self, panorama: FinishedPanorama, path: Path) -> None:
-        """Write the file: see `Exporter`."""
-        height, width = panorama.shape
-        with path.open("wb") as file:
-            file.write(f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode())
-            for start in range(0, height, _BLOCK_ROWS):
-                file.write(encoded(panorama.rows(start, min(start + _BLOCK_ROWS, height)).flux).tobytes())
+        """Write the file: see `Exporter`. The flux is held in memory."""
+        import cv2
 
-
-def encoded(flux: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return red, green, blue and exponent (Ward 1991), (h, w, 4), of flux, (h, w) or (h, w, 3); negative or unknown is 0."""
-    colours = np.maximum(np.nan_to_num(flux), 0)
-    colours = np.repeat(colours[..., None], 3, axis=-1) if colours.ndim == 2 else colours
-    brightest = colours.max(axis=-1)
-    # Rounding must not lift a mantissa to 256.
-    mantissa, exponent = np.frexp(brightest)
-    exponent = np.where(mantissa > 255.5 / 256, exponent + 1, exponent)
-    pixels = np.zeros((*brightest.shape, 4), np.uint8)
-    lit = (brightest > 0) & (exponent > -128)
-    pixels[lit, :3] = np.rint(np.ldexp(colours[lit], (8 - exponent[lit])[:, None])).astype(np.uint8)
-    pixels[lit, 3] = np.clip(exponent[lit] + 128, 1, 255)
-    return pixels
+        flux = np.maximum(np.nan_to_num(panorama.rows(0, panorama.shape[0]).flux), 0)
+        colours = np.repeat(flux[..., None], 3, axis=-1) if flux.ndim == 2 else flux[..., ::-1]
+        brightest = colours.max(axis=-1, keepdims=True)
+        # OpenCV cuts off what the 8 bits of a colour do not hold: half a step makes that rounding, which may lift the exponent.
+        exponent = np.frexp(brightest * np.float32(256 / 255.5))[1]
+        half_a_step = np.where(brightest > 0, np.ldexp(np.float32(0.5), exponent - 8), 0)
+        path.write_bytes(cv2.imencode(".hdr", colours + half_a_step)[1].tobytes())
