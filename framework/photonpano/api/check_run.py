@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from photonpano.api.command import command, require_trust, verdict_lines, warn
+from photonpano.api.command import command, require_trust, verdict_lines
 from photonpano.api.opened_run import opened_run
 from photonpano.capture import capture_of
 from photonpano.execution.context import Context, Progress, usual
@@ -25,17 +25,13 @@ class RunCheck:
 
     Attributes:
         verdict: whether motion and panorama explain the photons.
-        unknown: what could not be judged, a sentence each.
     """
 
     verdict: Verdict
-    unknown: tuple[str, ...]
 
 
 def _lines(found: RunCheck, *, strict: bool = False) -> Iterator[str]:
     yield from verdict_lines(found.verdict)
-    for sentence in found.unknown:
-        warn(sentence)
     ratio = found.verdict.residual_ratio
     yield f"scatter   {'unknown: too few frames' if ratio is None else f'{ratio:.2f} times what noise explains'}"
     if strict:
@@ -73,10 +69,8 @@ def check_run(
         fit = MotionFit(source, opened.motion, int(plan.run.memory), context)
         explained = fit.explained()
     verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
-    reasons, unknown = list(verdict.reasons), []
-    if not opened.has_std_px:
-        unknown.append("trajectory.npz has no std_px, as it is of an older version: the expected error is not judged")
+    reasons = list(verdict.reasons)
     recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
     reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NARROW)]
     judged = Verdict.of(reasons, verdict.residual_ratio, verdict.untested, verdict.notes)
-    return RunCheck(replace(judged, reduced_chi2=verdict.reduced_chi2), tuple(unknown))
+    return RunCheck(replace(judged, reduced_chi2=verdict.reduced_chi2))

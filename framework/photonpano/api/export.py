@@ -151,7 +151,7 @@ def _poses(folder: Path, every: int, frame_rate_hz: float | None, needs_seconds:
         camera, positions = run.camera, positions_of(run.camera_from_world)
         rotations = np.swapaxes(run.camera_from_world[:, :, :3], -1, -2)
     else:
-        run = load_run_trajectory(folder, needs_std_px=False)
+        run = load_run_trajectory(folder)
         if run.turn is None:
             raise InputError(
                 f"{folder} knows homographies, and no rotations of a camera; run its spec again with "

@@ -48,8 +48,7 @@ class OpenedRun:
     capture: Source  # with the corrections of the spec
     source: Source  # the same, divided by the vignette, in the light and through the lens that the run found
     vignette: Vignette | None
-    motion: FrameMotion  # of every frame; where the run did not record `std_px`, it is 0
-    has_std_px: bool
+    motion: FrameMotion  # of every frame
 
 
 @contextmanager
@@ -69,7 +68,7 @@ def opened_run(
         SpecError: a change is wrong.
     """
     require_one_run(folder, ["trajectory.npz", "light.npz", "layers.npz", "vignette.npz"])
-    run = load_run_trajectory(folder, needs_std_px=False)
+    run = load_run_trajectory(folder)
     record = read_record(folder)
     if moved is not None:
         changes = [*changes, capture_override(location(moved))]
@@ -87,7 +86,7 @@ def opened_run(
         lit = in_light_of(capture if vignette is None else divided_by(capture, vignette), folder)
         lit = before_background_of(lit, folder)
         source = through_lens(lit, model_of(plan)) if run.camera is None else seen_through(lit, run.camera)
-        yield OpenedRun(folder, record, plan, capture, source, vignette, _motion(run), not np.isnan(run.std_px).any())
+        yield OpenedRun(folder, record, plan, capture, source, vignette, _motion(run))
 
 
 @contextmanager
@@ -131,7 +130,7 @@ def load_panorama(run_folder: Path | str) -> Panorama:
     """
     folder = Path(run_folder)
     require_one_run(folder, ["trajectory.npz", "panorama.tiff", "coverage.tiff"])
-    canvas = load_run_trajectory(folder, needs_std_px=False).canvas
+    canvas = load_run_trajectory(folder).canvas
     return Panorama(*read_panorama(folder), canvas)
 
 
@@ -146,7 +145,7 @@ def load_trajectory(run_folder: Path | str) -> RunTrajectory:
     """
     folder = Path(run_folder)
     require_one_run(folder, ["trajectory.npz"])
-    return load_run_trajectory(folder, needs_std_px=False)
+    return load_run_trajectory(folder)
 
 
 def load_xarray(run_folder: Path | str) -> xarray.Dataset:
@@ -163,7 +162,7 @@ def load_xarray(run_folder: Path | str) -> xarray.Dataset:
     """
     module = library("xarray", "photonpano[xarray]", "load_xarray")
     folder = Path(run_folder)
-    panorama, motion = load_panorama(folder), load_run_trajectory(folder, needs_std_px=False)
+    panorama, motion = load_panorama(folder), load_run_trajectory(folder)
     (height, width), place, planar = panorama.flux.shape[:2], panorama.canvas, motion.projection == "planar"
     x, y = ((np.arange(side) - place[axis, 2]) / place[axis, axis] for axis, side in enumerate((width, height)))
     units = "px of the reference frame" if planar else "degrees"

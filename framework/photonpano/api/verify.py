@@ -59,11 +59,10 @@ def verify(run_folder: Path | str, catalog: Catalog | None = None) -> Verificati
     """
     folder = Path(run_folder)
     record = read_record(folder)
-    recorded, changed = recorded_contents(folder), changed_files(folder)
-    if recorded is None or changed is None:
-        return Verification(0, 0, ("run.json lists no hashes, as in older versions",), "not compared", folder)
-    problems = [f"{name} is missing" for name in recorded if not os.path.lexists(folder / name)]
-    problems += [f"{name} is not the file that the run wrote" for name in changed]
+    recorded = recorded_contents(folder)
+    problems = [] if recorded else ["run.json lists no files"]
+    problems += [f"{name} is missing" for name in recorded if not os.path.lexists(folder / name)]
+    problems += [f"{name} is not the file that the run wrote" for name in changed_files(folder)]
     others, capture = _capture(folder, record["spec"], record.get("capture"), catalog)
     size = sum(content["bytes"] for content in recorded.values())
     return Verification(len(recorded), size, (*problems, *others), capture, folder)

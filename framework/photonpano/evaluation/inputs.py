@@ -129,11 +129,8 @@ def load_truth(path: Path) -> Truth:
     )
 
 
-def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajectory:
-    """Read the trajectory of a run folder; `InputError` if the file is missing or damaged.
-
-    Runs of older versions lack the expected error: it is NaN then, unless it is needed.
-    """
+def load_run_trajectory(folder: Path) -> RunTrajectory:
+    """Read the trajectory of a run folder; `InputError` if the file is missing or damaged."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; give the run folder that `photonpano run` wrote")
     path = folder / "trajectory.npz"
@@ -143,13 +140,14 @@ def load_run_trajectory(folder: Path, *, needs_std_px: bool = True) -> RunTrajec
         )
     if not path.exists():
         raise InputError(f"{folder} has no trajectory.npz, so no run has finished in it; give the folder of a finished run")
-    required, error = ("homographies", "canvas", "frame_shape", "located"), ("std_px",)
-    of_camera = ("camera_matrix", "distortion", "horizon")
-    names = ((*required, *error), of_camera) if needs_std_px else (required, (*error, *of_camera))
-    arrays = read_numbers(path, "the trajectory of a run", *names)
+    required, of_camera = (
+        ("homographies", "canvas", "frame_shape", "located", "std_px"),
+        ("camera_matrix", "distortion", "horizon"),
+    )
+    arrays = read_numbers(path, "the trajectory of a run", required, of_camera)
     homographies = _homographies(path, arrays)
     canvas, located = arrays["canvas"], arrays["located"]
-    std_px = arrays.get("std_px", np.full(len(homographies), np.nan))
+    std_px = arrays["std_px"]
     if canvas.shape != (3, 3):
         raise InputError(f"{path}: canvas must have the shape (3, 3), got {canvas.shape}")
     if not np.isfinite(canvas).all() or not np.linalg.det(canvas):

@@ -26,12 +26,11 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
-from photonpano.record.contents import MAPS, RECORD, content_of, contents_of, names_of_results, recorded_json
+from photonpano.record.contents import MAPS, RECORD, REPORT, content_of, contents_of, names_of_results, recorded_json
 from photonpano.record.picture_files import png_of
 from photonpano.record.schema import RunRecord
 from photonpano.values import FluxImage, Panorama
 
-_REPORT = "report.html"
 SHOWN_FILES = 3  # files that a message names
 
 
@@ -86,13 +85,13 @@ class RunFolder:
 
     def add_report(self, page: str) -> None:
         """Write report.html beside the committed files; `update` lists it in run.json."""
-        self._put(_REPORT, page)
+        self._put(REPORT, page)
 
     def update(self, record: RunRecord) -> RunRecord:
         """Write run.json of the committed files again, with the report if there is one; return the record."""
-        report = self.directory / _REPORT
+        report = self.directory / REPORT
         if report.exists():
-            record = {**record, "files": {**record["files"], _REPORT: content_of(report)}}
+            record = {**record, "files": {**record["files"], REPORT: content_of(report)}}
         self._put(RECORD, _written(record))
         return record
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import stat
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
@@ -15,18 +14,9 @@ from photonpano.errors import InputError
 from photonpano.record.fingerprint import frames_sha256
 from photonpano.record.schema import FileContent
 
-logger = logging.getLogger(__name__)
-
 RECORD = "run.json"
 MAPS = ("panorama.tiff", "coverage.tiff", "panorama-std.tiff")  # flux, frames, and standard deviation of the flux of each pixel
-# The files of a run. Runs of older versions do not list theirs.
-RESULTS = frozenset(
-    {
-        *(*MAPS, "panorama.png", "trajectory.npz", "report.html"),
-        *("light.npz", "layers.npz", "vignette.npz"),
-        RECORD,
-    }
-)
+REPORT = "report.html"
 
 
 def contents_of(folder: Path) -> dict[str, FileContent]:
@@ -45,37 +35,30 @@ def recorded_json(folder: Path) -> Mapping[str, Any] | None:
     return record if isinstance(record, dict) and "photonpano" in record and isinstance(record.get("spec"), dict) else None
 
 
-def recorded_contents(folder: Path) -> Mapping[str, FileContent] | None:
-    """Return size and SHA-256 of each file as run.json lists them; None if it lists none, or files outside of the folder."""
+def recorded_contents(folder: Path) -> Mapping[str, FileContent]:
+    """Return size and SHA-256 of each file as run.json lists them; nothing if it lists none, or files outside of the folder."""
     listed = (recorded_json(folder) or {}).get("files")
     if not isinstance(listed, dict) or not all(isinstance(each, dict) for each in listed.values()):
-        return None
+        return {}
     outside = any(PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts for name in listed)
-    return None if outside else listed
+    return {} if outside else listed
 
 
 def names_of_results(folder: Path) -> set[str]:
     """Return the paths in a folder of the files that belong to its run."""
-    return {*RESULTS, *(recorded_contents(folder) or ())}
+    return {RECORD, REPORT, *recorded_contents(folder)}
 
 
-def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str] | None:
-    """Return which of the named files, by default all, differ from what run.json lists; None if it lists none."""
+def changed_files(folder: Path, names: Iterable[str] | None = None) -> list[str]:
+    """Return which of the named files, by default all, differ from what run.json lists."""
     recorded = recorded_contents(folder)
-    if recorded is None:
-        return None
     there = [name for name in (recorded if names is None else names) if name in recorded and (folder / name).exists()]
     return [name for name in there if _differs(folder / name, recorded[name])]
 
 
 def require_one_run(folder: Path, names: Iterable[str]) -> None:
-    """Raise `InputError` if files are not those of the run.json beside them; warn if it lists no hashes."""
-    if not folder.is_dir():
-        return
-    changed = changed_files(folder, names)
-    if changed is None:
-        logger.warning("%s: run.json lists no hashes, as in older versions, so the files may be of several runs", folder)
-    elif changed:
+    """Raise `InputError` if files are not those of the run.json beside them."""
+    if changed := changed_files(folder, names):
         was = "is not the file" if len(changed) == 1 else "are not the files"
         raise InputError(
             f"{folder}: {' and '.join(changed)} {was} that its run.json lists; the folder mixes several runs, or a file was "
@@ -84,7 +67,7 @@ def require_one_run(folder: Path, names: Iterable[str]) -> None:
 
 
 def require_same_frames(folder: Path, record: Mapping[str, Any], source: Source) -> None:
-    """Raise `InputError` if a capture has other frames than a run has read; older versions did not record them."""
+    """Raise `InputError` if a capture has other frames than a run has read."""
     recorded = record.get("capture")
     if isinstance(recorded, dict) and frames_sha256(source) != recorded.get("frames_sha256"):
         raise InputError(f"{folder}: the capture has other frames than when it was run; it is another capture")

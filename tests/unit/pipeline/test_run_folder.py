@@ -81,7 +81,8 @@ def files_in(directory: Path) -> dict[str, bytes]:
 def old_run(folder: Path) -> Path:
     """Write a run folder of an earlier run, and a note of its owner."""
     run_into(folder / "runs")
-    (folder / "runs" / "run.json").write_text(json.dumps(RECORD | {"seed": "old"}))
+    record = folder / "runs" / "run.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"seed": "old"}))
     (folder / "runs" / "notes").mkdir()
     (folder / "runs" / "notes" / "a.txt").write_text("a note")
     return folder / "runs"

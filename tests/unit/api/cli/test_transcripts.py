@@ -181,13 +181,6 @@ def full_disk(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Path, "write_bytes", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
 
 
-def aged(record: dict[str, Any]) -> None:
-    """Make a record one of an older version."""
-    del record["files"], record["capture"], record["verdict"], record["refinements"]
-    for level in record["levels"]:
-        del level["contradictions"]
-
-
 def hot() -> np.ndarray:
     rng = np.random.default_rng(0)
     frames = rng.random((600, 64, 64)) < 0.1
@@ -213,8 +206,8 @@ SET_UPS: dict[str, Callable[[World], object]] = {
     "trusted": lambda world: world.runs(TRUSTED, panorama=RANGE, decisions=[START, SIZE]),
     "doubtful": lambda world: world.runs(DOUBTFUL),
     "three-shots": lambda world: world.runs(DOUBTFUL, TRUSTED, DOUBTFUL),
-    "check-run-doubtful": lambda world: world.answer("check-run", RunCheck(DOUBTFUL, ("pairs are not judged",))),
-    "check-run-unknown": lambda world: world.answer("check-run", RunCheck(replace(DOUBTFUL, residual_ratio=None), ())),
+    "check-run-doubtful": lambda world: world.answer("check-run", RunCheck(DOUBTFUL)),
+    "check-run-unknown": lambda world: world.answer("check-run", RunCheck(replace(DOUBTFUL, residual_ratio=None))),
     "warm": lambda world: world.answer("warm-up", 31.4),
     "odd-catalog": lambda world: world.catalog(odd_catalog()),
     "grey": lambda world: world.catalog(with_grey()),
@@ -244,7 +237,6 @@ SET_UPS: dict[str, Callable[[World], object]] = {
     "no-capture": lambda _: Path("cube.npy").unlink(),
     "no-record": lambda _: Path("run/run.json").unlink(),
     "other-trajectory": lambda world: world.trajectory(std_px=np.zeros(200)),
-    "aged": lambda world: (world.record(aged), world.trajectory(std_px=None)),
     "no-hashes": lambda world: world.record(lambda record: record.pop("files")),
     "nothing-located": lambda world: (
         world.record(lambda record: record.pop("files")),
