@@ -7,17 +7,13 @@ import os
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from photonpano.api.cli.verbosity import STARTED_S, is_logged, is_quiet, is_verbose, log_shown, logger
 from photonpano.execution.context import Progress, Quiet
 from photonpano.text import columns, count, duration, share
-from photonpano.values import FloatArray
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -29,8 +25,7 @@ INTERVAL_S = 10.0  # time between two lines of progress
 _LEAST_S = 1.0  # minimum age of a stage that is printed
 _TOLD_FROM = 0.05  # share of a stage that is done before the time left is told
 _IN_NOTEBOOK = "JPY_PARENT_PID"  # set in notebooks, whose terminal prints control characters
-_READ = "rchar: "  # of the process so far, from files and caches, by the count of Linux
-START, OTHER, WHOLE = "start", "other", "whole"
+OTHER, WHOLE = "other", "whole"
 
 
 def progress_for_stderr(*, notes: bool = False) -> Progress:
@@ -105,18 +100,18 @@ class Lines:
 
 
 class Logged:
-    """Writes stages and notes to the log, and shows them; adds up what the stages cost."""
+    """Writes stages and notes to the log, and shows them; adds up what the stages take."""
 
     def __init__(self, shown: Progress) -> None:
         self._shown = shown
-        self._costs = StageCosts()
+        self._times = StageTimes()
 
     @contextmanager
     def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
         """Write when the stage begins, and when it is done."""
         state = _Stage(title, total, unit)
         log_shown(logging.INFO, f"{title}: begins")
-        with self._costs(title), self._shown.stage(title, total, unit) as advance:
+        with self._times(title), self._shown.stage(title, total, unit) as advance:
             yield advance
         log_shown(logging.INFO, state.finished())
 
@@ -125,9 +120,9 @@ class Logged:
         log_shown(logging.INFO, message)
         self._shown.note(message)
 
-    def log_costs(self) -> None:
-        """Log a table of what the stages cost so far."""
-        for line in self._costs.table().splitlines():
+    def log_times(self) -> None:
+        """Log a table of what the stages took so far."""
+        for line in self._times.table().splitlines():
             logger.info("%s", line)
 
 
@@ -181,48 +176,30 @@ def _bar(console: Console, unit: str) -> RichProgress:
     )
 
 
-class StageCosts:
-    """Adds up the costs of stages by their titles; the start is what comes before the first of them."""
+class StageTimes:
+    """Adds up the seconds of stages by their titles."""
 
     def __init__(self) -> None:
-        self._spent: dict[str, FloatArray] = {}
+        self._seconds: defaultdict[str, float] = defaultdict(float)
         self._times: Counter[str] = Counter()
 
     @contextmanager
     def __call__(self, title: str) -> Iterator[None]:
-        """Add the cost of the block to a stage."""
-        before = _spent()
-        self._spent.setdefault(START, before)
+        """Add the time of the block to a stage."""
+        start = time.perf_counter()
         try:
             yield
         finally:
-            self._spent[title] = self._spent.get(title, 0.0) + _spent() - before
+            self._seconds[title] += time.perf_counter() - start
             self._times[title] += 1
 
     def table(self) -> str:
         """Return a table of the stages; empty for a single one, whose line says all."""
         if len(self._times) < 2:
             return ""
-        whole = _spent()
-        other = whole - np.sum(list(self._spent.values()), axis=0)
-        rows = [["stage", "seconds", "CPU seconds", "GB read", "share"]]
-        for title, (seconds, cpu_s, read) in {**self._spent, OTHER: other, WHOLE: whole}.items():
+        whole = time.perf_counter() - STARTED_S
+        rows = [["stage", "seconds", "share"]]
+        for title, seconds in {**self._seconds, OTHER: whole - sum(self._seconds.values()), WHOLE: whole}.items():
             times = f" ({count(self._times[title])} times)" if self._times[title] > 1 else ""
-            gigabytes = "\N{EN DASH}" if np.isnan(read) else f"{read / 1e9:.2f}"
-            rows.append(
-                [f"{title}{times}", f"{seconds:7.2f}", f"{cpu_s:11.2f}", f"{gigabytes:>7}", f"{share(seconds / whole[0]):>5}"]
-            )
+            rows.append([f"{title}{times}", f"{seconds:7.2f}", f"{share(seconds / whole):>5}"])
         return columns(rows)
-
-
-def _spent() -> FloatArray:
-    """Return what the process has spent so far: seconds, CPU seconds, and bytes read, NaN where the system does not count."""
-    return np.array([time.perf_counter() - STARTED_S, time.process_time(), _bytes_read()])
-
-
-def _bytes_read() -> float:
-    try:
-        lines = Path("/proc/self/io").read_text(encoding="ascii").splitlines()
-    except OSError:  # not Linux, or not allowed
-        return np.nan
-    return next((float(line.removeprefix(_READ)) for line in lines if line.startswith(_READ)), np.nan)

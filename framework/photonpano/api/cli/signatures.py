@@ -70,7 +70,7 @@ def _callback(declared: Command) -> Callable[..., None]:
         for line in declared.prints(result, **{name: given[name] for name in printing}):
             typer.echo(line)
         if isinstance(progress := arguments.get("progress"), Logged):
-            progress.log_costs()
+            progress.log_times()
 
     parameters = [
         *(_parameter(name, *how) for name, how in PLANS[declared.plan].items()),
