@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 from urllib.parse import quote
 
@@ -71,12 +72,15 @@ def followed(
             yield plan
             page.write(state="finished")
         except BaseException as error:
+            rmtree(folder / f"{SO_FAR}.work", ignore_errors=True)  # of a run of the frames so far that was interrupted
+            n_frames = page.figures.frames
             if spool is not None:
                 spool.close()
+                n_frames = spool.n_frames()
                 if spool.path.exists():
                     logger.warning(f"the frames that arrived are in {spool.path}; {_way_on(plan)}")
             reason = str(error) if isinstance(error, PhotonpanoError) else described(error)
-            page.end("interrupted" if isinstance(error, KeyboardInterrupt) else reason)
+            page.end("interrupted" if isinstance(error, KeyboardInterrupt) else reason, n_frames)
             raise
 
 
@@ -212,10 +216,10 @@ class _Page:
                 logger.warning(f"the page of the run is not up to date: {error}")
             self._failed = True
 
-    def end(self, reason: str) -> None:
-        """Say why the run has stopped; without any frame, there is no page."""
-        if self.figures.frames:
-            self.write(state="stopped", message=reason)
+    def end(self, reason: str, n_frames: int) -> None:
+        """Say why the run has stopped after a number of frames; without any, there is no page."""
+        if n_frames:
+            self.write(state="stopped", frames=n_frames, message=reason)
         else:
             self._remove()
 
@@ -284,13 +288,13 @@ class Spool:
             size = self._file.seek(0, os.SEEK_END)
             self._rest = max(0, size - self._piped.header_bytes) % self._piped.frame_bytes
             self._file.truncate(size - self._rest)
-        if not self._n_frames():
+        if not self.n_frames():
             self.path.unlink()
 
     def require_whole(self) -> None:
         """Close a pipe that has ended; raise why it could not be copied, or that it ended before or within a frame."""
         self.close()
-        n_frames = self._n_frames()
+        n_frames = self.n_frames()
         kept = f"; the {n_frames:,} whole {'frame is' if n_frames == 1 else 'frames are'} in {self.path}" if n_frames else ""
         if self._failure is not None:
             raise OutputError(f"cannot copy standard input to {self.path}: {self._failure.strerror}{kept}; make room")
@@ -302,7 +306,8 @@ class Spool:
                 f"{self._rest:,} bytes more. Either the program that writes has died, or height and width are wrong{kept}"
             )
 
-    def _n_frames(self) -> int:
+    def n_frames(self) -> int:
+        """Return the number of whole frames in the file."""
         size = self.path.stat().st_size if self.path.exists() else 0
         return max(0, size - self._piped.header_bytes) // self._piped.frame_bytes
 
