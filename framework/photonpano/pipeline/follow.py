@@ -19,8 +19,8 @@ from shutil import rmtree
 from typing import Any
 from urllib.parse import quote
 
+from photonpano.contracts.attribution import attributing
 from photonpano.contracts.protocols import Arrived, Piped, Source
-from photonpano.contracts.rules import attributing
 from photonpano.errors import InputError, OutputError, PhotonpanoError, described
 from photonpano.execution.context import Progress
 from photonpano.files.atomic import atomic_path, locked
