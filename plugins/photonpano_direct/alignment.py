@@ -1,6 +1,7 @@
 """Align one layer of an exposure, the template, to that of another, and estimate how well.
 
-Inverse-compositional Gauss-Newton steps on homographies (Baker and Matthews 2004), with Levenberg-Marquardt damping.
+Inverse-compositional Gauss-Newton steps on homographies (Baker and Matthews 2004), with Levenberg-Marquardt damping. One more
+step for each patch of the aligned template says where the patch lies, beyond the homography.
 """
 
 from __future__ import annotations
@@ -13,21 +14,38 @@ import numpy as np
 
 from photonpano import FloatArray, Homography, NotLocated, Patches
 from photonpano.compiling import compiled
-from photonpano.geometry import corners, generators, slopes, unit_coordinates, violation, why_implausible
+from photonpano.geometry import (
+    PATCHES,
+    corners,
+    generators,
+    patch_centres,
+    slopes,
+    transform_points,
+    unit_coordinates,
+    violation,
+    why_implausible,
+)
 from photonpano.locating import NO_TEXTURE, information_on_turn
-from photonpano_direct.curvature import (
+from photonpano_direct.normal_equations import (
     MOMENTS_X,
     MOMENTS_Y,
     PRIOR,
+    Buffers,
     Coordinates,
+    Layer,
+    applied,
     chance_level,
     curvatures,
+    dot,
     expected_px,
     information_of,
+    inverse_homography,
+    product,
+    residuals_and_moments,
+    scaled_to_one,
+    solve,
+    transposed,
 )
-from photonpano_direct.moments import Buffers, Layer, residuals_and_moments
-from photonpano_direct.patches import patches_of, sums_of_patches
-from photonpano_direct.small_matrices import applied, dot, inverse_homography, product, scaled_to_one, solve, transposed
 
 # Exit status: no texture is flat, an impossible homography diverges.
 _CONVERGED, _FLAT, _MAX_STEPS, _DIVERGED = 0, 1, 2, 3
@@ -74,7 +92,7 @@ class Aligned:
         # A Gaussian blur of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
         noise_ratio = self.squares / self.pixels * 4 * np.pi * self.template.blur_px**2
         shape = (self.template.image.shape[0], self.template.image.shape[1])
-        sums = sums_of_patches(self.template, self.buffers)
+        sums = _sums_of_patches(self.template, self.buffers)
         information, std_px, common = information_of(
             self.template,
             self.buffers,
@@ -84,7 +102,7 @@ class Aligned:
             noise_ratio,
             _coordinates(shape),
         )
-        patches = patches_of(sums, self.homography, shape, common, noise_ratio) if np.isfinite(std_px) else None
+        patches = _patches_of(sums, self.homography, shape, common, noise_ratio) if np.isfinite(std_px) else None
         if camera_matrix is not None and np.isfinite(std_px):
             information, std_px = information_on_turn(information, self.homography, camera_matrix, shape)
         return Quality(information=information, noise_ratio=noise_ratio, overlap=self.overlap, std_px=std_px, patches=patches)
@@ -106,7 +124,7 @@ def align(
     """
     shape = (template.image.shape[0], template.image.shape[1])
     buffers = buffers_of(template)
-    status, homography, pixels, squares, weights = descend(
+    status, homography, pixels, squares, weights = _descend(
         template,
         fixed,
         homography,
@@ -146,7 +164,7 @@ def buffers_of(layer: Layer) -> Buffers:
 
 
 @compiled
-def descend(
+def _descend(
     moving: Layer,
     fixed: Layer,
     homography: Homography,
@@ -262,3 +280,85 @@ def _corner_px(step: Homography, height: int, width: int) -> float:
             if not distance <= largest:
                 largest = distance
     return largest
+
+
+_LEAST_SEEN = 0.5  # share of a patch that both images must see
+_TEXTURE = 0.02  # least curvature along a direction, relative to the patch's, that counts as texture
+_LARGEST_PX = 2.0  # step, in px of the layer, beyond which the image is not linear in it
+_SUMS = 9
+
+
+def _sums_of_patches(template: Layer, buffers: Buffers) -> FloatArray:
+    """Return the (P, 9) sums of `_add_up` over the patches of a template; residual and weight are those of its last step."""
+    sums = np.zeros((PATCHES, PATCHES, _SUMS))
+    _add_up(template, buffers, sums)
+    return sums.reshape(-1, _SUMS)
+
+
+def _patches_of(sums: FloatArray, homography: Homography, shape: tuple[int, int], common: float, noise_ratio: float) -> Patches:
+    """Return where the patches of an aligned template lie, in pixels of its layer.
+
+    Args:
+        sums: (P, 9) those of `_sums_of_patches`.
+        homography: (3, 3) from the template to the other layer.
+        shape: (height, width) of the layer.
+        common: share of the curvature of the template that the scene has, not its noise.
+        noise_ratio: mean squared residual relative to that of photon noise.
+    """
+    own, scatter = (sums[:, [xx, xx + 1, xx + 1, xx + 2]].reshape(-1, 2, 2) for xx in (0, 5))
+    # Noise has the same curvature along all directions, and in all patches alike.
+    seen, traces = sums[:, 8], np.trace(own, axis1=1, axis2=2)
+    noise = (1 - common) * traces.sum() / max(seen.sum(), 1) * seen / 2
+    values, vectors = np.linalg.eigh(own - noise[:, None, None] * np.eye(2))
+    values = np.maximum(values, _TEXTURE * np.maximum(traces, 1e-9)[:, None])
+    hessian = vectors @ (values[..., None] * np.swapaxes(vectors, -1, -2))
+    steps = np.linalg.solve(hessian, sums[:, 3:5, None])[..., 0]
+    # As for the whole template, the blur correlates the noise of neighbours: the step scatters by H^-1 M H^-1.
+    information = hessian @ np.linalg.pinv(scatter, hermitian=True) @ hessian / max(1.0, noise_ratio)
+    usable = (seen >= _LEAST_SEEN * shape[0] * shape[1] / len(sums)) & (np.linalg.norm(steps, axis=1) < _LARGEST_PX)
+
+    # A patch that is seen at x + step of the template is where the homography maps x; so its middle lies a step before.
+    middles = patch_centres(shape)
+    there = transform_points(homography, middles)
+    shifts = transform_points(homography, middles - steps) - there
+    depth = middles @ homography[2, :2] + homography[2, 2]
+    to_template = np.linalg.inv((homography[:2, :2] - there[..., None] * homography[2, :2]) / depth[:, None, None])
+    information = np.swapaxes(to_template, -1, -2) @ information @ to_template
+    kept = usable[:, None]
+    return Patches(np.where(kept, shifts, 0.0), np.where(kept[..., None], information, 0.0))
+
+
+@compiled
+def _add_up(template: Layer, buffers: Buffers, sums: FloatArray) -> None:
+    """Add up (rows, columns, 9) sums over the pixels of each patch, with the gradient g, residual r and weight w of a pixel.
+
+    They are w times the products xx, xy, yy of g; w r g; w^2 times the products of the smoothed g, relative to the mean weight;
+    and the number of pixels that both images see.
+    """
+    height, width = template.image.shape
+    rows, columns, _ = sums.shape
+    total, count = 0.0, 0
+    for y in range(height):
+        row = y * rows // height
+        residual, weight = buffers.residual[y], buffers.weight[y]
+        gx, gy, sx, sy = template.gradients[0][y], template.gradients[1][y], template.smoothed[0][y], template.smoothed[1][y]
+        for column in range(columns):
+            part = sums[row, column]
+            first, last = -(-column * width // columns), -(-(column + 1) * width // columns)
+            for x in range(first, last):
+                w = weight[x]
+                if w > 0:
+                    wx, wy = w * gx[x], w * gy[x]
+                    part[0] += wx * gx[x]
+                    part[1] += wx * gy[x]
+                    part[2] += wy * gy[x]
+                    part[3] += wx * residual[x]
+                    part[4] += wy * residual[x]
+                    w2 = w * w
+                    part[5] += w2 * sx[x] * sx[x]
+                    part[6] += w2 * sx[x] * sy[x]
+                    part[7] += w2 * sy[x] * sy[x]
+                    part[8] += 1
+                    total += w
+                    count += 1
+    sums[:, :, 5:8] *= count / max(total, 1e-20)

@@ -20,9 +20,8 @@ from photonpano.locating import (
 )
 from photonpano.photometry import Similarity, hann_window
 from photonpano_direct.alignment import Aligned, Quality, align
-from photonpano_direct.configs import DirectConfig
-from photonpano_direct.majority import JUDGED, masked, part_following, shifts_between
-from photonpano_direct.pyramid import Pyramid, pyramid_of, similarity_under
+from photonpano_direct.hooks import DirectConfig
+from photonpano_direct.pyramid import JUDGED, Pyramid, masked, part_following, pyramid_of, shifts_between, similarity_under
 
 _EXACT_PX = 0.1  # expected corner error below which coarser layers are not considered
 _COARSE_TOLERANCE = 12  # tolerance of coarser layers, which initialise the finest, relative to `converged_px`
