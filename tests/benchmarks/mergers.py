@@ -39,7 +39,7 @@ from photonpano_core.configs import LocalFlowConfig, PhotonMleConfig
 from photonpano_core.mergers.local_flow import LocalFlowMerger
 from photonpano_core.mergers.photon_mle import PhotonMleMerger
 from photonpano_core.mergers.splat import SplatMerger
-from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
+from photonpano_core.sources import PACKED_NPY, PackedNpyConfig
 from photonpano_simulator.config import SimulatorConfig, StreetScene
 from photonpano_simulator.scenes import scene_flux
 from photonpano_simulator.source import SimulatorSource

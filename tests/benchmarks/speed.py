@@ -46,7 +46,7 @@ from photonpano.values import FloatArray
 from photonpano_core.configs import MidpointConfig, PhotonMleConfig
 from photonpano_core.mergers.photon_mle import PhotonMleMerger
 from photonpano_core.resamplers import MidpointResampler
-from photonpano_core.sources.npy import PACKED_NPY, PackedNpyConfig
+from photonpano_core.sources import PACKED_NPY, PackedNpyConfig
 
 SHAPE = (254, 496)
 PX_A_FRAME = 0.02

@@ -12,11 +12,9 @@ from photonpano import BoolArray, FrameSpan, Group, Source, Trajectory, VirtualE
 from photonpano.geometry import inverse
 from photonpano.merging import PhotonSum, accumulate, chunks_of, clipped
 from photonpano_core.configs import LocalFlowConfig
-from photonpano_core.mergers.dense_motion.flow import estimate_field
-from photonpano_core.mergers.dense_motion.frames import WeightedFrames, rescaled, sharpened
-from photonpano_core.mergers.dense_motion.ghosts import GhostMap, compared, weighted
-from photonpano_core.mergers.dense_motion.sub_exposures import SCALE, SubExposures
-from photonpano_core.mergers.dense_motion.warping import Frames, Moved, Sums, add_along
+from photonpano_core.mergers.dense_motion.fields import Frames, Moved, Sums, add_along
+from photonpano_core.mergers.dense_motion.moving import GhostMap, compared, estimate_field, weighted
+from photonpano_core.mergers.dense_motion.sub_exposures import SCALE, SubExposures, WeightedFrames, rescaled, sharpened
 from photonpano_core.mergers.photon_mle import exposure_of, exposure_shape, require_plain, to_exposure, unwarped_sum
 
 # Numbers of sub-exposures that are tried for a group, with the photons per pixel that each must have.

@@ -12,9 +12,8 @@ from photonpano import FrameSpan, Group, Source, Trajectory, VirtualExposure
 from photonpano.photometry import flux_std
 from photonpano.testing import MemorySource
 from photonpano_core.configs import LocalFlowConfig, PhotonMleConfig
-from photonpano_core.mergers.dense_motion.field import MotionField, fit_each
-from photonpano_core.mergers.dense_motion.frames import blurred
-from photonpano_core.mergers.dense_motion.sub_exposures import noise_area_px2
+from photonpano_core.mergers.dense_motion.fields import MotionField, fit_each
+from photonpano_core.mergers.dense_motion.sub_exposures import blurred, noise_area_px2
 from photonpano_core.mergers.local_flow import LocalFlowMerger, number_of
 from photonpano_core.mergers.photon_mle import PhotonMleMerger
 

@@ -15,8 +15,7 @@ from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, OutputError, PackedSource, Piped, Source, SourceContext
 from photonpano.photometry import BinarySumResponse
-from photonpano_core.sources.npy import NPY, PACKED_NPY, NpyConfig, PackedNpyConfig
-from photonpano_core.sources.packed_raw import PACKED_RAW, PackedRawConfig
+from photonpano_core.sources import NPY, PACKED_NPY, PACKED_RAW, NpyConfig, PackedNpyConfig, PackedRawConfig
 
 
 def cube(n: int = 40, height: int = 6, width: int = 24, seed: int = 0) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from photonpano_core.interpolators.sl3 import exponential, logarithm, unimodular
+from photonpano_core.interpolators import exponential, logarithm, unimodular
 
 # Typical sizes of the entries of a matrix that maps pixels of an image of 300 px.
 PIXELS = np.array([[1, 1, 300], [1, 1, 300], [1 / 300, 1 / 300, 1]])

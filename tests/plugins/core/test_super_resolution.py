@@ -18,7 +18,7 @@ from photonpano.merging import Chunk, MergeRenderer, PhotonSum
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import SuperResolutionConfig
-from photonpano_core.mergers.dense_motion.frames import count_variance, sharpened
+from photonpano_core.mergers.dense_motion.sub_exposures import count_variance, sharpened
 from photonpano_core.super_resolution.collaborative import Patches, filter_groups, find_similar
 from photonpano_core.super_resolution.estimate import Observations, counts_in_light, expected, pixel_area, rounds_of
 from photonpano_core.super_resolution.renderer import SuperResolutionRenderer

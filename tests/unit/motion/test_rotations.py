@@ -35,8 +35,7 @@ from photonpano.motion.rotations import RotationTrajectory, fit_rotations
 from photonpano.motion.timeline import Timeline
 from photonpano.values import Edge, FloatArray, Located, NotLocated, Patches
 from photonpano_core.configs import InterpolatorConfig
-from photonpano_core.interpolators.interpolating import GeodesicInterpolator, LucasKanadeInterpolator
-from photonpano_core.interpolators.smoothing_spline import SmoothingSplineInterpolator
+from photonpano_core.interpolators import GeodesicInterpolator, LucasKanadeInterpolator, SmoothingSplineInterpolator
 
 from .measured_graphs import NOISE_PX, edge, groups_of, noise_of
 

@@ -10,8 +10,7 @@ from scipy.sparse.linalg import splu
 from photonpano import FloatArray, LocationError
 from photonpano.geometry import corners, inverse, normalised, transform_points
 from photonpano_core.configs import InterpolatorConfig
-from photonpano_core.interpolators.interpolating import HeldTrajectory, group_steps, interpolating_spline
-from photonpano_core.interpolators.sl3 import exponential, logarithm, unimodular
+from photonpano_core.interpolators import HeldTrajectory, exponential, group_steps, interpolating_spline, logarithm, unimodular
 
 DEGREE = 3
 MAX_ITERATIONS = 50

@@ -1,9 +1,13 @@
-"""Sources `packed-npy` and `npy`: frames in a .npy file, with eight pixels or with one pixel to a value."""
+"""Sources `packed-npy`, `npy` and `packed-raw`: frames in a .npy file or in one without a header.
+
+A value of `packed-npy` and `packed-raw` holds eight pixels, one of `npy` holds one: a bit, or a sum of bits.
+"""
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from functools import partial
 from typing import Any, Literal, Self, TypeAlias
 
@@ -11,15 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from photonpano import Arrived, Config, InputError, Location, Recognised, SourceContribution, SpecLocation, Url
-from photonpano.photometry import packed_along_width, reversed_bits
+from photonpano import (
+    Arrived,
+    Config,
+    FrameSpan,
+    InputError,
+    Location,
+    Piped,
+    Recognised,
+    SourceContribution,
+    SpecLocation,
+    StreamInfo,
+    Url,
+)
+from photonpano.photometry import BinarySumResponse, packed_along_width, reversed_bits
 from photonpano.reading import (
+    BinarySource,
+    BlockSource,
     Content,
     FrameFile,
     FrameLayout,
     NpyHeader,
     PackedFileSource,
     PixelOrder,
+    StoredFrames,
     ThreeChannels,
     any_npy_header,
     arrived_frames,
@@ -34,10 +53,107 @@ from photonpano.reading import (
     require_frames,
     require_whole,
     sampled_frames,
+    size_of,
     unpacked,
     unpacked_content,
 )
-from photonpano_core.sources.npy_values import NpyBits, NpySums, Values
+
+_BLOCK_BYTES = 4 * 1024**2  # read at once of frames along the last axis, which are scattered over the file
+_NO_BIT = "bits are 0 and 1, or 0 and 255; write holds: sums for sums, or use packed-npy for bytes of eight pixels"
+
+
+class _Values:
+    """Reads the values of frames in a .npy file, from any thread."""
+
+    def __init__(self, path: Location, header: NpyHeader, frames_last: bool) -> None:
+        """Take an array whose first or last axis is that of frames; raises an `InputError` if it is the last at a URL.
+
+        If the frames are first, there may be a fourth axis, of channels.
+        """
+        n_frames, height, width, *_ = header.shape[-1:] + header.shape[:-1] if frames_last else header.shape
+        self.path, self.shape, self._dtype = path, (n_frames, height, width), header.dtype
+        self._stored: StoredFrames | None = None
+        if not frames_last:
+            stored_shape = *header.shape[1:-1], header.shape[-1] * header.dtype.itemsize
+            self._stored = StoredFrames([FrameFile(path, n_frames, header.offset)], stored_shape)
+        elif isinstance(path, Url):
+            raise InputError(f"{path} has its frames along the last axis, scattered over the file; download it, and convert it")
+        else:
+            self._scattered = np.memmap(path, header.dtype, "r", header.offset, header.shape)
+
+    def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield some frames of a span at a time, (n, H, W) or (n, H, W, 3), and their place in it.
+
+        The next step may overwrite them.
+        """
+        if self._stored is not None:
+            yield from ((place, stored.view(self._dtype)) for place, stored in self._stored.blocks(span))
+            return
+        frame_bytes = self.shape[1] * self.shape[2] * self._dtype.itemsize
+        for block in span.blocks(max(1, _BLOCK_BYTES // frame_bytes)):
+            values = np.moveaxis(self._scattered[..., block.start : block.stop], -1, 0)
+            yield slice(block.start - span.start, block.stop - span.start), np.ascontiguousarray(values)
+
+    def require(self, wrong: NDArray[np.bool_], values: NDArray[Any], first: int, remedy: str) -> None:
+        """Raise for the first of the values, of frames from `first` on, that is wrong."""
+        if wrong.any():
+            frame, row, column, *_ = np.argwhere(wrong)[0].tolist()
+            raise InputError(
+                f"{self.path} holds the value {values[wrong][0]} in frame {first + frame}, row {row}, column {column}; {remedy}"
+            )
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._stored is not None:
+            self._stored.close()
+
+
+class _NpyBits(BinarySource):
+    """Binary frames, a pixel to a value; reading them raises an `InputError` for a value that is not a bit."""
+
+    def __init__(self, values: _Values, frame_rate_hz: float | None, channel: int | None = None) -> None:
+        """Take values, and the channel of those with channels, or None for what is lit in any."""
+        n_frames, height, width = values.shape
+        super().__init__(n_frames, FrameLayout((height, width), (height, -(-width // 8))), frame_rate_hz)
+        self._values, self._channel = values, channel
+
+    def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Yield the frames of a span, packed: see `BinarySource`."""
+        for place, values in self._values.blocks(span):
+            if values.max() > 1 or values.min() < 0:
+                wrong = (values != 0) & (values != 1) & (values != 255)
+                self._values.require(wrong, values, span.start + place.start, _NO_BIT)
+            lit = values != 0
+            yield place, np.packbits(of_channel(lit, self._channel) if lit.ndim == 4 else lit, axis=2)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._values.close()
+
+
+class _NpySums(BlockSource):
+    """Sums of binary frames: a `photonpano.Source`; reading one with a value that is too large raises an `InputError`."""
+
+    def __init__(self, values: _Values, binary_frames: int, frame_rate_hz: float | None) -> None:
+        self.info = StreamInfo(*values.shape, frame_rate_hz, "intensity", binary_frames.bit_length())
+        self.response = BinarySumResponse(binary_frames)
+        self.valid = np.ones(self.info.frame_shape, np.bool_)
+        self.valid.flags.writeable = False
+        self._values = values
+
+    def blocks(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[Any]]]:
+        """Yield the frames of a span, a few at a time: see `BlockSource`."""
+        most = self.response.n
+        for place, values in self._values.blocks(span):
+            if values.max() > most or values.min() < 0:
+                remedy = f"sums of frames_per_sum: {most} go from 0 to {most}; correct frames_per_sum"
+                self._values.require((values < 0) | (values > most), values, span.start + place.start, remedy)
+            yield place, values
+
+    def close(self) -> None:
+        """Close the file."""
+        self._values.close()
+
 
 _CHECKED = 16  # frames whose values are checked before a run
 _PLAIN = re.compile(r"[\w./~+-]+")  # paths that YAML takes without quotes
@@ -111,17 +227,17 @@ class NpyConfig(Config):
         return self
 
 
-AnyConfig: TypeAlias = PackedNpyConfig | NpyConfig
-AnySource: TypeAlias = PackedFileSource | NpyBits | NpySums | ThreeChannels
+_AnyConfig: TypeAlias = PackedNpyConfig | NpyConfig
+_AnySource: TypeAlias = PackedFileSource | _NpyBits | _NpySums | ThreeChannels
 
 
-def _open(config: AnyConfig) -> AnySource:
+def _open_npy(config: _AnyConfig) -> _AnySource:
     """Open a capture; raises an `InputError`, or an `OutputError` where a compressed file cannot be unpacked."""
     header = _whole_header(config)
-    return _source(config, unpacked(config.path) if is_gzip(config.path) else config.path, header)
+    return _npy_source(config, unpacked(config.path) if is_gzip(config.path) else config.path, header)
 
 
-def _arrived(config: AnyConfig) -> Arrived:
+def _arrived_npy(config: _AnyConfig) -> Arrived:
     """Open the frames that are there of a file that is still being written."""
     if (n_frames := arrived_frames(config.path)) is None:
         return Arrived(None)
@@ -130,16 +246,16 @@ def _arrived(config: AnyConfig) -> Arrived:
     header = _header(config)
     promised, *frame_shape = header.shape
     arrived = header._replace(shape=(n_frames, *frame_shape))
-    return Arrived(_source(config, config.path, arrived) if n_frames else None, promised)
+    return Arrived(_npy_source(config, config.path, arrived) if n_frames else None, promised)
 
 
-def _source(config: AnyConfig, path: Location, header: NpyHeader) -> AnySource:
+def _npy_source(config: _AnyConfig, path: Location, header: NpyHeader) -> _AnySource:
     if isinstance(config, NpyConfig) and config.frames_per_sum is not None:
-        return NpySums(Values(path, header, config.frame_axis == "last"), config.frames_per_sum, config.frame_rate_hz)
+        return _NpySums(_Values(path, header, config.frame_axis == "last"), config.frames_per_sum, config.frame_rate_hz)
 
-    def opened(channel: int | None) -> PackedFileSource | NpyBits:
+    def opened(channel: int | None) -> PackedFileSource | _NpyBits:
         if isinstance(config, NpyConfig):
-            return NpyBits(Values(path, header, config.frame_axis == "last"), config.frame_rate_hz, channel)
+            return _NpyBits(_Values(path, header, config.frame_axis == "last"), config.frame_rate_hz, channel)
         file = FrameFile(path, header.shape[0], header.offset)
         return PackedFileSource([file], _layout(config, header, channel), config.frame_rate_hz)
 
@@ -147,7 +263,7 @@ def _source(config: AnyConfig, path: Location, header: NpyHeader) -> AnySource:
     return ThreeChannels(opened) if has_channels(path, header) and channel is None else opened(channel)
 
 
-def _whole_header(config: AnyConfig) -> NpyHeader:
+def _whole_header(config: _AnyConfig) -> NpyHeader:
     """Return the header of a capture, of which nothing is missing and whose frames lie along the axis of the config."""
     path, header = config.path, _header(config)
     if not is_gzip(path):
@@ -160,7 +276,7 @@ def _whole_header(config: AnyConfig) -> NpyHeader:
     return header
 
 
-def _header(config: AnyConfig) -> NpyHeader:
+def _header(config: _AnyConfig) -> NpyHeader:
     """Return the header of the capture, which may be incomplete; raise if it does not agree with the config."""
     path = config.path
     header = any_npy_header(path)
@@ -326,7 +442,7 @@ def _require_values(config: NpyConfig) -> None:
     if is_gzip(config.path):
         _whole_header(config)
         return
-    with _open(config) as source:
+    with _open_npy(config) as source:
         for span in source.info.spread(_CHECKED, 1):
             source.frames(span)
 
@@ -379,10 +495,10 @@ def _recognise_bits(path: Location) -> Recognised | None:
 
 _contribution = partial(
     SourceContribution,
-    build=lambda config, _: _open(config),
+    build=lambda config, _: _open_npy(config),
     recognises_urls=True,
     suffixes=(".npy", ".gz"),
-    arrived=_arrived,
+    arrived=_arrived_npy,
 )
 PACKED_NPY = _contribution(
     name="packed-npy",
@@ -397,4 +513,77 @@ NPY = _contribution(
     config=NpyConfig,
     check=lambda config: objections(_require_values, config),
     recognise=_recognise_bits,
+)
+
+
+_STANDARD_INPUT = "-"
+
+
+class PackedRawConfig(Config):
+    """Frames one after the other: packed rows from top to bottom, and nothing between frames."""
+
+    path: Literal["-"] | SpecLocation = Field(
+        description="the file, or its URL; or -, standard input, for `photonpano run --follow`"
+    )
+    height: int = Field(ge=1, le=65535, description="rows of a frame, in px")
+    width: int = Field(ge=1, le=65535, description="columns of a frame, in px; a row takes ceil(width / 8) bytes")
+    bit_order: Literal["big", "little"] = Field(
+        "big", description="big if the first of eight pixels is the highest bit of its byte, little if it is the lowest"
+    )
+    header_bytes: int = Field(0, ge=0, description="bytes before the first frame, which are ignored")
+    frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
+
+    @property
+    def layout(self) -> FrameLayout:
+        """The order of the pixels of a frame in its bytes."""
+        return FrameLayout((self.height, self.width), (self.height, -(-self.width // 8)), self.bit_order)
+
+
+def _open_raw(config: PackedRawConfig) -> PackedFileSource:
+    """Open a capture; raises an `InputError` if it is missing, has no frame, ends within one, or is standard input."""
+    path, frame_bytes = _raw_file(config), config.layout.stored_bytes
+    size = size_of(path)
+    n_frames, rest = divmod(size - config.header_bytes, frame_bytes)
+    if n_frames < 1:
+        raise InputError(
+            f"{path} has {size:,} bytes, and a frame of {config.height}x{config.width} px takes {frame_bytes:,}"
+            f"{f' after {config.header_bytes:,} bytes' if config.header_bytes else ''}; correct height and width"
+        )
+    if rest:
+        raise InputError(
+            f"{path} ends within a frame: after {n_frames:,} frames of {frame_bytes:,} bytes come {rest:,} bytes more; correct "
+            f"height and width, or cut off the rest with `truncate -s {size - rest} {path}`"
+        )
+    return _raw_source(config, path, n_frames)
+
+
+def _arrived_raw(config: PackedRawConfig) -> Arrived | Piped:
+    """Open the frames that are there of a file that is still being written, or describe the pipe that they come from."""
+    frame_bytes = config.layout.stored_bytes
+    if config.path == _STANDARD_INPUT:
+        return Piped(config.header_bytes, frame_bytes)
+    path = _raw_file(config)
+    if isinstance(path, Url):
+        raise InputError(f"{path} is a URL, which cannot be followed: follow a file, or a pipe")
+    n_frames = (size_of(path) - config.header_bytes) // frame_bytes if path.exists() else 0
+    return Arrived(_raw_source(config, path, n_frames) if n_frames > 0 else None)
+
+
+def _raw_file(config: PackedRawConfig) -> Location:
+    if isinstance(config.path, str):
+        raise InputError("frames on standard input are read once, as they arrive: run with --follow, or name a file")
+    return config.path
+
+
+def _raw_source(config: PackedRawConfig, path: Location, n_frames: int) -> PackedFileSource:
+    return PackedFileSource([FrameFile(path, n_frames, config.header_bytes)], config.layout, config.frame_rate_hz)
+
+
+PACKED_RAW = SourceContribution(
+    name="packed-raw",
+    summary="Binary frames in a file without any description, or on standard input, eight pixels to a byte",
+    config=PackedRawConfig,
+    build=lambda config, _: _open_raw(config),
+    check=lambda config: () if config.path == _STANDARD_INPUT else objections(_open_raw, config),
+    arrived=_arrived_raw,
 )

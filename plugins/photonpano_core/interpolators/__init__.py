@@ -1,1 +1,0 @@
-"""Interpolators, and the trajectories that they fit."""

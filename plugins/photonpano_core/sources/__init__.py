@@ -1,1 +1,0 @@
-"""Sources of frames in .npy files, and in files without any description."""
