@@ -1,21 +1,97 @@
-"""Source `mat-parts`: binary frames in a folder of MATLAB files, part_1.mat, part_2.mat, and so on."""
+"""Source `mat-parts`: binary frames in a folder of MATLAB files, part_1.mat, part_2.mat, and so on.
+
+A file of MATLAB 7.3 is HDF5; the older ones are read by scipy.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
-from photonpano.reading import BinarySource, FrameLayout, objections, read_json, require_readable
-from photonpano_sensors.matlab import packed_frames, shape_of_frames
+from photonpano.reading import BinarySource, FrameLayout, objections, read_json, read_start, reading, require_readable
+
+_VARIABLE = "OUTPUT"
+_BLOCK_FRAMES = 64  # frames that are packed at once
+_DAMAGED = "cannot be read as a MATLAB file: it is damaged or something else; copy it again"
+
+
+def _shape_of_frames(path: Path) -> tuple[int, int, int]:
+    """Return (frames, height, width) from the headers of a file; raises an `InputError` if it has no frames in OUTPUT."""
+    with reading(path, _DAMAGED):
+        if _is_hdf(path):
+            with _hdf_values(path) as values:
+                shape = values.shape[::-1]  # HDF5 has the dimensions of MATLAB in reverse order
+        else:
+            from scipy.io import whosmat
+
+            shapes = {name: shape for name, shape, _ in whosmat(str(path))}
+            if _VARIABLE not in shapes:
+                raise _missing(path)
+            shape = shapes[_VARIABLE]
+    if len(shape) not in (2, 3) or min(shape) < 1:
+        raise InputError(f"{path} has {_VARIABLE} of shape {shape}; frames are (height, width, frames)")
+    height, width, n_frames = (*shape, 1)[:3]  # MATLAB drops the last dimension if it is 1
+    return int(n_frames), int(height), int(width)
+
+
+def _packed_frames(path: Path) -> NDArray[np.uint8]:
+    """Return all frames, (n, H, ceil(W / 8)), packed along the width; raises an `InputError` if they are not binary."""
+    with reading(path, _DAMAGED):
+        if _is_hdf(path):
+            with _hdf_values(path) as values:
+                stored = values[()].T
+        else:
+            from scipy.io import loadmat
+
+            stored = loadmat(str(path), variable_names=[_VARIABLE])[_VARIABLE]
+        frames = np.moveaxis(np.atleast_3d(stored), -1, 0)
+        if frames.dtype.kind not in "biuf":
+            raise InputError(f"{path} has {_VARIABLE} that is no array of real numbers; frames are (height, width, frames)")
+        packed = np.empty((*frames.shape[:2], -(-frames.shape[2] // 8)), np.uint8)
+        for start in range(0, len(frames), _BLOCK_FRAMES):
+            block = slice(start, start + _BLOCK_FRAMES)
+            lit = frames[block] == 1
+            if not np.all(lit | (frames[block] == 0)):
+                raise InputError(f"{path} holds values other than 0 and 1: its frames are not binary")
+            packed[block] = np.packbits(lit, axis=-1)
+    return packed
+
+
+def _is_hdf(path: Path) -> bool:
+    """Return whether a file is one of MATLAB 7.3, by its first bytes."""
+    start = read_start(path, 10)
+    return start == b"MATLAB 7.3" or start.startswith(b"\x89HDF")
+
+
+@contextmanager
+def _hdf_values(path: Path) -> Iterator[Any]:
+    """Open the array of the frames, (frames, width, height), whose values are not read yet."""
+    if importlib.util.find_spec("h5py") is None:
+        install = 'pip install "photonpano[hdf5]" (in a checkout: pip install ".[hdf5]")'
+        raise InputError(f"{path} is a file of MATLAB 7.3: reading it needs h5py, which is not installed: {install}")
+    import h5py
+
+    with h5py.File(path) as file:
+        if _VARIABLE not in file:
+            raise _missing(path)
+        yield file[_VARIABLE]
+
+
+def _missing(path: Path) -> InputError:
+    return InputError(f"{path} has no variable {_VARIABLE}; its frames must be (height, width, frames) of that name")
+
 
 _NAME = re.compile(r"part_([1-9][0-9]*)\.mat")
 _INFO = "info.json"
@@ -42,7 +118,7 @@ class MatPartsSource(BinarySource):
 
     def __init__(self, config: MatPartsConfig) -> None:
         self._paths = _parts(config.path)
-        shapes = [shape_of_frames(path) for path in self._paths]
+        shapes = [_shape_of_frames(path) for path in self._paths]
         for path, shape in zip(self._paths, shapes, strict=True):
             if shape[1:] != shapes[0][1:]:
                 raise InputError(
@@ -60,7 +136,7 @@ class MatPartsSource(BinarySource):
         _, height, width = shapes[0]
         super().__init__(self._starts[-1], FrameLayout((height, width), (height, -(-width // 8))), config.frame_rate_hz)
         self._lock = Lock()
-        self._packed = lru_cache(_MOST_PARTS)(packed_frames)
+        self._packed = lru_cache(_MOST_PARTS)(_packed_frames)
 
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Yield the frames of a span, one part after the other: see `BinarySource`."""

@@ -15,9 +15,7 @@ pytest.importorskip("av")
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from photonpano_sensors.intensity import video_index
-from photonpano_sensors.intensity.video import DecodedFrames, VideoSource
-from photonpano_sensors.intensity.video_index import index_of, open_video
+from photonpano_sensors.intensity.video import DecodedFrames, VideoSource, index_of, open_video
 
 
 def opened(path: Path, threads: int = 1, **keys: Any) -> VideoSource:
@@ -77,7 +75,7 @@ def test_index_keeps_no_packets(moving: Callable, write_video: Callable, monkeyp
                 most = max(most, len(alive))
                 yield packet
 
-    monkeypatch.setattr(video_index, "open_video", Container)
+    monkeypatch.setattr("photonpano_sensors.intensity.video.open_video", Container)
     index = index_of(write_video(moving(), "a.mp4", "libx264", "yuvj420p"))
     assert len(index.times) == 40
     assert most <= 2
