@@ -8,9 +8,7 @@ from pathlib import Path
 import photonpano_simulator as plugin
 from photonpano import SourceContribution, hookimpl
 from photonpano.reading import missing_file, objections
-from photonpano_simulator.config import CameraSimulatorConfig, PhotoScene, Sensor, SimulatorConfig
-from photonpano_simulator.path_config import FilePath
-from photonpano_simulator.recording import delivered
+from photonpano_simulator.config import CameraSimulatorConfig, FilePath, PhotoScene, Sensor, SimulatorConfig, delivered
 from photonpano_simulator.travel_config import TravelConfig
 
 _CHECKED_FRAMES = 5000  # frames of a path that are checked before a run, to find out whether it leaves the scene

@@ -18,9 +18,7 @@ import numpy as np
 from photonpano import FloatArray, InputError
 from photonpano.geometry import Camera, camera_matrix, inverse, normalised, rescaling, rotation_matrices, transform_points
 from photonpano.reading import read_array, read_arrays
-from photonpano_simulator.config import SimulationConfig
-from photonpano_simulator.lens import camera, middle_of, outline
-from photonpano_simulator.path_config import (
+from photonpano_simulator.config import (
     FilePath,
     HandShakePath,
     LoopPath,
@@ -28,10 +26,12 @@ from photonpano_simulator.path_config import (
     PanPath,
     ScanPath,
     Shake,
+    SimulationConfig,
     SplinePath,
     TurnPath,
 )
 from photonpano_simulator.sensor import Draw, generator
+from photonpano_simulator.views import camera, middle_of, outline
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

@@ -7,9 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from photonpano import Config, SpecPath
-from photonpano_simulator.config import Distortion, Sensor
-from photonpano_simulator.path_config import Shake
-from photonpano_simulator.recording import Drift, Drops, FrameCount, FrameRate, FrameShape, Repeats
+from photonpano_simulator.config import Distortion, Drift, Drops, FrameCount, FrameRate, FrameShape, Repeats, Sensor, Shake
 
 Metres = Annotated[float, Field(ge=-1000, le=1000)]
 Point = tuple[Metres, Metres, Metres]

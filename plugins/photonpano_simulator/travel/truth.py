@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from photonpano import FloatArray, InputError
 from photonpano.geometry import Camera
 from photonpano.reading import read_arrays
-from photonpano_simulator.lens import pixel_grid
-from photonpano_simulator.travel.planes import Planes, Scene, trace
-from photonpano_simulator.travel.rendering import LensView, View, atlas_of, view_of
+from photonpano_simulator.travel.planes import LensView, Planes, Scene, View, atlas_of, trace, view_of
+from photonpano_simulator.views import pixel_grid
 
 # Names of arrays in a truth file: the fields of `Planes`, and the others.
 _PLANES = {

@@ -12,9 +12,8 @@ from photonpano import FrameSpan
 from photonpano.geometry import corners, transform_points
 from photonpano.testing.scenes import z_scores
 from photonpano_simulator.config import FrameObject, Lens, Sensor, SimulatorConfig
-from photonpano_simulator.lens import undistorted
 from photonpano_simulator.sensor import SpadSensor
-from photonpano_simulator.views import DrawnObject
+from photonpano_simulator.views import DrawnObject, undistorted
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from photonpano import InputError
-from photonpano_simulator import drawing
+from photonpano_simulator import scenes
 from photonpano_simulator.config import NightScene, PhotoScene, StreetScene
-from photonpano_simulator.drawing import Chance, Drawing, pictures_of, read_scene
-from photonpano_simulator.scenes import scene_flux, street
+from photonpano_simulator.scenes import Chance, Drawing, pictures_of, read_scene, scene_flux, street
 from photonpano_simulator.travel import stage
 
 
@@ -153,7 +152,7 @@ def test_files_of_scenes_have_no_unknown_key_or_picture(kind: str) -> None:
     picked = {name for mark in marks for value in mark.get("pick", {}).values() for name in names_in(value)}
     variables = {"opening", "beside", "below", "surface", "goods"}
     drawn = {"street", *picked}
-    for keys, entries in ((documented(drawing), marks), (documented(stage), things)):
+    for keys, entries in ((documented(scenes), marks), (documented(stage), things)):
         for entry in entries:
             assert set(entry) <= keys, entry
             for key in ("draw", "front", "top"):

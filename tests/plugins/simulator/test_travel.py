@@ -16,8 +16,7 @@ from photonpano.geometry import Camera, camera_matrix, corners, positions_of, ro
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
 from photonpano_simulator.paths import camera_path
-from photonpano_simulator.travel.planes import Planes, Scene, trace
-from photonpano_simulator.travel.rendering import View, atlas_of
+from photonpano_simulator.travel.planes import Planes, Scene, View, atlas_of, trace
 from photonpano_simulator.travel.source import TravelSource
 from photonpano_simulator.travel.truth import TravelTruth, depth, flow, read_truth, sharp_view, truth_of
 from photonpano_simulator.travel_config import TravelConfig
