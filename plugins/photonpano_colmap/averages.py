@@ -30,11 +30,9 @@ from photonpano import (
 )
 from photonpano.geometry import Camera, camera_matrix, positions_of
 from photonpano.locating import blur_against_noise, stabilised_8_bit
-from photonpano_colmap.configs import MIN_AVERAGES, ColmapAveragesConfig, counted, starts_of, too_few_averages
-from photonpano_colmap.pose_noise import PoseNoise, pose_noise
-from photonpano_colmap.posing.merging import lit_counts
-from photonpano_colmap.posing.path import PoseSpline, left_out
-from photonpano_colmap.reconstruction import Piece, Reconstruction, reconstruct
+from photonpano_colmap.exposures import PoseSpline, left_out, lit_counts
+from photonpano_colmap.hooks import MIN_AVERAGES, ColmapAveragesConfig, counted, starts_of, too_few_averages
+from photonpano_colmap.reconstruction import Piece, PoseNoise, Reconstruction, pose_noise, reconstruct
 
 _PHOTONS = 60.0  # photons per pixel of an average; with fewer, keypoints are noise
 _BLUR_PX = 6.0  # motion blur of an average that keypoints tolerate; the shorter average of both limits is taken

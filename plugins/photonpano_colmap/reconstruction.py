@@ -1,11 +1,18 @@
-"""Structure from motion by COLMAP: poses and points of some images, in one or several pieces.
+"""Structure from motion by COLMAP: poses, their expected errors, and points of some images, in one or several pieces.
+
+A reconstruction is adjusted, its depth reversal (the ambiguity of Necker's cube) resolved, and halves of its points compared.
+From afar, a scene and its mirror image in depth look alike if the camera rotates the other way. A reconstruction may end in
+either; perspective leaves larger residuals in the wrong one.
 
 Convention:
     Positions in images are (x, y) with integers as pixel centres; COLMAP's are 0.5 larger and are converted here.
+    X_c = R (X - c) for the position c of a camera. A pose is perturbed by a rotation vector of its camera, exp(w) R, and by a
+    shift of c in the world. K maps points of the camera to ideal pixels.
 """
 
 from __future__ import annotations
 
+import copy
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,10 +23,11 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from photonpano import CameraGuess, FloatArray, OutputError
-from photonpano_colmap.configs import FIRST_CENTRE, SEEDS, ColmapAveragesConfig
-from photonpano_colmap.reversal import Halves, Readings, compared_halves, likelier_reading
+from photonpano import CameraGuess, FloatArray, OutputError, Reason
+from photonpano.geometry import positions_of
+from photonpano_colmap.hooks import FIRST_CENTRE, SEEDS, ColmapAveragesConfig
 
 _USUAL_FOCAL = 1.2  # initial focal length where none is given, in longer sides of a frame
 _START_ANGLE_DEG = 4.0  # parallax of COLMAP's initial pair; its own 16 degrees are too much for short captures
@@ -190,3 +198,263 @@ def _name(index: int) -> str:
 
 def _index(name: str) -> int:
     return int(name.partition(".")[0])
+
+
+_NEAREST = 0.1  # minimum distance of reversed points, in median depths
+_FARTHEST_OFF_PX = 4.0  # points with a larger residual are removed, as COLMAP removes them
+_SAME = 0.2  # two readings agree if their rotations differ by less than this fraction
+_ALIKE = 0.9  # neither reading is likelier if the ratio of their residuals is above this
+_CELLS = 0.06, 0.12  # sides of the squares of two chessboards, in focal lengths
+_FEWEST = 3  # positions that determine a similarity
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Residuals of two readings of the depth, and which is likelier."""
+
+    found_px: float  # median distance of a point from where images show it, adjusted from the reading that COLMAP found
+    reversed_px: float  # the same, adjusted from near and far exchanged
+    is_reversed: bool = False  # whether the likelier one is not what COLMAP found
+    differ: bool = True  # whether they are two readings: where perspective is strong, adjustment leads from either to one
+
+    @property
+    def ratio(self) -> float | None:
+        """The smaller of both residuals over the larger; None if they are those of one reading."""
+        return min(self.found_px, self.reversed_px) / max(self.found_px, self.reversed_px) if self.differ else None
+
+    @property
+    def doubt(self) -> Reason | None:
+        """Why the depth may be reversed; None if one reading explains the images better than the other."""
+        if (ratio := self.ratio) is None or ratio <= _ALIKE:
+            return None
+        return Reason(
+            "the depth of the scene may be reversed: near and far exchanged explain the averages as well",
+            ratio,
+            _ALIKE,
+            f"ratio of the residuals of both; {self}",
+            "move farther, or nearer to the scene, so that perspective tells them apart",
+        )
+
+    def __str__(self) -> str:
+        return (
+            f"points are {self.found_px:.2f} px from where averages show them as COLMAP found them, and "
+            f"{self.reversed_px:.2f} px with near and far exchanged"
+        )
+
+
+def likelier_reading(found: pycolmap.Reconstruction, finds_focal: bool) -> tuple[pycolmap.Reconstruction, Readings]:
+    """Return a reconstruction adjusted to its images, with its depth reversed if that explains them better; and how well."""
+    adjusted, other = copy.deepcopy(found), _reversed(found)
+    found_px, reversed_px = adjust_model(adjusted, finds_focal), adjust_model(other, finds_focal)
+    likelier = adjusted if found_px <= reversed_px else other
+    readings = Readings(found_px, reversed_px, not _agree(found, likelier), not _agree(adjusted, other))
+    for identifier, point in list(likelier.points3D.items()):
+        if point.error > _FARTHEST_OFF_PX:
+            likelier.delete_point3D(identifier)
+    return likelier, readings
+
+
+def reversed_in_depth(poses: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mirror (N, 3, 4) poses and (M, 3) points at the plane of the median depth; to first order, images stay as they are."""
+    towards = Rotation.from_matrix(poses[:, :, :3]).mean().as_matrix()
+    middle = positions_of(poses).mean(axis=0)
+    seen = (points - middle) @ towards.T
+    depth = float(np.median(seen[:, 2]))
+    seen[:, 2] = np.maximum(2 * depth - seen[:, 2], _NEAREST * depth)
+    rotations = poses[:, :, :3] @ towards.T
+    target = np.array([0.0, 0.0, depth])
+    # The camera pans and tilts the other way, and goes on to see the middle of the scene where it saw it.
+    rotated = Rotation.from_rotvec(Rotation.from_matrix(rotations).as_rotvec() * (-1, -1, 1)).as_matrix()
+    looked = np.einsum("nij,nj->ni", rotations, target - (positions_of(poses) - middle) @ towards.T)
+    return np.concatenate([rotated, (looked - rotated @ target)[:, :, None]], axis=2), seen
+
+
+def _reversed(found: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    other = copy.deepcopy(found)
+    images = [image for image in other.images.values() if image.has_pose]
+    identifiers = sorted(other.points3D)
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    points = np.array([other.points3D[identifier].xyz for identifier in identifiers])
+    poses, points = reversed_in_depth(poses, points)
+    for image, pose in zip(images, poses, strict=True):
+        image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
+    for identifier, point in zip(identifiers, points, strict=True):
+        other.points3D[identifier].xyz = point
+    return other
+
+
+def adjust_model(model: pycolmap.Reconstruction, finds_focal: bool) -> float:
+    """Adjust a reconstruction to its images, and return the median distance of a point from where they show it, px."""
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.refine_focal_length = finds_focal
+    options.refine_principal_point = options.refine_extra_params = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1
+    # This is what `pycolmap.bundle_adjustment` does, which prints a heading and its time whatever the level of its log.
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    model.update_point_3d_errors()
+    return float(np.median([point.error for point in model.points3D.values()] or [np.inf]))
+
+
+def _agree(first: pycolmap.Reconstruction, second: pycolmap.Reconstruction) -> bool:
+    """Return whether the camera rotates alike in two reconstructions from the same images."""
+    poses = [
+        np.array([each.cam_from_world().matrix() for each in model.images.values() if each.has_pose])
+        for model in (first, second)
+    ]
+    rotations = [Rotation.from_matrix(each[1:, :, :3] @ each[0, :, :3].T) for each in poses]
+    return bool(np.median((rotations[0] * rotations[1].inv()).magnitude()) < _SAME * np.median(rotations[0].magnitude()))
+
+
+@dataclass(frozen=True, slots=True)
+class Halves:
+    """Expected errors of poses from half of the points, root mean square.
+
+    Keypoints of a track err alike, from blur and at the edges of things, which residuals do not show: so the poses from all
+    points are hardly better than these.
+    """
+
+    std_position: float  # in units of the world
+    std_rotation: float  # in radians, after the best common rotation
+
+
+def compared_halves(found: pycolmap.Reconstruction, finds_focal: bool) -> Halves:
+    """Adjust the images of a reconstruction to each half of its points; compare both, aligned.
+
+    The halves are the black and the white squares of a chessboard that the image in the middle sees: neighbours err alike, so
+    that they belong to one half. How far two halves are apart is chance, too, and less so as the mean of two boards.
+    """
+    squares = np.array([_compared(found, finds_focal, cell) for cell in _CELLS]) ** 2
+    return Halves(*np.sqrt(squares.mean(axis=0)).tolist())
+
+
+def _compared(found: pycolmap.Reconstruction, finds_focal: bool, cell: float) -> tuple[float, float]:
+    """Return the expected errors of positions and rotations from the halves of a board; infinite where half has no poses."""
+    places = sorted(found.reg_image_ids())
+    middle = found.images[places[len(places) // 2]].cam_from_world()
+    halves = [copy.deepcopy(found) for _ in range(2)]
+    for number, half in enumerate(halves):
+        for identifier, point in found.points3D.items():
+            x, y, z = middle * point.xyz
+            if (x / z // cell + y / z // cell) % 2 == number:
+                half.delete_point3D(identifier)
+        adjust_model(half, finds_focal)
+        if not half.num_points3D():  # as of a camera that only turns, whose points lie anywhere
+            return np.inf, np.inf
+    images = sorted(set(halves[0].reg_image_ids()) & set(halves[1].reg_image_ids()))
+    first, second = (np.array([half.images[each].cam_from_world().matrix() for each in images]) for half in halves)
+    aligned = pycolmap.estimate_sim3d(positions_of(first), positions_of(second)) if len(images) >= _FEWEST else None
+    if aligned is None:
+        return np.inf, np.inf
+    apart = positions_of(first) @ aligned.rotation.matrix().T * aligned.scale + aligned.translation - positions_of(second)
+    worlds = Rotation.from_matrix(np.swapaxes(first[:, :, :3], 1, 2) @ second[:, :, :3])
+    turned = (worlds * worlds.mean().inv()).magnitude()
+    # Both halves err, by chance.
+    squares = np.sum(apart**2, axis=1), turned**2
+    return float(np.sqrt(np.mean(squares[0]) / 2)), float(np.sqrt(np.mean(squares[1]) / 2))
+
+
+_POSE = 6  # unknowns of a pose: rotation vector and position
+_SMALLEST = 1e-12  # eigenvalues of the information below this fraction of the largest are undetermined directions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseNoise:
+    """Expected errors, root mean square."""
+
+    std_position: FloatArray  # (N,) in units of the world
+    std_rotation: FloatArray  # (N,) in radians
+    std_focal_px: float  # 0 if the focal length is known
+    residual_px: float  # root mean square of the residuals along x and y
+
+
+def pose_noise(
+    poses: FloatArray,
+    points: FloatArray,
+    observed: Sequence[tuple[NDArray[np.intp], FloatArray]],
+    matrix: FloatArray,
+    finds_focal: bool,
+) -> PoseNoise:
+    """Return the expected errors of (N, 3, 4) poses after the best alignment of positions with the true ones.
+
+    The points, (M, 3), are eliminated (Schur complement), and the seven directions of the gauge are projected out of the
+    covariance, as a similarity that aligns the positions does. The noise in an image is that of the residuals. `observed` are
+    for each pose the indices of K points, and their (K, 2) ideal pixels.
+    """
+    n_poses, size = len(poses), _POSE * len(poses) + finds_focal
+    information = np.zeros((size, size))
+    corners: list[dict[int, FloatArray]] = [{} for _ in points]
+    of_points = np.zeros((len(points), 3, 3))
+    squares, count = 0.0, 0
+    for place, (pose, (indices, xy)) in enumerate(zip(poses, observed, strict=True)):
+        residuals, by_camera, by_point = _linearised(pose, points[indices], xy, matrix, finds_focal)
+        squares, count = squares + float((residuals**2).sum()), count + residuals.size
+        own = np.r_[_POSE * place : _POSE * place + _POSE, *([size - 1] if finds_focal else [])]
+        information[np.ix_(own, own)] += np.einsum("kia,kib->ab", by_camera, by_camera)
+        np.add.at(of_points, indices, np.einsum("kia,kib->kab", by_point, by_point))
+        for index, cross in zip(indices.tolist(), np.einsum("kia,kib->kab", by_camera, by_point), strict=True):
+            corners[index][place] = cross
+    for index, cross_of in enumerate(corners):
+        if len(cross_of) < 2:
+            continue
+        own = np.concatenate([np.arange(_POSE * place, _POSE * place + _POSE) for place in cross_of])
+        cross = np.concatenate([each[:_POSE] for each in cross_of.values()])
+        if finds_focal:
+            own, cross = np.append(own, size - 1), np.concatenate([cross, sum(each[_POSE:] for each in cross_of.values())])
+        information[np.ix_(own, own)] -= cross @ np.linalg.pinv(of_points[index]) @ cross.T
+    freedom = max(1, count - size - 3 * len(points) + 7)
+    covariance = squares / freedom * without_gauge(information, poses)
+    variances = np.diag(covariance)
+    per_pose = variances[: _POSE * n_poses].reshape(n_poses, 2, 3).sum(axis=2)
+    return PoseNoise(
+        np.sqrt(per_pose[:, 1]),
+        np.sqrt(per_pose[:, 0]),
+        float(np.sqrt(variances[-1])) if finds_focal else 0.0,
+        float(np.sqrt(squares / max(1, count))),
+    )
+
+
+def _linearised(
+    pose: FloatArray, points: FloatArray, xy: FloatArray, matrix: FloatArray, finds_focal: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return residuals (K, 2) and their derivatives by the camera (K, 2, 6 or 7) and by the point (K, 2, 3)."""
+    rotation, focal = pose[:, :3], np.diag(matrix)[:2]
+    seen = points @ rotation.T + pose[:, 3]
+    ahead = seen[:, 2:]
+    plane = seen[:, :2] / ahead
+    residuals = plane * focal + matrix[:2, 2] - xy
+    by_seen = np.zeros((len(points), 2, 3))
+    by_seen[:, 0, 0], by_seen[:, 1, 1] = focal[0] / ahead[:, 0], focal[1] / ahead[:, 0]
+    by_seen[:, :, 2] = -focal * plane / ahead
+    turned = np.cross(np.eye(3)[None], seen[:, None, :])  # row a: derivative of the point by rotation about axis a
+    by_camera = np.concatenate([by_seen @ np.swapaxes(turned, 1, 2), -by_seen @ rotation], axis=2)
+    if finds_focal:
+        by_camera = np.concatenate([by_camera, plane[:, :, None]], axis=2)
+    return residuals, by_camera, by_seen @ rotation
+
+
+def without_gauge(information: FloatArray, poses: FloatArray) -> FloatArray:
+    """Invert (6 N, 6 N) information, or with one more unknown, and project the covariance as aligning the positions does."""
+    values, vectors = np.linalg.eigh(information)
+    inverted = np.where(values > _SMALLEST * values[-1], 1 / np.where(values > 0, values, 1), 0)
+    covariance = (vectors * inverted) @ vectors.T
+    rotations = poses[:, :, :3]
+    places = positions_of(poses)
+    gauge = np.zeros((len(information), 7))
+    for place, (rotation, position) in enumerate(zip(rotations, places - places.mean(axis=0), strict=True)):
+        rows = slice(_POSE * place, _POSE * place + 3), slice(_POSE * place + 3, _POSE * place + _POSE)
+        gauge[rows[1], :3] = np.eye(3)
+        gauge[rows[1], 3:6] = np.cross(np.eye(3), position).T
+        gauge[rows[0], 3:6] = -rotation
+        gauge[rows[1], 6] = position
+    of_positions = np.zeros(len(information), np.bool_)
+    for axis in range(3, _POSE):
+        of_positions[axis : _POSE * len(poses) : _POSE] = True
+    aligned = np.eye(len(information))
+    aligned[:, of_positions] -= gauge @ np.linalg.pinv(gauge[of_positions])
+    return np.asarray(aligned @ covariance @ aligned.T)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray, Homography, Located, NotLocated, VirtualExposure
 from photonpano.geometry import normalised
 from photonpano.locating import Matches, PointLocator, blur_against_noise, motion_from_points, stabilised_8_bit, too_few_matches
-from photonpano_colmap.configs import FIRST_CENTRE, SEEDS, PycolmapTwoViewConfig
+from photonpano_colmap.hooks import FIRST_CENTRE, SEEDS, PycolmapTwoViewConfig
 
 MAX_TRIALS = 10_000  # of RANSAC, which finds a homography with 20 % inliers in half as many
 _SIFT = pycolmap.FeatureExtractorType.SIFT

@@ -30,7 +30,7 @@ from photonpano import CameraGuess, PhotonpanoError, evaluate_poses, parse_spec,
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import PoseScore, pose_errors
 from photonpano.evaluation.poses import load_run_poses, load_true_poses
-from photonpano_colmap.configs import ColmapAveragesConfig
+from photonpano_colmap.hooks import ColmapAveragesConfig
 from photonpano_colmap.reconstruction import reconstruct
 
 N_FRAMES, SHAPE, FOCAL_PX, SHARP_EVERY = 10_000, (254, 496), 450.0, 200

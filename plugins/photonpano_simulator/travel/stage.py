@@ -1,4 +1,4 @@
-"""Build the scenes that a camera travels through: rectangles in space as a file describes them, drawn, and lit by lamps and ambient light.
+"""Build the scenes that a camera travels through: rectangles in space that a file describes, drawn, and lit by lamps.
 
 Convention:
     Metres; x right, y down, z ahead. A rectangle is seen from the side on which `along` points to the right and `down` down.

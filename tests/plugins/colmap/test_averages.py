@@ -21,11 +21,9 @@ from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, captur
 pytest.importorskip("pycolmap")
 
 from photonpano_colmap.averages import AveragesEstimator, chosen_size, tilt
-from photonpano_colmap.configs import ColmapAveragesConfig
-from photonpano_colmap.pose_noise import pose_noise
-from photonpano_colmap.posing.path import PoseSpline
-from photonpano_colmap.reconstruction import Piece, Reconstruction, _apart, reconstruct
-from photonpano_colmap.reversal import Halves, Readings
+from photonpano_colmap.exposures import PoseSpline
+from photonpano_colmap.hooks import ColmapAveragesConfig
+from photonpano_colmap.reconstruction import Halves, Piece, Readings, Reconstruction, _apart, pose_noise, reconstruct
 
 SIZE = 20
 MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))

@@ -11,8 +11,7 @@ pytest.importorskip("pycolmap")
 
 import pycolmap
 
-from photonpano_colmap.pose_noise import pose_noise
-from photonpano_colmap.reversal import adjust_model, compared_halves, likelier_reading, reversed_in_depth
+from photonpano_colmap.reconstruction import adjust_model, compared_halves, likelier_reading, pose_noise, reversed_in_depth
 
 SEEN = 150
 

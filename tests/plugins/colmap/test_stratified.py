@@ -19,16 +19,22 @@ from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, captur
 pytest.importorskip("pycolmap")
 pytest.importorskip("gtsam")
 
-from photonpano_colmap.configs import StratifiedPoseConfig
-from photonpano_colmap.posing import levels
-from photonpano_colmap.posing.adjustment import Observations, adjust
-from photonpano_colmap.posing.lens import imaged, lens_of
-from photonpano_colmap.posing.levels import Merged, Scene, interpolate, locate, merge, resample
-from photonpano_colmap.posing.merging import inverse_depth_of, merge_through_depth
-from photonpano_colmap.posing.patches import Found, Patches, find_patches
-from photonpano_colmap.posing.path import Path, PoseSpline, between, moves, posed, projected
-from photonpano_colmap.posing.tremor import _beyond_noise, find_tremor
-from photonpano_colmap.stratified import StratifiedEstimator
+from photonpano_colmap.exposures import (
+    Path,
+    PoseSpline,
+    between,
+    imaged,
+    inverse_depth_of,
+    lens_of,
+    merge_through_depth,
+    moves,
+    posed,
+    projected,
+)
+from photonpano_colmap.hooks import StratifiedPoseConfig
+from photonpano_colmap.locating import Found, Observations, Patches, adjust, find_patches
+from photonpano_colmap.stratified import Merged, Scene, StratifiedEstimator, interpolate, locate, merge, resample
+from photonpano_colmap.tremor import _beyond_noise, find_tremor
 
 CAMERA = Camera.of(FOCAL_PX, SHAPE)
 MATRIX = CAMERA.matrix
@@ -326,7 +332,7 @@ def test_frames_that_an_early_level_does_not_locate_are_lost_and_named(monkeypat
         span = there[0].exposure.group.span
         return Found(*(part[:0] for part in each)) if span.start <= 150 < span.stop else each
 
-    monkeypatch.setattr(levels, "find_patches", found)
+    monkeypatch.setattr("photonpano_colmap.stratified.find_patches", found)
     source, config = capture(), StratifiedPoseConfig(group_size=20, levels=3)
     context = StageContext(source.info, source.response, 0, 2)
     estimate = StratifiedEstimator(config, context).estimate(source, CameraGuess(FOCAL_PX), Quiet())

@@ -19,7 +19,7 @@ pytest.importorskip("pycolmap")
 
 from collections.abc import Callable
 
-from photonpano_colmap.configs import PycolmapTwoViewConfig
+from photonpano_colmap.hooks import PycolmapTwoViewConfig
 from photonpano_colmap.two_view import Features, TwoViewLocator
 
 SHAPE = (160, 240)
@@ -109,7 +109,7 @@ REGISTER = """
 import numpy as np
 from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.photometry import BinaryResponse
-from photonpano_colmap.configs import PycolmapTwoViewConfig
+from photonpano_colmap.hooks import PycolmapTwoViewConfig
 from photonpano_colmap.two_view import TwoViewLocator
 
 flux = np.random.default_rng(0).random((12, 16), np.float32).repeat(8, axis=0).repeat(8, axis=1)

@@ -22,9 +22,7 @@ from photonpano.compiling import compiled
 from photonpano.filtering import exceeding_noise
 from photonpano.geometry import Camera
 from photonpano.photometry import flux_std
-from photonpano_colmap.posing.lens import Lens, imaged, lens_of
-from photonpano_colmap.posing.merging import Image, PosedExposure, lit_counts
-from photonpano_colmap.posing.path import Path, between
+from photonpano_colmap.exposures import Image, Lens, Path, PosedExposure, between, imaged, lens_of, lit_counts
 
 _NOISE_PX = 0.1  # standard error of the shift of a span that determines its length, within the limits below
 _SHORTEST, _LONGEST = 6, 32  # frames of a span

@@ -1,0 +1,319 @@
+"""Exposures that are merged along the path of a camera, through its lens and the depth of the scene.
+
+The path is a spline through some poses, or a pose for every frame. The depth is interpolated between points.
+
+Convention:
+    A pose (3, 4) maps points of the world to points of the camera, X_c = R X_w + t: x right, y down, z ahead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, LinearNDInterpolator, NearestNDInterpolator, make_interp_spline
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from photonpano import FloatArray, FrameSpan, Group, Source, VirtualExposure, capture_of
+from photonpano.compiling import compiled
+from photonpano.filtering import exceeding_noise
+from photonpano.geometry import Camera, inverse, positions_of, rotation_matrices, rotation_vectors, scaled_ahead
+from photonpano.merging import PhotonSum, chunks_of
+
+
+class Lens(NamedTuple):
+    """Where a lens images what ideal pixels see: see `photonpano.geometry.Camera`."""
+
+    distorts: bool
+    focal: float
+    centre: tuple[float, float]
+    distortion: tuple[float, float, float, float]
+    limit: float  # squared radius in focal lengths beyond which a frame shows nothing
+    ideal: FloatArray  # (H, W, 2) ideal pixels of the pixels of a frame; NaN where none is imaged
+    slopes: FloatArray  # (H, W, 2, 2) derivatives of the pixels of a frame by ideal ones
+
+
+@lru_cache(maxsize=4)
+def lens_of(camera: Camera, frame_shape: tuple[int, int]) -> Lens:
+    """Return the lens of a camera, for frames of (height, width)."""
+    height, width = frame_shape
+    ideal: FloatArray = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+    slopes: FloatArray = np.broadcast_to(np.eye(2), (height, width, 2, 2))
+    limit = np.inf
+    if camera.distorts:
+        ideal = camera.ideal(ideal)
+        sides = [camera.distorted(ideal + step) - camera.distorted(ideal - step) for step in np.eye(2) / 2]
+        slopes = np.stack(sides, axis=-1)
+        limit = float(np.nanmax((((ideal - camera.centre_px) / camera.focal_px) ** 2).sum(axis=-1)))
+    k1, k2, p1, p2 = camera.distortion.tolist()
+    return Lens(camera.distorts, camera.focal_px, camera.centre_px, (k1, k2, p1, p2), limit, ideal, np.array(slopes))
+
+
+@compiled
+def imaged(lens: Lens, x: float, y: float) -> tuple[float, float]:
+    """Return the pixel of a frame that images what an ideal pixel sees; NaN if none does."""
+    if not lens.distorts:
+        return x, y
+    k1, k2, p1, p2 = lens.distortion
+    a, b = (x - lens.centre[0]) / lens.focal, (y - lens.centre[1]) / lens.focal
+    square = a * a + b * b
+    if not square <= lens.limit:
+        return np.nan, np.nan
+    radial = 1 + square * (k1 + k2 * square)
+    across = a * radial + 2 * p1 * a * b + p2 * (square + 2 * a * a)
+    down = b * radial + p1 * (square + 2 * b * b) + 2 * p2 * a * b
+    return lens.focal * across + lens.centre[0], lens.focal * down + lens.centre[1]
+
+
+_DEGREE = 5  # degree of the polynomial in time that is always kept: gauge and drift
+
+
+class PoseSpline:
+    """Cubic splines of positions and of rotations; beyond the first and the last pose the camera keeps its velocity.
+
+    That of positions is a natural one: others magnify the noise of the outermost poses.
+    """
+
+    def __init__(self, instants: FloatArray, poses: FloatArray) -> None:
+        """Fit (N, 3, 4) poses at increasing instants, in frames; N is at least 2."""
+        self._ends = float(instants[0]), float(instants[-1])
+        self._positions = CubicSpline(instants, positions_of(poses), bc_type="natural")
+        self._rotations = RotationSpline(instants, Rotation.from_matrix(poses[:, :, :3]))
+
+    def at(self, instants: ArrayLike) -> FloatArray:
+        """Return the poses of N instants: (N, 3, 4)."""
+        instants = np.asarray(instants, dtype=np.float64)
+        inside = np.clip(instants, *self._ends)
+        beyond = (instants - inside)[:, None]
+        places = self._positions(inside) + beyond * self._positions(inside, 1)
+        # Rates are those of the camera in the world, in its own axes.
+        rotated = Rotation.from_rotvec(beyond * self._rotations(inside, 1))
+        rotations = (self._rotations(inside) * rotated).as_matrix()
+        return np.concatenate([rotations, -(rotations @ places[..., None])], axis=-1)
+
+
+def left_out(instants: FloatArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return leave-one-out errors of the spline at inner poses: distances and angles in radians, (N - 2,) each."""
+    apart, angles = [], []
+    for place in range(1, len(instants) - 1):
+        others = np.delete(np.arange(len(instants)), place)
+        [predicted] = PoseSpline(instants[others], poses[others]).at(instants[place : place + 1])
+        apart.append(float(np.linalg.norm(positions_of(predicted) - positions_of(poses[place]))))
+        angles.append(float(Rotation.from_matrix(predicted[:, :3] @ poses[place, :, :3].T).magnitude()))
+    return np.array(apart), np.array(angles)
+
+
+class Path:
+    """The poses of all frames, interpolated between them."""
+
+    def __init__(self, poses: FloatArray) -> None:
+        """Take the (T, 3, 4) poses of at least two frames."""
+        self.poses = poses
+        self._centres = positions_of(poses)
+
+    def at(self, instants: ArrayLike) -> FloatArray:
+        """Return the poses of M instants, in frames: (M, 3, 4). Before the first frame and after the last, the camera rests."""
+        at = np.clip(np.atleast_1d(np.asarray(instants, dtype=np.float64)), 0, len(self.poses) - 1)
+        first = np.minimum(at.astype(int), len(self.poses) - 2)
+        share = (at - first)[:, None, None]
+        rotations = (1 - share) * self.poses[first, :, :3] + share * self.poses[first + 1, :, :3]
+        # The mean of two rotation matrices is not orthogonal; a step of Newton's method makes it so.
+        rotations = rotations @ (3 * np.eye(3) - np.swapaxes(rotations, 1, 2) @ rotations) / 2
+        centres = (1 - share[:, 0]) * self._centres[first] + share[:, 0] * self._centres[first + 1]
+        return posed(rotations, centres)
+
+    def corrected(self, borders: FloatArray, means: FloatArray) -> Path:
+        """Return this path, corrected where groups of frames were located along it.
+
+        The frames of a group were merged along the path, so a group's pose gives the mean correction of its frames, (N, 6), not
+        that of one instant. Rotations are corrected by the function with these means and the least second derivative: the
+        derivative of the natural quintic spline through its integral at the borders of the groups, (N + 1,) in frames.
+        Positions become such a function: within a group they were interpolated only, from poses with more noise.
+        """
+        starts = np.ceil(borders).astype(int)
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(self._centres, axis=0)])[starts]
+        centres = np.diff(sums, axis=0) / np.diff(starts)[:, None]
+        means = np.concatenate([means[:, :3], centres + means[:, 3:]], axis=1)
+        integral = np.concatenate([np.zeros((1, 6)), np.cumsum(means * np.diff(borders)[:, None], axis=0)])
+        end = [(3, np.zeros(6)), (4, np.zeros(6))]
+        ends: Any = end, end  # which the library's types do not have
+        smooth = make_interp_spline(borders, integral, k=5, bc_type=ends).derivative()(np.arange(len(self.poses)))
+        return Path(posed(rotation_matrices(smooth[:, :3]) @ self.poses[:, :, :3], smooth[:, 3:]))
+
+    def rotated(self, rotations: FloatArray) -> Path:
+        """Return this path with the camera rotated on the spot at each frame, by (T, 3) rotation vectors in its own axes."""
+        return Path(rotation_matrices(rotations) @ self.poses)
+
+
+def posed(rotations: FloatArray, centres: FloatArray) -> FloatArray:
+    """Return the poses of cameras with (N, 3, 3) rotations from the world, at (N, 3) places of the world: (N, 3, 4)."""
+    shifts = -np.einsum("nij,nj->ni", rotations, centres)
+    return np.concatenate([rotations, shifts[:, :, None]], axis=2)
+
+
+def moves(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return how poses differ, (N, 3, 4) each: rotation vectors of the camera, and shifts of its place in the world; (N, 6)."""
+    rotations = rotation_vectors(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
+    return np.concatenate([rotations, positions_of(after) - positions_of(before)], axis=1)
+
+
+def between(pose: FloatArray, other: FloatArray, camera_matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return `turn`, (..., 3, 3), and `shift`, (..., 3): the map of pixels of a view to those of other poses, (..., 3, 4).
+
+    A pixel (x, y) of inverse depth q is seen by the other camera at `turn @ (x, y, 1) + q * shift`, in homogeneous pixels.
+    """
+    rotation = other[..., :3] @ pose[:, :3].T
+    moved = other[..., 3] - rotation @ pose[:, 3]
+    return camera_matrix @ rotation @ np.linalg.inv(camera_matrix), moved @ camera_matrix.T
+
+
+def projected(poses: FloatArray, points: FloatArray, camera_matrix: FloatArray) -> FloatArray:
+    """Return where cameras see points of the world: (N, 3, 4) poses and (N, 3) points to (N, 2) px; NaN behind a camera."""
+    seen = np.einsum("nij,nj->ni", poses[:, :, :3], points) + poses[:, :, 3]
+    depth = np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)
+    return np.asarray((seen @ camera_matrix.T)[:, :2] / depth)
+
+
+def exceeding_noise_of_poses(moves: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Denoise (N, 6) corrections of poses, in px, with a Wiener filter, and keep their slow part; `covariance` is (N, 6, 6)."""
+    times = np.linspace(-1, 1, len(moves))
+    basis = np.polynomial.legendre.legvander(times, min(_DEGREE, len(moves) - 1))
+    slow = basis @ np.linalg.lstsq(basis, moves, rcond=None)[0]
+    # In these modes, errors are independent of each other.
+    _, modes = np.linalg.eigh(np.linalg.inv(covariance).mean(axis=0))
+    variances = np.einsum("ka,nkl,la->na", modes, covariance, modes)
+    rest = [exceeding_noise(*columns).signal for columns in zip(((moves - slow) @ modes).T, variances.T, strict=True)]
+    return np.asarray(slow + np.stack(rest, axis=1) @ modes.T)
+
+
+Image = NDArray[np.float32]
+
+_CHUNK_PX = 1.0  # frames that move less than this are summed before they are warped
+_STEP_PX = 8  # spacing of the grid on which depth is interpolated
+_MARGIN = 0.05  # points up to this far outside of the frame are used, in its longer side
+# A point is an outlier if its inverse depth differs from the median of its 7 neighbours by half of it.
+_NEIGHBOURS = 7
+_APART = 0.5
+_LEAST = 4  # fewest points of a depth map
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedExposure:
+    """A virtual exposure, with its place in the world."""
+
+    exposure: VirtualExposure  # flux and weight, seen from the reference instant of its group
+    pose: FloatArray  # (3, 4) of that instant
+    inverse_depth: Image  # (H, W) of its pixels
+
+
+def merge_through_depth(source: Source, group: Group, path: Path, inverse_depth: Image, camera: Camera) -> PosedExposure:
+    """Merge the frames of a group as its reference instant sees them (paper, section 6: aggregation that is consistent in 3D).
+
+    Each chunk of frames is interpolated once, where its frames see the points of the reference view. Occlusions are ignored.
+    """
+    pose = path.at([group.reference])[0]
+    counts, weight = np.zeros((2, *source.info.frame_shape), np.float32)
+    lens = lens_of(camera, source.info.frame_shape)
+    plane = _Plane(path, pose, float(np.median(inverse_depth)), camera)
+    for chunk in chunks_of(group.span, plane, source.info.frame_shape, _CHUNK_PX):
+        turn, shift = between(pose, path.at([chunk.span.centre])[0], camera.matrix)
+        valid = capture_of(source).masked_in(chunk.span).valid.astype(np.float32)
+        frames = lit_counts(source, chunk.span) * valid
+        _add(frames, valid * np.float32(len(chunk.span)), inverse_depth, lens, turn, shift, counts, weight)
+    flux, seen = PhotonSum(counts, weight).estimate(source.response)
+    return PosedExposure(VirtualExposure(flux, seen, group, 1.0, source.response), pose, inverse_depth)
+
+
+class _Plane:
+    """The motion of a plane before a view at the median depth, by which frames are divided into chunks."""
+
+    def __init__(self, path: Path, pose: FloatArray, inverse_depth: float, camera: Camera) -> None:
+        self._path, self._pose, self._inverse_depth, self._matrix = path, pose, inverse_depth, camera.matrix
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        """Return the maps from pixels of frames to those of the view: (N, 3, 3)."""
+        maps, shifts = between(self._pose, self._path.at(frame_indices), self._matrix)
+        maps[:, :, 2] += self._inverse_depth * shifts
+        return scaled_ahead(inverse(maps))
+
+
+def lit_counts(source: Source, span: FrameSpan) -> Image:
+    """Return the sum of the frames of a span, of the flux alone: (H, W)."""
+    return capture_of(source).corrected_counts(span).astype(np.float32)
+
+
+@compiled
+def _add(
+    frames: Image,
+    frame_weight: Image,
+    inverse_depth: Image,
+    lens: Lens,
+    turn: FloatArray,
+    shift: FloatArray,
+    counts: Image,
+    weight: Image,
+) -> None:
+    """Add (H, W) counts and weights of frames to those of a view, interpolated bilinearly; see `path.between`."""
+    height, width = frames.shape
+    for y in range(height):
+        row, counts_of, weight_of = inverse_depth[y], counts[y], weight[y]
+        for x in range(width):
+            q, px, py = row[x], lens.ideal[y, x, 0], lens.ideal[y, x, 1]
+            depth = turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] + q * shift[2]
+            if not depth > 0:
+                continue
+            u = (turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] + q * shift[0]) / depth
+            v = (turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] + q * shift[1]) / depth
+            u, v = imaged(lens, u, v)
+            if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+                continue
+            i, j = min(int(u), width - 2), min(int(v), height - 2)
+            a, b = np.float32(u - i), np.float32(v - j)
+            upper, lower = frames[j], frames[j + 1]
+            upper_weight, lower_weight = frame_weight[j], frame_weight[j + 1]
+            one = np.float32(1)
+            counts_of[x] += (one - b) * ((one - a) * upper[i] + a * upper[i + 1]) + b * (
+                (one - a) * lower[i] + a * lower[i + 1]
+            )
+            weight_of[x] += (one - b) * ((one - a) * upper_weight[i] + a * upper_weight[i + 1]) + b * (
+                (one - a) * lower_weight[i] + a * lower_weight[i + 1]
+            )
+
+
+def inverse_depth_of(pose: FloatArray, points: FloatArray, camera: Camera, shape: tuple[int, int]) -> Image | None:
+    """Return the inverse depth of the pixels of a view, (H, W), from points of the world; None if it sees fewer than 4.
+
+    It is linear between points, as that of a plane is. At the edges of things it is wrong by the width of a triangle; within a
+    group, the camera moves so little that this hardly matters.
+    """
+    height, width = shape
+    seen = points @ pose[:, :3].T + pose[:, 3]
+    seen = seen[seen[:, 2] > 0]
+    pixels = seen @ camera.matrix.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    margin = _MARGIN * max(shape)
+    ideal = lens_of(camera, shape).ideal
+    low, high = np.nanmin(ideal, axis=(0, 1)) - margin, np.nanmax(ideal, axis=(0, 1)) + 1 + margin
+    inside = ((pixels > low) & (pixels < high)).all(axis=1)
+    pixels, inverse_depth = pixels[inside], 1 / seen[inside, 2]
+    if len(pixels) >= _NEIGHBOURS:
+        _, nearest = cKDTree(pixels).query(pixels, k=_NEIGHBOURS)
+        median = np.median(inverse_depth[nearest], axis=1)
+        kept = np.abs(inverse_depth - median) < _APART * median
+        pixels, inverse_depth = pixels[kept], inverse_depth[kept]
+    if len(pixels) < _LEAST or np.linalg.matrix_rank(pixels - pixels.mean(axis=0), tol=1.0) < 2:
+        return None
+    rows, columns = -(-height // _STEP_PX), -(-width // _STEP_PX)
+    middle = (_STEP_PX - 1) / 2
+    x, y = np.meshgrid(np.arange(columns) * _STEP_PX + middle, np.arange(rows) * _STEP_PX + middle)
+    places = camera.ideal(np.stack([x, y], axis=-1))
+    places = np.where(np.isfinite(places), places, camera.centre_px)
+    grid = LinearNDInterpolator(pixels, inverse_depth)(places)
+    grid = np.where(np.isfinite(grid), grid, NearestNDInterpolator(pixels, inverse_depth)(places)).astype(np.float32)
+    fine = cv2.resize(grid, (columns * _STEP_PX, rows * _STEP_PX), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(fine[:height, :width])
