@@ -24,7 +24,7 @@ from photonpano.locating import (
     motion_from_points,
     stabilised_8_bit,
 )
-from photonpano_kornia.configs import KorniaFeaturesConfig, KorniaLoftrConfig
+from photonpano_kornia.hooks import KorniaFeaturesConfig, KorniaLoftrConfig
 from photonpano_kornia.runtime import device_of, image_on, loftr_from, one_thread, seeded
 
 _FAR = 1e3  # descriptor distance of keypoints beyond the search radius; true ones are at most 2

@@ -38,7 +38,7 @@ from photonpano.locating import (
     motion_from_images,
     view_pyramid,
 )
-from photonpano_kornia.configs import KorniaRegistratorConfig
+from photonpano_kornia.hooks import KorniaRegistratorConfig
 from photonpano_kornia.runtime import device_of, image_on, one_thread
 
 _COARSE_TOLERANCE = 4  # tolerance of coarser layers, which initialise the finest, relative to `converged_px`

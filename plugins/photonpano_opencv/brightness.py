@@ -20,7 +20,7 @@ from photonpano.locating import (
     view_of,
     view_pyramid,
 )
-from photonpano_opencv.configs import OpencvEccConfig, PhaseCorrelationConfig
+from photonpano_opencv.hooks import OpencvEccConfig, PhaseCorrelationConfig
 
 _SMALLEST_SIDE = 32  # minimum side of the images of the pyramid, px
 # Fraction of the photons' information that phase correlation uses, as it weights noisy frequencies like those of the scene:

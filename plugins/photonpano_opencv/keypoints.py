@@ -22,7 +22,7 @@ from photonpano.locating import (
     motion_from_points,
     stabilised_8_bit,
 )
-from photonpano_opencv.configs import OpencvOrbConfig, OpencvSiftConfig
+from photonpano_opencv.hooks import OpencvOrbConfig, OpencvSiftConfig
 
 GUIDED_RADII = (1.5, 1.0)  # of the search around predicted positions, one a round, in units of `threshold_px`
 # Lowe's ratio within these radii

@@ -20,7 +20,7 @@ pytest.importorskip("kornia")
 import kornia
 import torch
 
-from photonpano_kornia.configs import KorniaRegistratorConfig
+from photonpano_kornia.hooks import KorniaRegistratorConfig
 from photonpano_kornia.registrator import RegistratorLocator, unit_square
 from photonpano_kornia.runtime import device_of, image_on, one_thread, seeded
 

@@ -15,7 +15,7 @@ pytest.importorskip("kornia")
 import kornia
 import torch
 
-from photonpano_kornia.configs import KorniaLoftrConfig
+from photonpano_kornia.hooks import KorniaLoftrConfig
 from photonpano_kornia.matched import LoftrLocator
 from photonpano_kornia.runtime import loftr_from
 
