@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from photonpano.notebooks import facts, picture
 from photonpano.text import share
-from photonpano.values.arrays import BoolArray, FluxImage, Homography
-from photonpano.values.frames import Group
+from photonpano.values.frames import BoolArray, FluxImage, Group, Homography
 
 
 class Response(Protocol):
