@@ -1,11 +1,5 @@
 """Camera responses and flux estimation, similarity of images, tone curves, and sums of packed bits."""
 
-from .noise import FluxRange as FluxRange
-from .noise import debiased as debiased
-from .noise import flux_std as flux_std
-from .noise import frame_variance as frame_variance
-from .noise import measurable_range as measurable_range
-from .noise import saturated as saturated
 from .packed import MAX_FRAMES as MAX_FRAMES
 from .packed import BitOrder as BitOrder
 from .packed import packed_along_width as packed_along_width
@@ -22,7 +16,13 @@ from .pictures import tone_mapped as tone_mapped
 from .responses import BinaryResponse as BinaryResponse
 from .responses import BinarySumResponse as BinarySumResponse
 from .responses import Factor as Factor
+from .responses import FluxRange as FluxRange
 from .responses import IntensityResponse as IntensityResponse
+from .responses import debiased as debiased
+from .responses import flux_std as flux_std
+from .responses import frame_variance as frame_variance
+from .responses import measurable_range as measurable_range
+from .responses import saturated as saturated
 from .similarity import LOCAL_PX as LOCAL_PX
 from .similarity import Similarity as Similarity
 from .similarity import autocorrelation as autocorrelation
