@@ -41,7 +41,7 @@ from photonpano.geometry import Canvas, FrameTrajectory, normalised, transform_p
 from photonpano.merging.canvas_plan import plan_canvas
 from photonpano.merging.panorama import render
 from photonpano.reading import Closing
-from photonpano.record.environment import peak_memory_bytes
+from photonpano.record.run_json import peak_memory_bytes
 
 sys.path.append(str(Path(__file__).parent / "baselines"))
 

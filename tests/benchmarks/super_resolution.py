@@ -46,7 +46,7 @@ from photonpano.geometry import FrameTrajectory
 from photonpano.merging.canvas_plan import plan_canvas
 from photonpano.merging.panorama import render
 from photonpano.pipeline.rendering import build_renderer
-from photonpano.record.environment import peak_memory_bytes
+from photonpano.record.run_json import peak_memory_bytes
 
 FLUXES = (0.5, 0.1, 0.02)
 THREADS = 2

@@ -27,7 +27,7 @@ from photonpano.pipeline.components import build_source
 from photonpano.plugins.contributions import SourceContribution
 from photonpano.plugins.registry import Catalog, discover
 from photonpano.plugins.registry.description import flow
-from photonpano.record.fingerprint import capture_files
+from photonpano.record.contents import capture_files
 from photonpano.specs import Plan
 from photonpano.text import columns, counted
 from photonpano.values import StreamInfo

@@ -20,8 +20,7 @@ from photonpano.files.folders import require_new
 from photonpano.geometry import Camera, canvas_of_box, nearest_rotations, outline_of
 from photonpano.pipeline.film import Film
 from photonpano.plugins.registry import Catalog
-from photonpano.record.contents import require_one_run
-from photonpano.record.fingerprint import capture_files
+from photonpano.record.contents import capture_files, require_one_run
 from photonpano.record.picture_files import Picture
 from photonpano.record.poses import Poses, read_colmap
 from photonpano.values import FloatArray

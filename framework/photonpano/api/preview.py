@@ -13,7 +13,7 @@ from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.files.folders import require_new
 from photonpano.pipeline.components import build_source
-from photonpano.record.fingerprint import capture_files
+from photonpano.record.contents import capture_files
 from photonpano.record.picture_files import advancing, require_writable, write_pictures
 from photonpano.report.preview import Style, pictures, preview_spans, white_flux
 from photonpano.specs import Plan

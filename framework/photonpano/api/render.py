@@ -19,9 +19,8 @@ from photonpano.merging.panorama import RenderedPanorama
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_folder import run_folder as writing_run_folder
 from photonpano.plugins.registry import Catalog
-from photonpano.record.environment import library_versions, peak_memory_bytes, plugin_records
-from photonpano.record.fingerprint import capture_files, fingerprint
-from photonpano.record.run_json import decision_records, panorama_record
+from photonpano.record.contents import capture_files, fingerprint
+from photonpano.record.run_json import decision_records, library_versions, panorama_record, peak_memory_bytes, plugin_records
 from photonpano.record.schema import RunRecord
 from photonpano.report.notebook import run_html
 from photonpano.values import Decision

@@ -11,9 +11,9 @@ from photonpano.api.command import command
 from photonpano.errors import InputError, SpecError
 from photonpano.pipeline.components import open_source
 from photonpano.plugins.registry import Catalog
-from photonpano.record.contents import changed_files, recorded_contents
-from photonpano.record.fingerprint import CaptureRecord, changes, fingerprint
+from photonpano.record.contents import changed_files, changes, fingerprint, recorded_contents
 from photonpano.record.run_json import read_record
+from photonpano.record.schema import CaptureRecord
 from photonpano.specs import parse_spec
 from photonpano.text import byte_size, counted
 

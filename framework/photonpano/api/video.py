@@ -28,7 +28,7 @@ from photonpano.motion.frame_motion import view_of
 from photonpano.pipeline.film import Film, merged
 from photonpano.pipeline.rendering import naming_key_of_canvas
 from photonpano.plugins.registry import Catalog
-from photonpano.record.fingerprint import capture_files
+from photonpano.record.contents import capture_files
 from photonpano.record.picture_files import advancing, require_writable, write_pictures
 from photonpano.text import byte_size, counted
 from photonpano.values import FrameSpan

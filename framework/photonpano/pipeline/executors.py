@@ -18,8 +18,8 @@ from photonpano.execution import CaptureElsewhere, Executor, LocalExecutor, diff
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.pipeline.components import build_source, built
 from photonpano.plugins.contributions import ExecutorContext
-from photonpano.record.environment import library_versions, plugin_records
-from photonpano.record.fingerprint import frames_sha256
+from photonpano.record.contents import frames_sha256
+from photonpano.record.run_json import library_versions, plugin_records
 from photonpano.specs.loading import parse_spec
 from photonpano.specs.plan import Plan
 

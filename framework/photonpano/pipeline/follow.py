@@ -26,7 +26,7 @@ from photonpano.execution.context import Progress
 from photonpano.files.atomic import atomic_path, locked
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.plugins.contributions import PartOfCapture, SourceContribution
-from photonpano.record.fingerprint import capture_files
+from photonpano.record.contents import capture_files
 from photonpano.report import LiveFigures, render_live
 from photonpano.specs.plan import Plan
 from photonpano.text import counted

@@ -20,7 +20,7 @@ from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.rendering import build_renderer
 from photonpano.pipeline.state import State, model_of
-from photonpano.record.environment import peak_memory_bytes
+from photonpano.record.run_json import peak_memory_bytes
 from photonpano.specs.plan import Plan
 from photonpano.values import FrameSpan
 

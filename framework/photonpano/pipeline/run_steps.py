@@ -26,10 +26,9 @@ from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.obstacles import order_warning
 from photonpano.pipeline.run_folder import RunFolder, run_folder
 from photonpano.pipeline.summary import require_photons
-from photonpano.record.environment import peak_memory_bytes
-from photonpano.record.fingerprint import CaptureRecord, capture_files, fingerprint
-from photonpano.record.run_json import level_record, started_record, verdict_of
-from photonpano.record.schema import RunRecord
+from photonpano.record.contents import capture_files, fingerprint
+from photonpano.record.run_json import level_record, peak_memory_bytes, started_record, verdict_of
+from photonpano.record.schema import CaptureRecord, RunRecord
 from photonpano.report import loading_figures, render_failure
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Verdict

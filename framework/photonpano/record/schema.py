@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NotRequired, TypedDict
 
-from photonpano.record.fingerprint import CaptureRecord
-
 
 class SourceRecord(TypedDict):
     """The capture."""
@@ -237,6 +235,31 @@ class FileContent(TypedDict):
 
     bytes: int
     sha256: str
+
+
+class FileRecord(TypedDict):
+    """A file, or a folder of files, that the source, a correction or the motion graph reads.
+
+    `bytes` is the size of all its files, `modified` the latest of their times, ISO 8601 in UTC; None where there is none.
+    `etag` is the mark that a server gives the content of a URL; None for other files.
+    """
+
+    path: str
+    bytes: int | None
+    modified: str | None
+    etag: str | None
+
+
+class CaptureRecord(TypedDict):
+    """The fingerprint of a capture.
+
+    `frames_sha256` is of sampled frames, as the source and the corrections of the spec give them. `pixels_sha256` is of the
+    mask and of what corrections make of a sum of frames.
+    """
+
+    files: Sequence[FileRecord]
+    frames_sha256: str
+    pixels_sha256: str
 
 
 class RunRecord(TypedDict):

@@ -9,7 +9,7 @@ import pytest
 import photonpano
 from photonpano import Config, Plan, RefinerContribution, capture_plan, convert, discover, explain, info, parse_spec, simulate
 from photonpano.api.cli.app import commands
-from photonpano.record.environment import plugin_records
+from photonpano.record.run_json import plugin_records
 
 
 @pytest.fixture

@@ -31,7 +31,8 @@ from photonpano.pipeline.components import build_source
 from photonpano.pipeline.obstacles import naming_obstacles, obstacles, order_warning, repetition_px, timeline_of
 from photonpano.pipeline.summary import require_photons
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource
-from photonpano.record.fingerprint import CaptureRecord, changes, fingerprint
+from photonpano.record.contents import changes, fingerprint
+from photonpano.record.schema import CaptureRecord
 from photonpano.testing import MemorySource
 from photonpano.values import Decision
 from photonpano_simulator.travel.truth import sharp_view, truth_of

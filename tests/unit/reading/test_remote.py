@@ -15,7 +15,7 @@ import pytest
 from photonpano import FrameSpan, InputError, SpecError, Url, capture_plan, discover, info, parse_spec, run
 from photonpano.pipeline.components import build_source
 from photonpano.reading import read_range, size_of
-from photonpano.record.fingerprint import changes, fingerprint
+from photonpano.record.contents import changes, fingerprint
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (3000, 64, 32), np.uint8)
 FRAME_BYTES = 64 * 32

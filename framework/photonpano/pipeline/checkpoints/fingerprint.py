@@ -14,11 +14,9 @@ from typing import Any
 import photonpano
 from photonpano.errors import InputError
 from photonpano.pipeline.components import scale_of
-from photonpano.record.contents import changed_files
-from photonpano.record.environment import library_versions, plugin_records
-from photonpano.record.fingerprint import CaptureRecord, changes
-from photonpano.record.run_json import read_record
-from photonpano.record.schema import RunRecord
+from photonpano.record.contents import changed_files, changes
+from photonpano.record.run_json import library_versions, plugin_records, read_record
+from photonpano.record.schema import CaptureRecord, RunRecord
 from photonpano.specs.plan import Choice, Plan
 
 Fingerprint = dict[str, Any]

@@ -24,7 +24,7 @@ from photonpano.pipeline.checkpoints.work_folder import (
     path_of,
     work_folder,
 )
-from photonpano.record.fingerprint import CaptureRecord
+from photonpano.record.schema import CaptureRecord
 from photonpano.values import Decision
 
 RESUMING = Continuation(resume=True)
