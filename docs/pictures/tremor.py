@@ -12,7 +12,7 @@ from harness import Compared, Study, groups, packed, rendered, simulator
 from photonpano import video
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas
-from photonpano.report.residual_figures import spectrum_over_noise
+from photonpano.report.figures import spectrum_over_noise
 from photonpano.residuals.measure import measure
 from photonpano.residuals.prediction import Predictions
 

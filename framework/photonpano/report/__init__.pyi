@@ -1,10 +1,10 @@
-from .batch_page import render_batch as render_batch
-from .comparison_page import ComparedRun as ComparedRun
-from .comparison_page import render_comparison as render_comparison
 from .drawing import loading_figures as loading_figures
-from .failure_page import render_failure as render_failure
 from .live_page import LiveFigures as LiveFigures
 from .live_page import render_live as render_live
+from .other_pages import ComparedRun as ComparedRun
+from .other_pages import render_batch as render_batch
+from .other_pages import render_comparison as render_comparison
+from .other_pages import render_failure as render_failure
 from .page import OpenCapture as OpenCapture
 from .page import render_report as render_report
 from .pose_page import render_pose_report as render_pose_report

@@ -1,4 +1,7 @@
-"""What the figures of the report share: inline SVG whose colours the page's style sheet decides, for light, dark and print."""
+"""What pages and figures of the report share: templates that are filled, and inline SVG.
+
+The page's style sheet decides the colours of a figure, for light, dark and print.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +9,21 @@ import base64
 import importlib
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:  # importing matplotlib takes a second
+from photonpano import text
+from photonpano.record.batch_row import written
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure
@@ -272,3 +280,38 @@ def jpeg_uri(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> str:
     in_opencv_order = image if image.ndim == 2 else image[..., ::-1]
     _, encoded = cv2.imencode(".jpg", in_opencv_order, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+def filled(template: str, **values: Any) -> str:
+    """Return the page that a template makes of its values."""
+    page: str = _environment().get_template(template).render(**values)
+    return page
+
+
+@cache
+def _environment() -> Environment:
+    """Return the environment of the templates, with filters that write numbers."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("photonpano.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for name in ("byte_size", "count", "counted", "duration", "pixels", "rate", "share", "span"):
+        environment.filters[name] = getattr(text, name)
+    environment.filters["setting"] = written
+    return environment
+
+
+def yaml_of(document: Mapping[str, Any]) -> str:
+    """Write a spec as YAML."""
+    from ruamel.yaml import YAML
+
+    yaml = YAML()
+    yaml.width = 100
+    buffer = io.StringIO()
+    yaml.dump(document, buffer)
+    return buffer.getvalue()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from time import time_ns
 from typing import Literal
 
-from photonpano.report.environment import filled
+from photonpano.report.drawing import filled
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,9 +19,8 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.record.contents import RECORD
 from photonpano.record.schema import FailureRecord, FileContent, LevelRecord, RunRecord
-from photonpano.report import figures, residual_figures
-from photonpano.report.drawing import jpeg_uri, shrunk
-from photonpano.report.environment import filled, yaml_of
+from photonpano.report import figures
+from photonpano.report.drawing import filled, jpeg_uri, shrunk, yaml_of
 from photonpano.report.viewer import viewer_data
 from photonpano.residuals.refinement import Explained
 from photonpano.text import counted
@@ -61,7 +60,7 @@ def render_report(
         files=files,
         more_files=more_files,
         viewer=None if capture is None else viewer_data(record, explained, panorama, capture.source, capture.levels),
-        flicker_over_panorama=residual_figures.flicker_over_panorama(light, panorama.canvas),
+        flicker_over_panorama=figures.flicker_over_panorama(light, panorama.canvas),
         **_motion(record, explained.motion, panorama),
         **_unexplained(record, explained, panorama),
     )
@@ -84,12 +83,12 @@ def _unexplained(record: RunRecord, explained: Explained, panorama: RenderedPano
     residuals, canvas = explained.residuals, panorama.canvas
     return {
         "reduced_chi2": float(residuals.reduced_chi2.mean()),
-        "chi2_over_panorama": residual_figures.chi2_over_panorama(residuals, explained.canvas, canvas),
-        "over_sensor": residual_figures.over_sensor(residuals),
-        "shifts_are_drawn": residual_figures.significant_shifts(residuals) is not None,
-        "shifts_over_time": residual_figures.shifts_over_time(residuals, record["source"]["frame_rate_hz"]),
-        "halves_over_time": residual_figures.halves_over_time(explained.halves, residuals.spans[-1].stop),
-        "light_over_time": residual_figures.light_over_time(residuals),
+        "chi2_over_panorama": figures.chi2_over_panorama(residuals, explained.canvas, canvas),
+        "over_sensor": figures.over_sensor(residuals),
+        "shifts_are_drawn": figures.significant_shifts(residuals) is not None,
+        "shifts_over_time": figures.shifts_over_time(residuals, record["source"]["frame_rate_hz"]),
+        "halves_over_time": figures.halves_over_time(explained.halves, residuals.spans[-1].stop),
+        "light_over_time": figures.light_over_time(residuals),
         "span_frames": int(np.median([len(span) for span in residuals.spans])),
     }
 

@@ -14,8 +14,18 @@ import numpy as np
 from photonpano.geometry import nearest_rotations, positions_of
 from photonpano.photometry import linear_to_srgb
 from photonpano.record.schema import RunRecord
-from photonpano.report.drawing import INK, MUTED, SERIES, WIDTH_IN, Margins, add_axes, add_time_axis, plain_figure, svg_of
-from photonpano.report.environment import filled
+from photonpano.report.drawing import (
+    INK,
+    MUTED,
+    SERIES,
+    WIDTH_IN,
+    Margins,
+    add_axes,
+    add_time_axis,
+    filled,
+    plain_figure,
+    svg_of,
+)
 from photonpano.report.page import head_of
 from photonpano.values import FloatArray, PoseEstimate
 

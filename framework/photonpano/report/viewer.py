@@ -20,9 +20,8 @@ from photonpano.motion.loop import LevelResult
 from photonpano.photometry import balanced, tone_mapped
 from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
-from photonpano.report.figures import centre_of, instants_of, places_on
+from photonpano.report.figures import centre_of, chi2_cells, instants_of, places_on, same_projection
 from photonpano.report.preview import still_exposure
-from photonpano.report.residual_figures import chi2_cells, same_projection
 from photonpano.residuals.refinement import Explained, distance_to_nearest
 from photonpano.values import Background, FloatArray, FluxImage, FrameSpan
 

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 
 from photonpano import FrameSpan, Group, LocationError, NotLocated
 from photonpano.motion.diagnosis import UntiedError
-from photonpano.report import figures, render_failure, render_report, residual_figures
+from photonpano.report import figures, render_failure, render_report
 from photonpano.report.page import failure_groups
 from photonpano.values import Edge
 
@@ -21,10 +21,9 @@ from photonpano.values import Edge
 @pytest.fixture
 def no_figures(monkeypatch):
     """Leave out the figures, whose drawing takes a second, where a test is about the words."""
-    for name in ("path_over_time", "path_on_panorama", "coverage_map", "stage_times"):
+    of_motion = "path_over_time", "path_on_panorama", "coverage_map", "stage_times"
+    for name in (*of_motion, "chi2_over_panorama", "over_sensor", "shifts_over_time", "halves_over_time"):
         monkeypatch.setattr(figures, name, lambda *_: "")
-    for name in ("chi2_over_panorama", "over_sensor", "shifts_over_time", "halves_over_time"):
-        monkeypatch.setattr(residual_figures, name, lambda *_: "")
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import Canvas, transform_points
-from photonpano.report import residual_figures
+from photonpano.report import figures
 from photonpano.report.pose_page import path_views, scene_views, viewpoints
 from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX
 from photonpano.values import Light, PoseEstimate, ScenePoints
@@ -19,9 +19,9 @@ CANVAS = Canvas(300, 1240, np.eye(3))
 
 def test_figures_use_colour_variables_of_page(residuals):
     for svg in (
-        residual_figures.chi2_over_panorama(residuals, CANVAS, CANVAS),
-        residual_figures.over_sensor(residuals),
-        residual_figures.shifts_over_time(residuals, None),
+        figures.chi2_over_panorama(residuals, CANVAS, CANVAS),
+        figures.over_sensor(residuals),
+        figures.shifts_over_time(residuals, None),
     ):
         ElementTree.fromstring(svg)
         assert not re.search("#0101|#0102", svg)
@@ -31,18 +31,18 @@ def test_figures_use_colour_variables_of_page(residuals):
 
 
 def test_light_is_drawn_only_if_it_changes(residuals):
-    assert residual_figures.light_over_time(residuals) is None
-    svg = residual_figures.light_over_time(replace(residuals, light=np.linspace(0.5, 1.5, len(residuals.spans))))
+    assert figures.light_over_time(residuals) is None
+    svg = figures.light_over_time(replace(residuals, light=np.linspace(0.5, 1.5, len(residuals.spans))))
     ElementTree.fromstring(svg)
     assert "light / mean" in svg
 
 
 def test_flicker_is_drawn_only_where_places_have_their_own():
     gain = np.ones(100)
-    assert residual_figures.flicker_over_panorama(None, Canvas(60, 90, np.eye(3))) is None
-    assert residual_figures.flicker_over_panorama(Light.of_frames(gain), Canvas(60, 90, np.eye(3))) is None
+    assert figures.flicker_over_panorama(None, Canvas(60, 90, np.eye(3))) is None
+    assert figures.flicker_over_panorama(Light.of_frames(gain), Canvas(60, 90, np.eye(3))) is None
     waves, maps = np.zeros((2, 100)), np.stack([np.linspace(0, 0.8, 90 * 60).reshape(60, 90)] * 2).astype(np.float32)
-    svg = residual_figures.flicker_over_panorama(Light(gain, waves, maps, np.eye(3), 0.1, gain), Canvas(60, 90, np.eye(3)))
+    svg = figures.flicker_over_panorama(Light(gain, waves, maps, np.eye(3), 0.1, gain), Canvas(60, 90, np.eye(3)))
     ElementTree.fromstring(svg)
     assert "flicker / mean light" in svg
     assert "phase (degrees)" in svg
@@ -55,22 +55,22 @@ def test_flicker_of_large_panorama_is_that_of_the_middles_of_its_squares(monkeyp
         asked.append(canvas)
         return [np.ones(canvas.shape)] * 2
 
-    monkeypatch.setattr(residual_figures, "amplitudes_on", even)
+    monkeypatch.setattr(figures, "amplitudes_on", even)
     light = Light(np.ones(9), np.zeros((2, 9)), np.zeros((2, 3, 3), np.float32), np.eye(3), 0.1, np.ones(9))
-    residual_figures.flicker_over_panorama(light, Canvas(500, 1000, np.eye(3)))
+    figures.flicker_over_panorama(light, Canvas(500, 1000, np.eye(3)))
     assert asked[0].shape == (100, 200)
     np.testing.assert_allclose(transform_points(asked[0].transform, [[2.0, 2.0]]), [[0, 0]], atol=1e-12)
 
 
 def test_spectrum_of_noise_is_one(residuals):
-    frequencies, power = residual_figures.spectrum_over_noise(residuals)
+    frequencies, power = figures.spectrum_over_noise(residuals)
     assert (len(frequencies), frequencies[-1]) == (len(power), pytest.approx(1 / 32, rel=0.01))
     # Interpolation is expected to add 0.015 px to a noise of 0.03 px.
     assert power.mean() == pytest.approx(1 / (1 + 0.015**2 / 0.03**2), rel=0.1)
 
 
 def test_spectrum_peaks_at_period_of_tremor(tremor):
-    frequencies, power = residual_figures.spectrum_over_noise(tremor)
+    frequencies, power = figures.spectrum_over_noise(tremor)
     assert 1 / frequencies[power.argmax()] == pytest.approx(100, rel=0.02)
     assert power.max() > 100
 
@@ -78,24 +78,24 @@ def test_spectrum_peaks_at_period_of_tremor(tremor):
 def test_spectrum_ignores_spans_without_information(tremor):
     normal = tremor.normal.copy()
     normal[::7] = 0
-    frequencies, power = residual_figures.spectrum_over_noise(replace(tremor, normal=normal))
+    frequencies, power = figures.spectrum_over_noise(replace(tremor, normal=normal))
     assert 1 / frequencies[power.argmax()] == pytest.approx(100, rel=0.02)
 
 
 @pytest.mark.parametrize(("rate", "label"), [(None, "cycles per frame"), (96_800.0, "frequency (Hz)")])
 def test_spectrum_names_its_unit(residuals, rate, label):
-    assert label in residual_figures.shifts_over_time(residuals, rate)
+    assert label in figures.shifts_over_time(residuals, rate)
 
 
 def test_shifts_of_blocks_are_drawn_if_significant(residuals):
-    assert residual_figures.significant_shifts(residuals) is None
+    assert figures.significant_shifts(residuals) is None
     blocks = residuals.blocks.copy()
     blocks[..., GX_R] = 0.2 * blocks[..., GXX]
-    places, shifts = residual_figures.significant_shifts(replace(residuals, blocks=blocks))
+    places, shifts = figures.significant_shifts(replace(residuals, blocks=blocks))
     np.testing.assert_allclose(shifts, np.broadcast_to([0.2, 0], shifts.shape), atol=1e-12)
     np.testing.assert_allclose(places[0], (BLOCK_PX - 1) / 2)
     np.testing.assert_allclose(places[-1], [(480 + 495) / 2, (240 + 253) / 2])
-    assert "0.2 px" in residual_figures.over_sensor(replace(residuals, blocks=blocks))
+    assert "0.2 px" in figures.over_sensor(replace(residuals, blocks=blocks))
 
 
 def test_figures_draw_residuals_of_a_single_span_that_saw_nothing(residuals):
@@ -111,9 +111,9 @@ def test_figures_draw_residuals_of_a_single_span_that_saw_nothing(residuals):
         cell_count=0 * residuals.cell_count,
     )
     for svg in (
-        residual_figures.chi2_over_panorama(nothing, CANVAS, CANVAS),
-        residual_figures.over_sensor(nothing),
-        residual_figures.shifts_over_time(nothing, 100.0),
+        figures.chi2_over_panorama(nothing, CANVAS, CANVAS),
+        figures.over_sensor(nothing),
+        figures.shifts_over_time(nothing, 100.0),
     ):
         ElementTree.fromstring(svg)
 
