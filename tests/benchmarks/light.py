@@ -22,7 +22,7 @@ from photonpano import LocationError, parse_spec
 from photonpano.capture.writing import truth_path
 from photonpano.corrections import divided_by
 from photonpano.corrections.lighting import LIGHT_DECISION, find_light, in_light, in_light_of
-from photonpano.evaluation.images import covered, image_score, true_panorama, white_flux
+from photonpano.evaluation.scores import covered, image_score, true_panorama, white_flux
 from photonpano.execution.context import Context
 from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import estimate_motion

@@ -15,8 +15,8 @@ from photonpano.api.command import command
 from photonpano.capture.writing import truth_path
 from photonpano.errors import InputError, OutputError
 from photonpano.evaluation import evaluate, load_run_trajectory
-from photonpano.evaluation.comparison import motion_difference, on_canvas, reduced
 from photonpano.evaluation.inputs import RunTrajectory
+from photonpano.evaluation.run_scores import motion_difference, on_canvas, reduced
 from photonpano.files.atomic import atomic_path
 from photonpano.files.folders import require_new
 from photonpano.record.contents import require_one_run

@@ -1,8 +1,3 @@
-from .images import ImageScore as ImageScore
-from .images import covered as covered
-from .images import image_score as image_score
-from .images import true_panorama as true_panorama
-from .images import white_flux as white_flux
 from .inputs import RunTrajectory as RunTrajectory
 from .inputs import Truth as Truth
 from .inputs import load_panorama as load_panorama
@@ -17,6 +12,11 @@ from .poses import load_run_poses as load_run_poses
 from .poses import pose_errors as pose_errors
 from .run_scores import Evaluation as Evaluation
 from .run_scores import evaluate as evaluate
-from .trajectory import RotationScore as RotationScore
-from .trajectory import TrajectoryScore as TrajectoryScore
-from .trajectory import corner_errors as corner_errors
+from .scores import ImageScore as ImageScore
+from .scores import RotationScore as RotationScore
+from .scores import TrajectoryScore as TrajectoryScore
+from .scores import corner_errors as corner_errors
+from .scores import covered as covered
+from .scores import image_score as image_score
+from .scores import true_panorama as true_panorama
+from .scores import white_flux as white_flux

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.evaluation.trajectory import Turn
+from photonpano.evaluation.scores import Turn
 from photonpano.geometry import (
     PROJECTIONS,
     Camera,

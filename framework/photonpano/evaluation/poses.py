@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.evaluation.trajectory import of_focal_length
+from photonpano.evaluation.scores import of_focal_length
 from photonpano.geometry import Camera, nearest_rotations, positions_of, rotation_vectors
 from photonpano.notebooks import facts
 from photonpano.reading import read_arrays

@@ -11,7 +11,7 @@ import numpy as np
 
 from photonpano.errors import InputError
 from photonpano.evaluation.inputs import RunTrajectory, Truth, frame_shape_of, load_run_trajectory, read_numbers
-from photonpano.evaluation.trajectory import corner_errors
+from photonpano.evaluation.scores import corner_errors
 from photonpano.geometry import Camera, normalised, rescaling, scaled_ahead, translation
 from photonpano.reading import reading
 from photonpano.values import BoolArray, FloatArray, Homography

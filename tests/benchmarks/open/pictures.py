@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.evaluation.images import true_panorama, white_flux
 from photonpano.evaluation.inputs import Truth
+from photonpano.evaluation.scores import true_panorama, white_flux
 from photonpano.geometry import Canvas, corners, transform_points, translation
 from photonpano.photometry import linear_to_srgb, srgb_to_linear
 from photonpano.reading import read_picture

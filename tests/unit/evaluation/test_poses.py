@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from photonpano import InputError, evaluate, evaluate_poses, evaluation
 from photonpano.api.cli.app import app
 from photonpano.evaluation import load_truth, pose_errors, true_panorama
-from photonpano.evaluation.trajectory import of_focal_length
+from photonpano.evaluation.scores import of_focal_length
 from photonpano.geometry import Camera, Canvas, corners, rotation_matrices, translation
 
 N_FRAMES, RATE = 200, 1000.0
