@@ -197,7 +197,7 @@ def test_sums_have_the_response_of_their_number(tmp_path: Path, dtype: Any, last
 
 
 def test_long_span_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.reading.packed_files._READ_BYTES", 7 * 6 * 19)
+    monkeypatch.setattr("photonpano.reading.sources._READ_BYTES", 7 * 6 * 19)
     with unpacked(saved(tmp_path / "cube.npy", BITS), holds="bits") as source:
         np.testing.assert_array_equal(source.frames(source.info.span), BITS)
         np.testing.assert_array_equal(source.counts(FrameSpan(1, 40)), BITS[1:].sum(axis=0))
