@@ -1,12 +1,19 @@
-"""What all locators that align brightness share: from coarse to fine, and from aligned images to an accepted motion."""
+"""What all locators that align brightness share: from coarse to fine, and from aligned images to an accepted motion.
+
+The shift to start from is found by phase correlation (Kuglin and Hines 1975). Objects that move by themselves do not follow the
+camera: the part of an image that follows a motion is found.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from photonpano.geometry import corners, generators, jacobian, rescaled, slopes, unit_coordinates, why_implausible
 from photonpano.locating.configs import ImageLimits
@@ -199,3 +206,205 @@ def _common_curvature(
     values, vectors = np.linalg.eigh(whitening @ (between + between.T) @ whitening.T / 2)
     half = root @ vectors * np.sqrt(np.maximum(values, MIN_COMMON_CURVATURE))
     return np.asarray(half @ half.T)
+
+
+_SIDE_PX = 7  # side of the square in which two images are compared, px
+# Relative variance of the difference of two aligned images from which on they differ: 0 for equal, 1 for unrelated images.
+_DIFFERENT = 0.5
+_STANDARD_ERRORS = 4.0  # by which the variances must exceed those of noise
+_ALIKE = 0.25  # largest relative variance of an aligned part
+_BORDER_PX = 2  # width of the mixed border around parts that move otherwise, px
+_REST_PX = 4.0  # standard deviation of the Gaussian that smooths the weights of what does not follow, px
+_SUSPECT = 0.12  # mean difference, each at most 0.5, above which other motions are tried: noise and blur leave less
+# Share of the image from which on a part that shows something different may move otherwise: noise leaves no such part.
+_SUSPECT_SHARE = 0.03
+_CLEARLY = 0.5  # a pixel clearly follows the motion that leaves less than half of the difference of another one
+
+
+class Follows(NamedTuple):
+    """What follows a motion."""
+
+    # (H, W) float32, local variance of the difference of the aligned images relative to the sum of their variances, from 0 to
+    # 1; NaN without enough texture
+    difference: NDArray[np.float32]
+
+    @property
+    def part(self) -> BoolArray:
+        """(H, W), True where the image follows, and where it lacks texture."""
+        return ~(self.difference > _ALIKE)
+
+    @property
+    def inner(self) -> BoolArray:
+        """(H, W), that part without the border of larger parts that do not follow."""
+        beyond = cv2.dilate(_opened(~self.part), np.ones((2 * _BORDER_PX + 1, 2 * _BORDER_PX + 1), np.uint8)) > 0
+        return np.asarray(self.part & ~beyond)
+
+    @property
+    def rest(self) -> NDArray[np.float32]:
+        """(H, W) weights of what does not follow, without edges that would correlate with themselves."""
+        smooth = cv2.GaussianBlur(np.nan_to_num(self.difference), (0, 0), _REST_PX)
+        return np.asarray(np.maximum(2 * smooth / max(float(smooth.max()), 1e-6) - 1, 0), np.float32)
+
+    def rather_than(self, other: Follows) -> BoolArray:
+        """(H, W), True where the image clearly follows this motion and not another one."""
+        return np.asarray(self.difference < _CLEARLY * other.difference)
+
+    @property
+    def suspect(self) -> bool:
+        """Whether a part of the image may move otherwise."""
+        textured = self.difference[np.isfinite(self.difference)]
+        mean = float(np.minimum(textured, _DIFFERENT).mean()) if textured.size else 0.0
+        return mean > _SUSPECT or float(_opened(self.difference > _DIFFERENT).mean()) > _SUSPECT_SHARE
+
+    def extent_beyond(self, other: Follows) -> float:
+        """Return how large the part is that clearly follows this motion and not another one, and how far it spreads.
+
+        The scene surrounds an object, so an area counts by its extent: the number of its pixels times the standard deviations
+        of their coordinates.
+        """
+        y, x = np.nonzero(self.rather_than(other))
+        return float(len(y) * y.std() * x.std()) if len(y) else 0.0
+
+    def more_than(self, other: Follows, trust: float = 1.0) -> bool:
+        """Whether the part that clearly follows this motion is larger, and spreads further, than that of another motion.
+
+        Args:
+            other: what follows the other motion.
+            trust: factor on the extent of this part, for a motion that is known from elsewhere.
+        """
+        return trust * self.extent_beyond(other) > other.extent_beyond(self)
+
+
+def follows(
+    moving: NDArray[np.float32], fixed: NDArray[np.float32], noise: NDArray[np.float32], noise_left: float = 1.0
+) -> Follows:
+    """Find the part of an image that follows the motion by which another one was aligned to it.
+
+    Args:
+        moving: (H, W) the image.
+        fixed: (H, W) the other one, seen along the motion.
+        noise: (H, W) variance of the noise of their difference; infinite where either was not seen.
+        noise_left: share of the variance of white noise that the blur of the images left, which makes neighbours alike.
+    """
+    seen = np.isfinite(noise).astype(np.float32)
+    near = _averaged(seen)
+    own = np.asarray(_averaged(np.where(seen > 0, noise, np.float32(0))) / np.maximum(near, np.float32(1e-6)), np.float32)
+    difference, first, second = (_variance(image * seen, near) for image in (fixed - moving, moving, fixed))
+    chance = np.float32(_STANDARD_ERRORS * np.sqrt(2 / (_SIDE_PX**2 * noise_left))) * own
+    texture = first + second - own
+    textured = (near > _DIFFERENT) & (seen > 0) & (texture > chance)
+    relative = np.clip((difference - own) / np.maximum(texture, np.float32(1e-12)), 0, 1)
+    return Follows(np.where(textured, relative, np.float32(np.nan)).astype(np.float32))
+
+
+def _opened(part: BoolArray) -> NDArray[np.uint8]:
+    """Return the squares that fit into a part of an image: 1 there, 0 elsewhere."""
+    square = np.ones((_SIDE_PX, _SIDE_PX), np.uint8)
+    return np.asarray(cv2.morphologyEx(part.astype(np.uint8), cv2.MORPH_OPEN, square), np.uint8)
+
+
+def _variance(image: NDArray[np.float32], near: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the variance in the square around each pixel; `image` is 0 where nothing is seen."""
+    near = np.maximum(near, np.float32(1e-6))
+    return np.asarray(_averaged(image * image) / near - (_averaged(image) / near) ** 2, np.float32)
+
+
+def _averaged(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.blur(image, (_SIDE_PX, _SIDE_PX)), np.float32)
+
+
+_TAPER = 0.25  # the window falls to 0 at masked pixels, over this fraction of the shorter side
+
+
+def shift_between(moving: View, fixed: View, peak_px: float = 1.5) -> FloatArray | None:
+    """Return the shift (x, y) in px that maps `moving` to `fixed`; None without overlap or without texture.
+
+    Args:
+        moving: one image.
+        fixed: the other one, on the same grid.
+        peak_px: see `shift_of_spectra`.
+    """
+    both = moving.seen & fixed.seen
+    if not both.any():
+        return None
+    # Without a window, which falls to 0 at the borders of what was seen, these would correlate: they do not move.
+    distance = cv2.distanceTransform(np.pad(both, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    window = np.sin(np.pi / 2 * np.minimum(distance / (_TAPER * min(both.shape)), 1)) ** 2
+    first, second = (window * (view.image - view.image[both].mean()) for view in (moving, fixed))
+    return shift_of_spectra(fft.rfft2(first), fft.rfft2(second), both.shape, peak_px, gaussian_peak=True)
+
+
+def shift_of_spectra(
+    moving: NDArray[np.complexfloating],
+    fixed: NDArray[np.complexfloating],
+    shape: tuple[int, ...],
+    peak_px: float,
+    *,
+    gaussian_peak: bool,
+) -> FloatArray | None:
+    """Return the shift (x, y) in px between two windowed images of mean 0, (H, W), from their spectra; None without texture.
+
+    The inverse transform of the normalised cross-power spectrum peaks at the shift. All frequencies have the same weight in it,
+    also those that hold only noise; so it is blurred, which makes the peak a Gaussian of the standard deviation `peak_px`. It
+    is located by a Gaussian through three values, or by a parabola. The spectra are (H, W // 2 + 1).
+    """
+    surface = correlation_surface(fixed * moving.conj(), shape, peak_px)
+    if surface is None:
+        return None
+    row, column = np.unravel_index(int(surface.argmax()), surface.shape)
+    return _refined(surface, int(row), int(column), gaussian_peak)
+
+
+def correlation_surface(cross: NDArray[np.complexfloating], shape: tuple[int, ...], peak_px: float) -> FloatArray | None:
+    """Return the phase correlation of two images at each cyclic shift, (H, W), row by row from 0; None without texture.
+
+    Args:
+        cross: (H, W // 2 + 1) spectrum of the fixed image times the conjugate spectrum of the moving one. Spectra of several
+            pairs with one shift may be summed.
+        shape: (height, width) of the images.
+        peak_px: standard deviation of the peak, in px.
+    """
+    amplitude = np.abs(cross)
+    if not amplitude.max() > 0:
+        return None
+    return np.asarray(fft.irfft2(_blur(shape, peak_px) * cross / np.maximum(amplitude, 1e-12 * amplitude.max()), s=shape))
+
+
+def correlation_peaks(surface: FloatArray, least: float, most: int = 8) -> tuple[FloatArray, FloatArray]:
+    """Return the shifts (x, y) of the highest local maxima of a phase correlation, (P, 2) in px, and their heights, (P,).
+
+    Args:
+        surface: (H, W), from `correlation_surface`.
+        least: height of the lowest peak, as a share of the highest.
+        most: largest number of peaks, the highest first.
+    """
+    padded = np.pad(surface.astype(np.float32), 1, mode="wrap")
+    highest_near = cv2.dilate(padded, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
+    rows, columns = np.nonzero((padded[1:-1, 1:-1] >= highest_near) & (surface >= least * surface.max()))
+    order = np.argsort(-surface[rows, columns], kind="stable")[:most]
+    shifts = [_refined(surface, int(rows[index]), int(columns[index]), gaussian=True) for index in order]
+    return np.array(shifts).reshape(-1, 2), np.asarray(surface[rows[order], columns[order]])
+
+
+def _refined(surface: FloatArray, row: int, column: int, gaussian: bool) -> FloatArray:
+    """Return the shift (x, y) of a local maximum, to a fraction of a pixel."""
+    height, width = surface.shape
+    y = row + _vertex(surface[[row - 1, row, (row + 1) % height], column], gaussian)
+    x = column + _vertex(surface[row, [column - 1, column, (column + 1) % width]], gaussian)
+    # Shifts beyond half of the image come out as negative ones.
+    return np.array([(x + width / 2) % width - width / 2, (y + height / 2) % height - height / 2])
+
+
+@cache
+def _blur(shape: tuple[int, ...], peak_px: float) -> FloatArray:
+    """Return the spectrum of a Gaussian: (H, W // 2 + 1)."""
+    height, width = shape
+    down, across = np.meshgrid(fft.fftfreq(height), fft.rfftfreq(width), indexing="ij")
+    return np.asarray(np.exp(-2 * (np.pi * peak_px) ** 2 * (down**2 + across**2)))
+
+
+def _vertex(values: FloatArray, gaussian: bool) -> float:
+    """Return where the curve through three values is highest, from the middle one, which is the largest of them."""
+    before, here, after = np.log(np.maximum(values, 1e-3 * values[1])) if gaussian else values
+    curvature = before - 2 * here + after
+    return float((before - after) / (2 * curvature)) if curvature < 0 else 0.0

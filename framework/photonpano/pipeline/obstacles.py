@@ -15,7 +15,7 @@ from photonpano.capture import Capture, capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, LocationError
 from photonpano.execution.context import Context
-from photonpano.locating.phase import correlation_peaks
+from photonpano.locating.images import correlation_peaks
 from photonpano.merging import binned_mean, binning_of
 from photonpano.merging.accumulate import weights_of
 from photonpano.motion.timeline import Timeline

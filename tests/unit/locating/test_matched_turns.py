@@ -12,7 +12,7 @@ from scipy.stats import binom
 from photonpano import Located, LocatesTurns, NotLocated, VirtualExposure
 from photonpano.geometry import Camera, corner_displacements, parameters, rotation_matrices, scaled_ahead, transform_points
 from photonpano.locating import Matches, MatchingConfig, PointLocator, turn_of
-from photonpano.locating.matched_turns import agreeing_by_chance, distinct, rotation_of_most
+from photonpano.locating.points import agreeing_by_chance, distinct, rotation_of_most
 
 SHAPE = (160, 240)
 CAMERA = Camera.of(300.0, SHAPE)
