@@ -38,8 +38,7 @@ from photonpano.evaluation import (
 )
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas, FrameTrajectory, normalised, transform_points
-from photonpano.merging.canvas_plan import plan_canvas
-from photonpano.merging.panorama import render
+from photonpano.merging.panorama import plan_canvas, render
 from photonpano.reading import Closing
 from photonpano.record.run_json import peak_memory_bytes
 

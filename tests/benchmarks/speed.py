@@ -39,9 +39,8 @@ from photonpano.capture.writing import truth_path
 from photonpano.contracts.protocols import Source
 from photonpano.evaluation import load_truth
 from photonpano.geometry import Camera, FrameTrajectory, inverse, rotation_matrices, translation
-from photonpano.merging.canvas_plan import View, plan_canvas
-from photonpano.merging.footprints import footprints_of
-from photonpano.merging.warping import Grid, Texture, add_warped
+from photonpano.merging.panorama import View, plan_canvas
+from photonpano.merging.warping import Grid, Texture, add_warped, footprints_of
 from photonpano.values import FloatArray
 from photonpano_core.configs import MidpointConfig, PhotonMleConfig
 from photonpano_core.mergers.photon_mle import PhotonMleMerger

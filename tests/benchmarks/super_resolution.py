@@ -43,8 +43,7 @@ from photonpano.capture.writing import truth_path
 from photonpano.evaluation import covered, load_truth
 from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory
-from photonpano.merging.canvas_plan import plan_canvas
-from photonpano.merging.panorama import render
+from photonpano.merging.panorama import plan_canvas, render
 from photonpano.pipeline.rendering import build_renderer
 from photonpano.record.run_json import peak_memory_bytes
 

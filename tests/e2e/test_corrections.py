@@ -17,8 +17,7 @@ from photonpano.api.cli.app import app
 from photonpano.capture.writing import truth_path, write_packed
 from photonpano.evaluation import Evaluation
 from photonpano.execution.context import Context
-from photonpano.merging.canvas_plan import plan_canvas
-from photonpano.merging.panorama import render
+from photonpano.merging.panorama import plan_canvas, render
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.forecast import forecast
 from photonpano.specs import parse_spec

@@ -16,7 +16,7 @@ import tifffile
 import photonpano
 from photonpano import Config, ExporterContribution, PluginError, discover
 from photonpano.geometry import translation
-from photonpano.merging.canvas_plan import BYTES_PER_PIXEL
+from photonpano.merging.panorama import BYTES_PER_PIXEL
 from photonpano.pipeline.run import RunResult
 from photonpano.record.contents import changed_files
 from photonpano.specs import parse_spec

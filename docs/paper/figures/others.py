@@ -32,7 +32,7 @@ from photonpano import FrameSpan, Panorama, PhotonpanoError, evaluate_poses, loa
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import align_positions
 from photonpano.geometry import FrameTrajectory, positions_of
-from photonpano.merging.canvas_plan import plan_canvas
+from photonpano.merging.panorama import plan_canvas
 
 APERTURES = {"f/8": 1 / 8, "f/5.6": 1 / 4, "f/4": 1 / 2, "f/2.8": 1.0}  # and their light, relative to the spec
 SHOWN = ("f/5.6", "f/2.8")  # the paper's apertures

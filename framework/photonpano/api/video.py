@@ -21,9 +21,9 @@ from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.files.folders import require_new
 from photonpano.geometry import canvas_of_box
-from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, box_of, plan_canvas
+from photonpano.merging.accumulate import bytes_of_light
 from photonpano.merging.colour import channels_of
-from photonpano.merging.light import bytes_of_light
+from photonpano.merging.panorama import BYTES_PER_PIXEL, box_of, plan_canvas
 from photonpano.motion.frame_motion import view_of
 from photonpano.pipeline.film import Film, merged
 from photonpano.pipeline.rendering import naming_key_of_canvas

@@ -1,4 +1,7 @@
-"""Render the panorama: divide its canvas into tiles that fit into memory, merge all located frames on each."""
+"""Choose the canvas of a panorama, its projection and what it holds, and render it.
+
+The canvas is divided into tiles that fit into memory, and all located frames are merged on each.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +14,197 @@ from numpy.typing import NDArray
 
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Renderer, Source, Trajectory
+from photonpano.errors import CanvasTooLargeError, ExtentError, LocationError, ProjectionError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import InOrder
-from photonpano.geometry import Canvas, rescaling
-from photonpano.merging.accumulate import accumulate
+from photonpano.geometry import (
+    Camera,
+    Canvas,
+    Covered,
+    Extent,
+    canvas_around,
+    canvas_of,
+    canvas_of_box,
+    covered_by,
+    inverse,
+    level_horizon,
+    outline_of,
+    rescaling,
+    transform_points,
+)
+from photonpano.merging.accumulate import accumulate, chunks_of
 from photonpano.merging.canvas_noise import DynamicRange
-from photonpano.merging.canvas_plan import BYTES_PER_PIXEL
-from photonpano.merging.chunks import chunks_of
 from photonpano.merging.colour import channels_of, in_colours, seen_in
 from photonpano.photometry import debiased
-from photonpano.values import FluxImage, FrameSpan, Panorama
+from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
+
+BYTES_PER_PIXEL = 40  # peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests
+# A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time.
+MAX_EXCESS = 16
+_LEAST_SCALE = 0.05  # that render.scale may have
+# Up to the first field of view, "auto" takes a plane; beyond the second, a plane is refused.
+_PLANAR_DEGREES, _WIDEST_PLANE_DEGREES = 90, 100
+# Up to the first distance from b = 0, "auto" takes a cylinder; beyond the second, a cylinder is refused.
+_CYLINDER_DEGREES, _TALLEST_CYLINDER_DEGREES = 45, 80
+_TURN = 360
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """How a panorama is projected."""
+
+    projection: str = "auto"  # "planar", "cylindrical", "spherical", or "auto"
+    level: bool = False  # whether the horizon is level, or that of the reference frame
+    camera: Camera | None = None  # of the frames; None if it is not known
+    turns: bool = False  # whether the camera only turns, so that a cylinder or a sphere can show what it sees
+
+
+def plan_canvas(
+    trajectory: Trajectory,
+    span: FrameSpan,
+    frame_shape: tuple[int, int],
+    scale: float,
+    memory: int,
+    bytes_per_pixel: int = BYTES_PER_PIXEL,
+    extent: Extent = "panorama",
+    view: View | None = None,
+) -> Canvas:
+    """Choose the canvas that holds every frame of a span, or a part of it, before anything of its size is allocated.
+
+    `scale` is pixels of the canvas per pixel of the reference frame, `memory` the bytes that rendering may take, of which a
+    pixel takes `bytes_per_pixel`. A box is in pixels of the reference frame on a plane, and in degrees of a and b otherwise;
+    without a view, the canvas is a plane.
+
+    Raises:
+        ExtentError: no frame shows the extent.
+        CanvasTooLargeError: the canvas has more than `MAX_EXCESS` times the pixels that fit into memory; the message suggests
+            a scale that fits, if there is one.
+        LocationError: frames reach the horizon of the reference plane.
+        ProjectionError: the motion does not suit the projection.
+    """
+    view = view or View("planar")
+    homographies = trajectory.at(np.arange(span.start, span.stop))
+    canvas = _canvas(homographies, frame_shape, scale, extent, view)
+    excess = canvas.height * canvas.width * bytes_per_pixel / memory
+    if excess > MAX_EXCESS:
+        fitting = scale * np.sqrt(MAX_EXCESS / excess)
+        digit = 10.0 ** (np.floor(np.log10(fitting)) - 1)  # two are significant; rounded down, the suggestion fits
+        suggested = float(np.floor(fitting / digit) * digit)
+        lower = f"lower render.scale from {scale:g} to {suggested:g}, " if suggested >= _LEAST_SCALE else ""
+        raise CanvasTooLargeError(
+            f"the panorama would have {canvas.height}x{canvas.width} px, {excess:.0f} times what fits into the "
+            f"{memory / 1024**3:.2g} GiB of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
+            f"More often means that the motion is wrong. Raise run.memory, {lower}or choose a render.reference nearer to the "
+            "middle of the motion"
+        )
+    return canvas
+
+
+def box_of(extent: Extent, frame_shape: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return the box of a part of a planar panorama, not of the whole one, in pixels of the reference frame."""
+    return (0, 0, *frame_shape[::-1]) if isinstance(extent, str) else extent
+
+
+def _canvas(homographies: FloatArray, frame_shape: tuple[int, int], scale: float, extent: Extent, view: View) -> Canvas:
+    if not view.turns or view.camera is None:
+        if view.projection not in ("auto", "planar"):
+            raise ProjectionError(
+                f"a {view.projection} panorama needs a camera that only turns, and this motion is one homography a frame; "
+                "write motion: {model: rotation}, or render.projection: planar"
+            )
+        return _plane(homographies, frame_shape, scale, extent, view.camera)
+    rotations, horizon = view.camera.rotations(homographies), None
+    covered = covered_by(rotations, view.camera, frame_shape)
+    projection = view.projection if view.projection != "auto" else _suitable(covered, extent)
+    if projection == "planar":
+        if extent == "panorama" and np.degrees(covered.field_of_view) > _WIDEST_PLANE_DEGREES:
+            raise ProjectionError(
+                f"the frames cover {np.degrees(covered.field_of_view):.0f} degrees, and a plane holds up to "
+                f"{_WIDEST_PLANE_DEGREES}; write render.projection: {_suitable(covered, extent)}"
+            )
+        return _plane(homographies, frame_shape, scale, extent, view.camera, turns=True)
+    if view.level:
+        horizon = level_horizon(rotations)
+        covered = covered_by(horizon @ rotations, view.camera, frame_shape)
+    low, high = np.degrees(covered.b) if isinstance(extent, str) else (extent[1], extent[3])
+    if projection == "cylindrical" and max(-low, high) > _TALLEST_CYLINDER_DEGREES:  # far taller than what it shows
+        raise ProjectionError(
+            f"the frames reach {max(-low, high):.0f} degrees up or down, and a cylinder holds up to "
+            f"{_TALLEST_CYLINDER_DEGREES}; write render.projection: spherical"
+        )
+    whole = canvas_around(covered, view.camera, scale, projection, horizon)
+    if extent == "panorama":
+        return whole
+    if isinstance(extent, str):
+        own = covered_by(np.eye(3)[None] if horizon is None else horizon[None], view.camera, frame_shape)
+        return canvas_around(own, view.camera, scale, projection, horizon)
+    return _part_around(whole, covered, extent)
+
+
+def _suitable(covered: Covered, extent: Extent) -> str:
+    """Return the projection that suits what frames cover."""
+    if extent == "reference" or np.degrees(covered.field_of_view) <= _PLANAR_DEGREES:
+        return "planar"
+    return "cylindrical" if np.degrees(max(-covered.b[0], covered.b[1])) < _CYLINDER_DEGREES else "spherical"
+
+
+def _plane(
+    homographies: FloatArray,
+    frame_shape: tuple[int, int],
+    scale: float,
+    extent: Extent,
+    camera: Camera | None,
+    turns: bool = False,
+) -> Canvas:
+    if extent != "panorama" and turns:
+        # Frames beside and behind the plane do not matter to a part of it.
+        return canvas_of_box(box_of(extent, frame_shape), scale)
+    outline = camera.ideal(outline_of(frame_shape)) if camera is not None and camera.distorts else None
+    try:
+        whole = canvas_of(homographies, frame_shape, scale, outline)
+    except ValueError as error:
+        raise LocationError(
+            f"the motion turns so far away from the reference frame that a flat panorama cannot show it ({error}); "
+            "choose a render.reference in the middle of the motion, or fewer frames"
+        ) from error
+    return whole if extent == "panorama" else _part_of(whole, box_of(extent, frame_shape), scale)
+
+
+def _part_of(whole: Canvas, box: tuple[int, int, int, int], scale: float) -> Canvas:
+    """Return the canvas of a box in pixels of the reference frame; an `ExtentError` if it lies outside the whole canvas."""
+    part = canvas_of_box(box, scale)
+    ends = np.array([[0.0, 0.0], [whole.width - 1, whole.height - 1]])
+    (left, top), (right, bottom) = np.rint(transform_points(inverse(whole.transform), ends)).astype(int).reshape(2, 2).tolist()
+    x0, y0, x1, y1 = box
+    if x1 <= left or x0 > right or y1 <= top or y0 > bottom:
+        raise ExtentError(
+            f"[{x0}, {y0}, {x1}, {y1}] lies outside the panorama, which holds x from {left} to {right} and "
+            f"y from {top} to {bottom}, in pixels of the reference frame"
+        )
+    return part
+
+
+def _part_around(whole: Canvas, covered: Covered, box: tuple[int, int, int, int]) -> Canvas:
+    """Return the part of a canvas of a cylinder or a sphere between a0, b0 and a1, b1 in degrees, or raise an `ExtentError`."""
+    a0, b0, a1, b1 = box
+    (first, last), (low, high) = np.degrees(covered.a), np.degrees(covered.b)
+    if a1 - a0 > _TURN or b0 < -_TURN / 4 or b1 > _TURN / 4:
+        raise ExtentError(
+            f"{list(box)} is in degrees on a {whole.projection} panorama: expected a0, b0, a1, b1 with a1 - a0 up to {_TURN} "
+            f"and b0 and b1 from {-_TURN // 4} (up) to {_TURN // 4} (down)"
+        )
+    beside = not any(a0 < last + turn and a1 > first + turn for turn in (-_TURN, 0, _TURN)) and not covered.full_turn
+    if beside or b0 >= high or b1 <= low:
+        raise ExtentError(
+            f"{list(box)} lies outside the panorama, which holds a from {first:.0f} to {last:.0f} and b from {low:.0f} to "
+            f"{high:.0f}, in degrees"
+        )
+    per_radian, b = whole.transform[0, 0], np.radians([b0, b1])
+    across = np.radians([a0, a1]) * per_radian
+    down = (np.tan(b) if whole.projection == "cylindrical" else b) * per_radian
+    (left, right), (top, bottom) = ((int(np.floor(start + 1e-6)), int(np.ceil(stop - 1e-6))) for start, stop in (across, down))
+    origin = np.rint(whole.transform[:2, 2] + 0.5).astype(int)
+    return whole.part(left + int(origin[0]), top + int(origin[1]), bottom - top, right - left)
 
 
 class MergeRenderer:

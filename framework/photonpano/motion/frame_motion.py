@@ -19,7 +19,7 @@ from photonpano.geometry import (
     rotation_matrices,
     rotation_vectors,
 )
-from photonpano.merging.canvas_plan import View
+from photonpano.merging.panorama import View
 from photonpano.motion.loop import LevelResult
 from photonpano.values import BoolArray, FloatArray, FrameSpan, Homography, StreamInfo
 

@@ -195,7 +195,7 @@ def flux_std(flux: FluxImage, weight: FluxImage, response: Response, slope: Fact
     """Return the standard deviation of flux from photon noise and dark counts.
 
     For binary frames with d dark counts, `flux / std` is `sqrt(n) flux / sqrt(exp(flux + d) - 1)`, the bound of the binary
-    model. Interpolation between pixels averages noise, which `photonpano.merging.averaging` considers.
+    model. Interpolation between pixels averages noise, which `photonpano.merging.canvas_noise` considers.
 
     Args:
         flux: any shape, photons per pixel per frame; NaN stays NaN.

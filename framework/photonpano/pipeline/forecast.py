@@ -12,9 +12,8 @@ from photonpano.contracts.protocols import Source, camera_of_motion
 from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.geometry import Canvas, canvas_of_box
-from photonpano.merging.canvas_plan import View, box_of, plan_canvas
 from photonpano.merging.colour import channels_of
-from photonpano.merging.panorama import render
+from photonpano.merging.panorama import View, box_of, plan_canvas, render
 from photonpano.motion.loop import LevelResult, resample
 from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.components import build_levels

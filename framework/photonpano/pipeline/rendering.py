@@ -25,12 +25,11 @@ from photonpano.errors import ExtentError, InputError, OutputError, ProjectionEr
 from photonpano.execution.context import Context
 from photonpano.execution.threads import InOrder
 from photonpano.geometry import Canvas
+from photonpano.merging.accumulate import bytes_of_light
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
-from photonpano.merging.canvas_plan import plan_canvas
 from photonpano.merging.colour import channels_of, composed
-from photonpano.merging.footprints import by_homographies
-from photonpano.merging.light import bytes_of_light
-from photonpano.merging.panorama import RenderedPanorama, Thumbnail, render_tiles, tiles_of
+from photonpano.merging.panorama import RenderedPanorama, Thumbnail, plan_canvas, render_tiles, tiles_of
+from photonpano.merging.warping import by_homographies
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.motion.level import Recorder
 from photonpano.photometry import balanced, picture_of

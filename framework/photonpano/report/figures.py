@@ -23,7 +23,7 @@ from photonpano.geometry import (
     rescaling,
     transform_points,
 )
-from photonpano.merging.light import amplitudes_on
+from photonpano.merging.accumulate import amplitudes_on
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.record.schema import LevelRecord, PanoramaRecord

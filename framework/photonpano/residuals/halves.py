@@ -21,8 +21,8 @@ from photonpano.contracts.protocols import Source
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas, rescaling
 from photonpano.merging.colour import channels_of, in_colours
-from photonpano.merging.footprints import footprints_of
 from photonpano.merging.panorama import MergeRenderer
+from photonpano.merging.warping import footprints_of
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.photometry import frame_variance
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Panorama, Response

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from photonpano.capture import Capture, capture_of
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.geometry import Camera, Canvas
-from photonpano.merging.light import gain_image
+from photonpano.merging.accumulate import gain_image
 from photonpano.merging.warping import NODES_PX, Texture, sample
 from photonpano.photometry import frame_variance
 from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Light, Panorama, Response

@@ -16,10 +16,9 @@ from photonpano.contracts.protocols import Refiner, Source
 from photonpano.execution.context import Context
 from photonpano.filtering import SYSTEMATIC_PX
 from photonpano.geometry import Canvas, corners, inverse, steps_of
-from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
+from photonpano.merging.accumulate import bytes_of_light
 from photonpano.merging.colour import channels_of
-from photonpano.merging.light import bytes_of_light
-from photonpano.merging.panorama import render
+from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.residuals.halves import Halves, halves_of
 from photonpano.residuals.measure import Residuals, measure

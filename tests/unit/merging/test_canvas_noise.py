@@ -13,9 +13,8 @@ from photonpano.capture import Capture, capture_of
 from photonpano.corrections.colour_filter import with_colours
 from photonpano.geometry import Canvas, rescaling, translation
 from photonpano.merging import accumulate, canvas_noise
-from photonpano.merging.averaging import Averaging
-from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange, squared_gradient
-from photonpano.merging.chunks import chunks_of
+from photonpano.merging.accumulate import chunks_of
+from photonpano.merging.canvas_noise import Averaging, CanvasNoise, DynamicRange, squared_gradient
 from photonpano.photometry import BinaryResponse, flux_std
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano.values import Light

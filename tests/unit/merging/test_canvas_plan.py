@@ -5,7 +5,7 @@ import pytest
 
 from photonpano import FrameSpan, InputError
 from photonpano.geometry import Camera, Canvas, Extent, FrameTrajectory, rotation_matrices
-from photonpano.merging.canvas_plan import View, plan_canvas
+from photonpano.merging.panorama import View, plan_canvas
 
 SHAPE = (40, 60)
 CAMERA = Camera.of(50.0, SHAPE)

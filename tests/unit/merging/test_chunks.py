@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from photonpano import FrameSpan, InputError
 from photonpano.geometry import Canvas, corner_displacements, from_parameters, inverse, rescaling, transform_points, translation
 from photonpano.merging import CountsCache, chunks_of, clipped
-from photonpano.merging.footprints import Footprint, footprints_of
-from photonpano.merging.warping import Grid, Texture, add_warped
+from photonpano.merging.warping import Footprint, Grid, Texture, add_warped, footprints_of
 
 SHAPE = (30, 40)
 

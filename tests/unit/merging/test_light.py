@@ -7,7 +7,7 @@ from photonpano import FrameSpan, Light, Response
 from photonpano.corrections.lighting import in_light
 from photonpano.geometry import translation
 from photonpano.merging import Chunk, accumulate
-from photonpano.merging.light import LitFrames, gain_image
+from photonpano.merging.accumulate import LitFrames, gain_image
 from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano.testing import MemorySource
 

@@ -9,8 +9,7 @@ from photonpano import CanvasTooLargeError, FrameSpan, InputError, LocationError
 from photonpano.execution.context import Context, Quiet
 from photonpano.geometry import Canvas, from_parameters, transform_points, translation
 from photonpano.merging import MergeRenderer, accumulate
-from photonpano.merging.canvas_plan import BYTES_PER_PIXEL, plan_canvas
-from photonpano.merging.panorama import Thumbnail, Tile, render, render_tiles, tiles_of
+from photonpano.merging.panorama import BYTES_PER_PIXEL, Thumbnail, Tile, plan_canvas, render, render_tiles, tiles_of
 from photonpano.photometry import tone_mapped
 
 SHAPE = (30, 40)

@@ -16,8 +16,7 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.merging import Chunk, accumulate
-from photonpano.merging.averaging import Averaging
-from photonpano.merging.canvas_noise import laid
+from photonpano.merging.canvas_noise import Averaging, laid
 from photonpano.testing.captures import MemorySource
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 

@@ -14,8 +14,7 @@ from photonpano import Refined
 from photonpano.contracts.requirements import require_refined
 from photonpano.geometry import FrameTrajectory, nearest_rotations, steps_px
 from photonpano.merging import chunks_of
-from photonpano.merging.canvas_plan import plan_canvas
-from photonpano.merging.panorama import RenderedPanorama
+from photonpano.merging.panorama import RenderedPanorama, plan_canvas
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.run_folder import run_folder

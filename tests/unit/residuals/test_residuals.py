@@ -11,8 +11,7 @@ from photonpano import FrameSpan, open_source, parse_spec
 from photonpano.capture import capture_of, seen_through
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
-from photonpano.merging.canvas_plan import View, plan_canvas
-from photonpano.merging.panorama import render
+from photonpano.merging.panorama import View, plan_canvas, render
 from photonpano.photometry import IntensityResponse
 from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import Residuals, measure

@@ -14,7 +14,7 @@ from photonpano.corrections.lighting.flicker import _amplitudes, local_flicker
 from photonpano.corrections.lighting.gains import SeenCells, solve_gains
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, rotation_matrices, translation
-from photonpano.merging.light import gain_image
+from photonpano.merging.accumulate import gain_image
 from photonpano.merging.panorama import render
 from photonpano.testing import KnownMotion, MemorySource, Scene
 from photonpano.testing.scenes import detected, seen_along
