@@ -13,8 +13,7 @@ from scipy.interpolate import UnivariateSpline
 
 from photonpano.capture import in_light
 from photonpano.contracts.protocols import Source, Trajectory, light_of
-from photonpano.corrections.lighting.flicker import LocalFlicker, local_flicker
-from photonpano.corrections.lighting.gains import Gains, seen_cells, solve_gains
+from photonpano.corrections.lighting.gains import Gains, LocalFlicker, local_flicker, seen_cells, solve_gains
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
 from photonpano.geometry import corner_displacements, inverse
