@@ -1,3 +1,3 @@
-from .matched import FeatureLocator as FeatureLocator
-from .matched import LoftrLocator as LoftrLocator
-from .registrator import RegistratorLocator as RegistratorLocator
+from .locators import FeatureLocator as FeatureLocator
+from .locators import LoftrLocator as LoftrLocator
+from .locators import RegistratorLocator as RegistratorLocator

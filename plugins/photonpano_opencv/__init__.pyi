@@ -1,4 +1,4 @@
-from .brightness import EccLocator as EccLocator
-from .brightness import PhaseCorrelationLocator as PhaseCorrelationLocator
-from .keypoints import OrbLocator as OrbLocator
-from .keypoints import SiftLocator as SiftLocator
+from .locators import EccLocator as EccLocator
+from .locators import OrbLocator as OrbLocator
+from .locators import PhaseCorrelationLocator as PhaseCorrelationLocator
+from .locators import SiftLocator as SiftLocator

@@ -1,16 +1,22 @@
-"""Estimate the flux of a fine grid from the photons of its cells: expectation-maximisation, and denoising in between."""
+"""Estimate the flux of a fine grid from the photons of its cells: expectation-maximisation, and denoising in between.
+
+An image is denoised by collaborative filtering of similar patches (Dabov et al., "BM3D", IEEE TIP 2007, its first stage):
+they are stacked, transformed together, and coefficients below the noise are set to 0. Compiled.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct
 
 from photonpano import FloatArray, FluxImage
 from photonpano.compiling import compiled
 from photonpano.merging import LitFrames
-from photonpano_core.super_resolution.collaborative import PATCH, Patches, filter_groups, find_similar
 
 # Noise that each round removes, in standard deviations of the photon noise of a cell: details come in from round to round.
 STRENGTHS = (4.0, 3.0, 2.25, 1.7, 1.27, 0.95)
@@ -97,7 +103,7 @@ def rounds_of(observed: Observations, n_rounds: int) -> list[FluxImage]:
     (Venkatakrishnan et al. 2013).
     """
     seen = observed.weight()
-    noise = 0.5 / np.sqrt(np.maximum(cv2.blur(seen, (PATCH, PATCH)), _FEWEST_FRAMES))
+    noise = 0.5 / np.sqrt(np.maximum(cv2.blur(seen, (_PATCH, _PATCH)), _FEWEST_FRAMES))
     flux = _initial_flux(observed)
     floor = np.float32(_DARKEST * max(float(flux.mean()), 1e-9))
     known = seen > 1e-3 * max(float(seen.max()), 1e-9)
@@ -250,3 +256,157 @@ def counts_in_light(mean: FluxImage, frames: FluxImage, gains: FluxImage, lit: F
                     share = _lit_share(gains[c, y, x] / n * mean[y, x])
                     lit[y, x] += n * share
                     dark[y, x] += n * (np.float32(1) - share)
+
+
+Image = NDArray[np.float32]
+
+_PATCH = 8  # side of a patch, px
+GROUP = 16  # similar patches that are filtered together; a power of 2
+SEARCH = 10  # similar patches are looked for at this distance at most along x and y, px
+STEP = 4  # distance of reference patches, px
+_THRESHOLD = np.float32(2.7)  # coefficients below this many standard deviations of the noise are set to 0
+_DCT: Image = dct(np.eye(_PATCH), axis=0, norm="ortho").astype(np.float32)
+
+
+class Patches(NamedTuple):
+    """Reference patches on a regular grid, and the patches that are similar to each."""
+
+    rows: NDArray[np.int32]  # (R,) first rows of the reference patches
+    columns: NDArray[np.int32]  # (C,) their first columns
+    similar: NDArray[np.int32]  # (R, C, GROUP, 2) first row and column of the similar patches, the reference first
+
+    @classmethod
+    def over(cls, shape: tuple[int, ...]) -> Patches:
+        """Return patches that cover an image of a (height, width), without similar ones."""
+        rows, columns = (_places(length) for length in shape)
+        return cls(rows, columns, np.empty((len(rows), len(columns), GROUP, 2), np.int32))
+
+
+def _places(length: int) -> NDArray[np.int32]:
+    """Return where reference patches begin along a side, so that they cover it."""
+    return np.unique(np.append(np.arange(0, length - _PATCH + 1, STEP), length - _PATCH)).astype(np.int32)
+
+
+@compiled
+def find_similar(image: Image, patches: Patches) -> None:
+    """Find the patches of an image, (H, W), that differ least from each reference patch."""
+    rows, columns, found = patches
+    height, width = image.shape
+    side = 2 * SEARCH + 1
+    best = np.empty(GROUP, np.float32)
+    distances = np.empty(side, np.float32)
+    for r in range(len(rows)):
+        for c in range(len(columns)):
+            y0, x0 = rows[r], columns[c]
+            places = found[r, c]
+            n = 0
+            top, bottom = max(0, y0 - SEARCH), min(height - _PATCH, y0 + SEARCH)
+            left, right = max(0, x0 - SEARCH), min(width - _PATCH, x0 + SEARCH)
+            size = right - left + 1
+            for y in range(top, bottom + 1):
+                row = distances[:size]
+                for t in range(size):
+                    row[t] = np.float32(0)
+                for i in range(_PATCH):
+                    line = image[y + i]
+                    for j in range(_PATCH):
+                        value, part = image[y0 + i, x0 + j], line[left + j : left + j + size]
+                        for t in range(size):
+                            apart = part[t] - value
+                            row[t] += apart * apart
+                for t in range(size):
+                    distance = row[t]
+                    if y == y0 and left + t == x0:
+                        distance = np.float32(-1)
+                    if n == GROUP and distance >= best[GROUP - 1]:
+                        continue
+                    k = n if n < GROUP else GROUP - 1
+                    n = min(n + 1, GROUP)
+                    while k > 0 and best[k - 1] > distance:
+                        best[k] = best[k - 1]
+                        places[k, 0], places[k, 1] = places[k - 1, 0], places[k - 1, 1]
+                        k -= 1
+                    best[k] = distance
+                    places[k, 0], places[k, 1] = y, left + t
+            for k in range(n, GROUP):
+                places[k, 0], places[k, 1] = y0, x0
+
+
+@compiled
+def _transformed(patch: Image, matrix: Image, scratch: Image) -> None:
+    """Multiply a patch with a matrix from the left and with its transpose from the right, in place."""
+    for i in range(_PATCH):
+        for j in range(_PATCH):
+            scratch[i, j] = np.float32(0)
+        for k in range(_PATCH):
+            weight, row, out = matrix[i, k], patch[k], scratch[i]
+            for j in range(_PATCH):
+                out[j] += weight * row[j]
+    for i in range(_PATCH):
+        for j in range(_PATCH):
+            patch[i, j] = np.float32(0)
+        for k in range(_PATCH):
+            weight, out = scratch[i, k], patch[i]
+            for j in range(_PATCH):
+                out[j] += weight * matrix[j, k]
+
+
+@compiled
+def _mixed(stack: Image) -> None:
+    """Apply the orthonormal Walsh-Hadamard transform along the patches of a (GROUP, PATCH * PATCH) stack; it inverts itself."""
+    half = 1
+    while half < GROUP:
+        for start in range(0, GROUP, 2 * half):
+            for k in range(start, start + half):
+                a, b = stack[k], stack[k + half]
+                for t in range(_PATCH * _PATCH):
+                    p, q = a[t], b[t]
+                    a[t], b[t] = p + q, p - q
+        half *= 2
+    scale = np.float32(1 / np.sqrt(GROUP))
+    for k in range(GROUP):
+        row = stack[k]
+        for t in range(_PATCH * _PATCH):
+            row[t] *= scale
+
+
+@compiled
+def filter_groups(image: Image, noise: Image, patches: Patches, total: Image, weights: Image) -> None:
+    """Filter each group of similar patches, and add its patches where they lie, weighted by how few coefficients are left.
+
+    `noise` is (H, W), the standard deviation to remove; `total` and `weights`, (H, W), are added to.
+    """
+    rows, columns, found = patches
+    stack = np.empty((GROUP, _PATCH, _PATCH), np.float32)
+    flat = stack.reshape(GROUP, _PATCH * _PATCH)
+    scratch = np.empty((_PATCH, _PATCH), np.float32)
+    forth, back = _DCT, np.ascontiguousarray(_DCT.T)
+    half = _PATCH // 2
+    for r in range(len(rows)):
+        for c in range(len(columns)):
+            places = found[r, c]
+            for k in range(GROUP):
+                y, x = places[k, 0], places[k, 1]
+                for i in range(_PATCH):
+                    for j in range(_PATCH):
+                        stack[k, i, j] = image[y + i, x + j]
+                _transformed(stack[k], forth, scratch)
+            _mixed(flat)
+            sigma = noise[rows[r] + half, columns[c] + half]
+            limit, kept = _THRESHOLD * sigma, 0
+            for k in range(GROUP):
+                row = flat[k]
+                for t in range(_PATCH * _PATCH):
+                    if abs(row[t]) < limit and k + t > 0:
+                        row[t] = np.float32(0)
+                    else:
+                        kept += 1
+            _mixed(flat)
+            weight = np.float32(1) / (np.float32(kept) * sigma * sigma)
+            for k in range(GROUP):
+                _transformed(stack[k], back, scratch)
+                y, x = places[k, 0], places[k, 1]
+                for i in range(_PATCH):
+                    for j in range(_PATCH):
+                        total[y + i, x + j] += weight * stack[k, i, j]
+                        weights[y + i, x + j] += weight

@@ -19,10 +19,17 @@ from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import SuperResolutionConfig
 from photonpano_core.mergers.dense_motion.sub_exposures import count_variance, sharpened
-from photonpano_core.super_resolution.collaborative import Patches, filter_groups, find_similar
-from photonpano_core.super_resolution.estimate import Observations, counts_in_light, expected, pixel_area, rounds_of
-from photonpano_core.super_resolution.renderer import SuperResolutionRenderer
-from photonpano_core.super_resolution.sums import add_observations, sums_on
+from photonpano_core.super_resolution.estimate import (
+    Observations,
+    Patches,
+    counts_in_light,
+    expected,
+    filter_groups,
+    find_similar,
+    pixel_area,
+    rounds_of,
+)
+from photonpano_core.super_resolution.renderer import SuperResolutionRenderer, add_observations, sums_on
 
 SIDE, CHUNKS, FRAMES, FINE = 40, 96, 40, 8
 """Pixels of a side of a frame, its stops, the frames of each, and the samples of the scene along the side of a pixel."""

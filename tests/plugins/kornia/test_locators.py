@@ -21,8 +21,7 @@ import kornia
 import torch
 
 from photonpano_kornia.hooks import KorniaRegistratorConfig
-from photonpano_kornia.registrator import RegistratorLocator, unit_square
-from photonpano_kornia.runtime import device_of, image_on, one_thread, seeded
+from photonpano_kornia.locators import RegistratorLocator, device_of, image_on, one_thread, seeded, unit_square
 
 SHAPE = (120, 176)
 STILL = np.eye(3)

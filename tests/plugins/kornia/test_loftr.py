@@ -16,8 +16,7 @@ import kornia
 import torch
 
 from photonpano_kornia.hooks import KorniaLoftrConfig
-from photonpano_kornia.matched import LoftrLocator
-from photonpano_kornia.runtime import loftr_from
+from photonpano_kornia.locators import LoftrLocator, loftr_from
 
 SHAPE = (120, 176)
 STILL = np.eye(3)

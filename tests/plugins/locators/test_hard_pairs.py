@@ -195,11 +195,11 @@ def features(name: str, points: np.ndarray) -> Any:
     """Return keypoints with distinct descriptors, as `describe` does."""
     rng, points = np.random.default_rng(0), points.astype(np.float32)
     if name == "opencv-sift":
-        from photonpano_opencv.keypoints import Keypoints
+        from photonpano_opencv.locators import Keypoints
 
         descriptors = rng.integers(0, 256, (len(points), 128), dtype=np.uint8)
         return Keypoints(points, np.full(len(points), 4, np.float32), descriptors, SHAPE)
-    from photonpano_kornia.matched import SiftFeatures
+    from photonpano_kornia.locators import SiftFeatures
 
     frames = np.concatenate([np.tile(6 * np.eye(2), (len(points), 1, 1)), points[:, :, None]], axis=2)
     unit = rng.normal(size=(len(points), 128))

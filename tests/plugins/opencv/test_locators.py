@@ -14,9 +14,17 @@ from hypothesis import strategies as st
 from photonpano import Located, NotLocated, VirtualExposure
 from photonpano.geometry import corner_displacements, from_parameters, generators, jacobian, transform_points, translation
 from photonpano.locating import View
-from photonpano_opencv.brightness import EccLocator, PhaseCorrelationLocator
 from photonpano_opencv.hooks import OpencvEccConfig, OpencvOrbConfig, PhaseCorrelationConfig
-from photonpano_opencv.keypoints import Keypoints, OrbLocator, match_everywhere, match_nearby, unit_bits, unit_descriptors
+from photonpano_opencv.locators import (
+    EccLocator,
+    Keypoints,
+    OrbLocator,
+    PhaseCorrelationLocator,
+    match_everywhere,
+    match_nearby,
+    unit_bits,
+    unit_descriptors,
+)
 
 SHAPE = (160, 240)
 STILL = np.eye(3)
