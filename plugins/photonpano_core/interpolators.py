@@ -207,7 +207,7 @@ def group_steps(instants: FloatArray, knots: FloatArray) -> FloatArray:
     return steps
 
 
-ORDER = 3  # of the derivative that is penalised: parabolas, which fit any three knots, are not
+_ORDER = 3  # of the derivative that is penalised: parabolas, which fit any three knots, are not
 # Candidates for the scale of the jerk, from a parabola to interpolation. The number of knots averaged grows with the sixth
 # root.
 _SCALES = np.logspace(-10, 10, 41)
@@ -243,7 +243,7 @@ class SmoothingSplineInterpolator:
 
     def fit(self, instants: FloatArray, homographies: FloatArray, information: FloatArray | None) -> _ParameterTrajectory:
         """Smooth; without information, corners have equal, independent errors. Up to three knots are interpolated."""
-        if len(instants) > ORDER:
+        if len(instants) > _ORDER:
             homographies = self._smoothed(instants, homographies, information)
         spline = interpolating_spline(instants, parameters(homographies))
         return _ParameterTrajectory(instants, spline, self._config.hold_frames, _BENT)
@@ -256,7 +256,7 @@ class SmoothingSplineInterpolator:
         The scale of the information is trusted. Without it, all rotations have equal and independent errors, whose size is
         estimated.
         """
-        if len(instants) > ORDER:
+        if len(instants) > _ORDER:
             covariances: FloatArray = np.broadcast_to(np.eye(3), (len(instants), 3, 3))
             if information is not None:
                 covariances = np.asarray(np.linalg.inv(information))
@@ -300,7 +300,7 @@ def _smoothed_modes(
     every = sparse.kron(difference, sparse.eye_array(n_modes))
     of_knots = sparse.bsr_array((covariances, np.arange(n_knots), np.arange(n_knots + 1)))
     expected = every @ of_knots @ every.T + sparse.kron(jerk, sparse.diags_array(_most_likely_scales(modes, quiet, noise)))
-    explained = solveh_banded(_banded(expected, (ORDER + 1) * n_modes - 1), observed.ravel())
+    explained = solveh_banded(_banded(expected, (_ORDER + 1) * n_modes - 1), observed.ravel())
     return np.asarray(knots - (of_knots @ (every.T @ explained)).reshape(n_knots, n_modes))
 
 
@@ -316,7 +316,7 @@ class _Mode:
         self.n_observed = len(observed)
         self.scales = _SCALES * np.median(noise.diagonal() / jerk.diagonal())
         self.squares, self.determinants = np.empty((2, len(self.scales)))
-        noise_bands, jerk_bands = _banded(noise, ORDER), _banded(jerk, ORDER)
+        noise_bands, jerk_bands = _banded(noise, _ORDER), _banded(jerk, _ORDER)
         for index, scale in enumerate(self.scales):
             factor = cholesky_banded(noise_bands + scale * jerk_bands)
             self.squares[index] = observed @ cho_solve_banded((factor, False), observed)
@@ -353,7 +353,7 @@ def _from_corners(here: FloatArray, there: FloatArray) -> FloatArray:
 def _third_differences(times: FloatArray) -> sparse.csr_array:
     """Return the (N - 3, N) map from N values to divided differences: for a cubic, its third derivative."""
     result = sparse.csr_array(sparse.eye_array(len(times)))
-    for order in range(1, ORDER + 1):
+    for order in range(1, _ORDER + 1):
         lengths = times[order:] - times[:-order]
         result = sparse.csr_array(sparse.diags_array(order / lengths) @ (result[1:] - result[:-1]))
     return result
@@ -364,13 +364,13 @@ def _jerk_covariance(times: FloatArray) -> sparse.csr_array:
 
     Each is the average of the jerk, weighted by a B-spline over four instants (Peano kernel).
     """
-    nodes, weights = np.polynomial.legendre.leggauss(ORDER)
+    nodes, weights = np.polynomial.legendre.leggauss(_ORDER)
     halves = np.diff(times)[:, None] / 2
     points = times[:-1, None] + halves * (1 + nodes)
-    padded = np.pad(times, ORDER - 1, mode="edge")
+    padded = np.pad(times, _ORDER - 1, mode="edge")
     # B-splines at the ends have coinciding knots, and average over fewer instants.
-    splines = BSpline.design_matrix(points.ravel(), padded, ORDER - 1)[:, ORDER - 1 : 1 - ORDER]
-    averages = splines @ sparse.diags_array(ORDER / (times[ORDER:] - times[:-ORDER]))
+    splines = BSpline.design_matrix(points.ravel(), padded, _ORDER - 1)[:, _ORDER - 1 : 1 - _ORDER]
+    averages = splines @ sparse.diags_array(_ORDER / (times[_ORDER:] - times[:-_ORDER]))
     return sparse.csr_array(averages.T @ sparse.diags_array((halves * weights).ravel()) @ averages)
 
 

@@ -117,9 +117,9 @@ class PhaseCorrelationLocator:
         return motion_from_images(moving, fixed, homography, config, free=TRANSLATION, efficiency=_EFFICIENCY)
 
 
-GUIDED_RADII = (1.5, 1.0)  # of the search around predicted positions, one a round, in units of `threshold_px`
+_GUIDED_RADII = (1.5, 1.0)  # of the search around predicted positions, one a round, in units of `threshold_px`
 # Lowe's ratio within these radii
-GUIDED_RATIO = 0.9
+_GUIDED_RATIO = 0.9
 # Standard deviation of rounding to whole pixels. Where a camera only shifts, all keypoints are rounded alike, so that the
 # error does not decrease with the number of matches.
 _ROUNDING_PX = math.sqrt(1 / 12)
@@ -191,10 +191,10 @@ class KeypointMatcher(PointLocator):
             return NotLocated(f"{reason}, from {len(matches.moving)} matches", evidence)
         motion: Located | NotLocated
         descriptors = self._descriptors(moving, fixed)
-        for radius, max_std_px in zip(GUIDED_RADII, (np.inf, config.max_std_px), strict=True):
+        for radius, max_std_px in zip(_GUIDED_RADII, (np.inf, config.max_std_px), strict=True):
             limits = config.model_copy(update={"threshold_px": radius * config.threshold_px, "max_std_px": max_std_px})
             predicted = transform_points(homography, moving.points)
-            pairs = match_nearby(*descriptors, predicted, fixed.points, limits.threshold_px, GUIDED_RATIO)
+            pairs = match_nearby(*descriptors, predicted, fixed.points, limits.threshold_px, _GUIDED_RATIO)
             here, there, sizes = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], moving.sizes[pairs[:, 0]]
             # One round: matches that were searched within the threshold are all inliers.
             motion = motion_from_points(

@@ -133,7 +133,7 @@ def turned_alignment(estimated: Turn, true: Turn, true_homographies: FloatArray,
 
 
 # Quantile of the true scene that is white: the maximum may be a lamp, which would darken everything else.
-WHITE_QUANTILE = 0.999
+_WHITE_QUANTILE = 0.999
 
 MIN_COVERAGE = 0.05  # minimum coverage of compared pixels, relative to the median coverage of the seen pixels
 
@@ -172,8 +172,8 @@ def known(image: FluxImage) -> BoolArray:
 
 
 def white_flux(scene: FluxImage) -> float:
-    """Return the flux that becomes white in a comparison, of a scene that is NaN where unknown: see `WHITE_QUANTILE`."""
-    return float(np.nanquantile(scene, WHITE_QUANTILE))
+    """Return the flux that becomes white in a comparison, of a scene that is NaN where unknown: see `_WHITE_QUANTILE`."""
+    return float(np.nanquantile(scene, _WHITE_QUANTILE))
 
 
 def image_score(panorama: FluxImage, truth: FluxImage, compared: BoolArray, white: float) -> ImageScore:

@@ -44,7 +44,7 @@ def why_implausible(homography: Homography, shape: tuple[int, int], min_overlap:
 
 # Evenly spaced frames to which the alignment is fitted. They are plenty: a homography has eight parameters, and each frame
 # gives eight equations.
-FIT_FRAMES = 300
+_FIT_FRAMES = 300
 
 _FAR_PX = 1e6  # residual of points mapped to infinity
 
@@ -82,7 +82,7 @@ def align_planes(
         raise ValueError(
             f"only trajectories of the same length can be aligned, got {len(estimated)} and {len(true)} homographies"
         )
-    chosen = np.unique(np.linspace(0, len(true) - 1, FIT_FRAMES).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(true) - 1, _FIT_FRAMES).round().astype(int))
     frame, condition = corners(frame_shape), unit_coordinates(frame_shape)
     to_plane, to_frame = estimated[chosen], np.linalg.inv(true[chosen])
     first = start

@@ -86,7 +86,7 @@ def information_on_turn(
 
 Points = NDArray[np.floating]
 # Rounds of reweighting; after 4 the weights of the soft L1 loss change the result by a few per cent of its error.
-REWEIGHTINGS = 4
+_REWEIGHTINGS = 4
 # Lower bound of the position error of a keypoint, px; the residuals of a few matches may be smaller by chance.
 MIN_NOISE_PX = 0.02
 
@@ -250,7 +250,7 @@ def fit_homography(
     p = parameters(start)
     residuals = _residuals(p, here, there, by_size)
     # Iteratively reweighted: scipy's robust losses need a decomposition that takes a hundred times as long.
-    for _ in range(REWEIGHTINGS):
+    for _ in range(_REWEIGHTINGS):
         lengths = np.linalg.norm(residuals.reshape(-1, 2), axis=1)
         weights = by_size * np.sqrt(soft_l1_weights(lengths, max(robust_std(residuals), MIN_NOISE_PX)))
         solution = least_squares(_residuals, p, _derivatives, method="lm", x_scale="jac", args=(here, there, weights))

@@ -1,7 +1,7 @@
 """Warp sums of frames onto a grid and add them up, for virtual exposures and panoramas; and sum frames in large pixels.
 
 A chunk is a run of frames within which the motion stays below a tolerance, so that one warp serves the whole run. In changing
-light, the sums say how many frames of which gain each pixel of a grid was seen in.
+light, frames of one gain are counted together for each pixel of a grid.
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ _RUN = 64  # chunks that are summed on a part of the grid of their own. It does 
 _BLOCK = 4096  # chunks whose footprints are known at a time
 # Pixels are binned until the shorter side has about 64 of them, which lowers the noise and keeps shifts measurable.
 _SIDE_PX = 64
-MIN_WEIGHT = 1.0  # pixels with less weight than this, in frames, are unknown
+_MIN_WEIGHT = 1.0  # pixels with less weight than this, in frames, are unknown
 
 _Visible = Sequence[tuple[Chunk, Footprint]]
 
@@ -271,12 +271,12 @@ class PhotonSum:
         Returns:
             Flux, (H, W) float32, NaN where the weight is below one frame; weight, (H, W) float32, 0 there.
         """
-        unknown = self.weight < MIN_WEIGHT
+        unknown = self.weight < _MIN_WEIGHT
         if self.lit is not None:
             flux, weight = self.lit.flux(self.counts, response), self.weight.copy()
             flux[unknown], weight[unknown] = np.nan, 0
             return flux, weight
-        seen = np.asarray(np.maximum(self.weight, MIN_WEIGHT), dtype=np.float32)
+        seen = np.asarray(np.maximum(self.weight, _MIN_WEIGHT), dtype=np.float32)
         # Subtraction of dark counts can leave a negative sum by chance.
         mean = np.asarray(np.maximum(self.counts, 0) / seen, dtype=np.float32)
         flux, weight = response.flux(mean, seen), self.weight.copy()

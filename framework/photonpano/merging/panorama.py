@@ -40,7 +40,7 @@ from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
 
 BYTES_PER_PIXEL = 40  # peak memory of merging, per pixel of a tile: sums, estimate and output, as measured in the tests
 # A canvas is refused above this many times the size that fits into memory: the motion is then wrong, most of the time.
-MAX_EXCESS = 16
+_MAX_EXCESS = 16
 _LEAST_SCALE = 0.05  # that render.scale may have
 # Up to the first field of view, "auto" takes a plane; beyond the second, a plane is refused.
 _PLANAR_DEGREES, _WIDEST_PLANE_DEGREES = 90, 100
@@ -77,7 +77,7 @@ def plan_canvas(
 
     Raises:
         ExtentError: no frame shows the extent.
-        CanvasTooLargeError: the canvas has more than `MAX_EXCESS` times the pixels that fit into memory; the message suggests
+        CanvasTooLargeError: the canvas has more than `_MAX_EXCESS` times the pixels that fit into memory; the message suggests
             a scale that fits, if there is one.
         LocationError: frames reach the horizon of the reference plane.
         ProjectionError: the motion does not suit the projection.
@@ -86,14 +86,14 @@ def plan_canvas(
     homographies = trajectory.at(np.arange(span.start, span.stop))
     canvas = _canvas(homographies, frame_shape, scale, extent, view)
     excess = canvas.height * canvas.width * bytes_per_pixel / memory
-    if excess > MAX_EXCESS:
-        fitting = scale * np.sqrt(MAX_EXCESS / excess)
+    if excess > _MAX_EXCESS:
+        fitting = scale * np.sqrt(_MAX_EXCESS / excess)
         digit = 10.0 ** (np.floor(np.log10(fitting)) - 1)  # two are significant; rounded down, the suggestion fits
         suggested = float(np.floor(fitting / digit) * digit)
         lower = f"lower render.scale from {scale:g} to {suggested:g}, " if suggested >= _LEAST_SCALE else ""
         raise CanvasTooLargeError(
             f"the panorama would have {canvas.height}x{canvas.width} px, {excess:.0f} times what fits into the "
-            f"{memory / 1024**3:.2g} GiB of run.memory; up to {MAX_EXCESS} times is rendered in tiles. "
+            f"{memory / 1024**3:.2g} GiB of run.memory; up to {_MAX_EXCESS} times is rendered in tiles. "
             f"More often means that the motion is wrong. Raise run.memory, {lower}or choose a render.reference nearer to the "
             "middle of the motion"
         )

@@ -1,6 +1,6 @@
 """Camera responses, flux to counts and back, and the noise of estimated flux.
 
-The noise says its standard deviation, which pixels are saturated, and the range of flux above it.
+The noise gives the standard deviation of the flux, and the range of flux that can be measured; beyond it, pixels are saturated.
 """
 
 from __future__ import annotations

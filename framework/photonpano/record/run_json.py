@@ -62,16 +62,16 @@ def record_of(
 ) -> RunRecord:
     """Return the record of a finished run; `rendered` are the decisions of renderer and exporters."""
     motion, timeline = explained.motion, levels[-1].exposures.timeline
-    decisions = [levels_decision(levels), *rendered] if plan.until_converged else rendered
+    decisions = [_levels_decision(levels), *rendered] if plan.until_converged else rendered
     return {
         **started,
         "decisions": [*started["decisions"], *decision_records(decisions)],
         "levels": [level_record(result) for result in levels],
         "panorama": panorama_record(plan, panorama, rendered),
-        "motion": motion_record(motion.std_px),
+        "motion": _motion_record(motion.std_px),
         "refinements": [refinement_record(each) for each in explained.refinements],
-        "halves": agreement_records(explained.halves.cuts),
-        "stretches": agreement_records(explained.halves.stretches),
+        "halves": _agreement_records(explained.halves.cuts),
+        "stretches": _agreement_records(explained.halves.stretches),
         "verdict": verdict_record(verdict),
         "warnings": [
             *time_warnings(started["decisions"]),
@@ -228,7 +228,7 @@ def _rounded(decibels: float | None) -> float | None:
     return None if decibels is None else round(decibels, 2)
 
 
-def motion_record(std_px: FloatArray) -> MotionRecord | None:
+def _motion_record(std_px: FloatArray) -> MotionRecord | None:
     """Describe the expected error of the motion; None where no motion is known, as with a single exposure.
 
     `std_px` is (T,), infinite where nothing was located.
@@ -265,7 +265,7 @@ def refinement_record(refinement: Refinement) -> RefinementRecord:
     }
 
 
-def agreement_records(found: Agreements) -> list[AgreementRecord]:
+def _agreement_records(found: Agreements) -> list[AgreementRecord]:
     """Describe how frames agree across cuts, or those of stretches with all others."""
     columns = found.firsts, found.coherence, found.std_coherence, found.std_px, found.angles_deg
     return [
@@ -280,7 +280,7 @@ def agreement_records(found: Agreements) -> list[AgreementRecord]:
     ]
 
 
-def levels_decision(results: Sequence[LevelResult]) -> Decision:
+def _levels_decision(results: Sequence[LevelResult]) -> Decision:
     """Return the number of levels after which the motion converged, and why."""
     last = results[-1]
     if last.change_px is None or not np.isfinite(last.uncertainty.mean_px):

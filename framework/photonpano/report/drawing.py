@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure
 
-JPEG_QUALITY = 90
+_JPEG_QUALITY = 90
 WIDTH_IN = 10.0
-MAX_MAP_HEIGHT_IN = 5.0
-MIN_MAP_IN = 0.8
+_MAX_MAP_HEIGHT_IN = 5.0
+_MIN_MAP_IN = 0.8
 BAR_IN = 1.0  # room for a colour bar to the right of a map, with its numbers and its label
 MAP_PIXELS = 1000
 _X_LABEL_IN, _Y_LABEL_IN, _BAR_LABEL_IN = 0.25, 0.55, 0.45  # distance of the labels of axes, and of colour bars, from these
@@ -144,8 +144,8 @@ def map_figure(height: int, width: int, side_in: float = 0) -> Iterator[tuple[Fi
     """Open a figure with the proportions of a panorama, with `side_in` inches beside it for a colour bar."""
     margins = Margins(left=0.6, right=0.3 + side_in, top=0.15, bottom=0.35)
     margin_in = margins.left + margins.right
-    map_width = min(WIDTH_IN - margin_in, MAX_MAP_HEIGHT_IN * width / height)
-    size_in = max(map_width, MIN_MAP_IN), max(map_width * height / width, MIN_MAP_IN)
+    map_width = min(WIDTH_IN - margin_in, _MAX_MAP_HEIGHT_IN * width / height)
+    size_in = max(map_width, _MIN_MAP_IN), max(map_width * height / width, _MIN_MAP_IN)
     with plain_figure(size_in[0] + margin_in, size_in[1] + margins.top + margins.bottom) as figure:
         [axes] = add_axes(figure, margins)
         _show_pixels(axes, height, width)
@@ -160,7 +160,7 @@ def maps_figure(height: int, width: int, n_maps: int) -> Iterator[tuple[Figure, 
     margins = Margins(left=0.6, right=BAR_IN if n_maps == 2 else 0.1, top=0.35, bottom=0.3)
     gap_in = BAR_IN + 0.35
     map_width = (WIDTH_IN - margins.left - margins.right - (n_maps - 1) * gap_in) / n_maps
-    map_height = float(np.clip(map_width * height / width, MIN_MAP_IN, 4.0))
+    map_height = float(np.clip(map_width * height / width, _MIN_MAP_IN, 4.0))
     with plain_figure(WIDTH_IN, map_height + margins.top + margins.bottom) as figure:
         maps = add_axes(figure, margins, columns=n_maps, gap_in=gap_in)
         for axes in maps:
@@ -273,7 +273,7 @@ def png_uri(image: NDArray[np.uint8]) -> str:
     return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
-def jpeg_uri(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> str:
+def jpeg_uri(image: NDArray[np.uint8], quality: int = _JPEG_QUALITY) -> str:
     """Return an (H, W) grey or (H, W, 3) red-green-blue image as a data URI."""
     import cv2
 

@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 
 MAX_INSTANTS = 1500  # maximum number of instants at which a trajectory is drawn
 
-MAX_PARTS = 5  # maximum number of parts of a motion graph with a row of their own
+_MAX_PARTS = 5  # maximum number of parts of a motion graph with a row of their own
 
 STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "interpolate": "interpolate"}
 
@@ -163,7 +163,7 @@ def tied_parts(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
     `parts` is (N,), the number of the connected component of each exposure, 0 for the largest.
     """
     sizes = np.bincount(parts)
-    tied = np.flatnonzero(sizes > 1)[:MAX_PARTS]
+    tied = np.flatnonzero(sizes > 1)[:_MAX_PARTS]
     rows = [(f"part {row + 1}", parts == part, SERIES[0]) for row, part in enumerate(tied)]
     lone, others = sizes[parts] == 1, (sizes[parts] > 1) & ~np.isin(parts, tied)
     rows += [("other parts", others, SERIES[4])] if others.any() else []
@@ -217,8 +217,8 @@ def centre_of(frame_shape: tuple[int, int]) -> FloatArray:
     return np.asarray(corners(frame_shape).mean(axis=0, keepdims=True))
 
 
-MAX_DOTS = 500  # maximum number of spans whose shifts are drawn
-SMALLEST_SHIFT_PX = 0.06  # shifts of blocks are drawn if their root mean square exceeds this, and three times their noise
+_MAX_DOTS = 500  # maximum number of spans whose shifts are drawn
+_SMALLEST_SHIFT_PX = 0.06  # shifts of blocks are drawn if their root mean square exceeds this, and three times their noise
 _FEWEST_BLOCKS = 16  # minimum number of blocks per square of the panorama
 _FEWEST_SPANS = 16  # minimum number of spans for a spectrum
 _WINDOW_SPANS = 512  # maximum window of the spectrum
@@ -288,7 +288,7 @@ def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
     steps, stds = found.steps[:, :2], _noise_px(found)
     with plain_figure(WIDTH_IN, 5.2) as figure:
         time, spectrum = add_axes(figure, Margins(top=0.35), rows=(1, 1), gap_in=0.6)
-        shown = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), MAX_DOTS)).round().astype(int))
+        shown = np.unique(np.linspace(0, len(steps) - 1, min(len(steps), _MAX_DOTS)).round().astype(int))
         instants, band = residuals.instants[shown], 2 * stds[shown].max(axis=1)
         band = np.where(np.isfinite(band), band, np.nan)
         time.fill_between(instants, -band, band, color=MUTED, alpha=0.25, linewidth=0)
@@ -390,8 +390,8 @@ def significant_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray] | 
     with np.errstate(divide="ignore"):
         noise = np.sqrt(1 / np.linalg.eigvalsh(information).clip(min=0)[..., 0])
     length = np.linalg.norm(field, axis=-1)
-    known = noise < np.maximum(SMALLEST_SHIFT_PX, length / 2)
-    if not known.any() or np.sqrt(np.mean(length[known] ** 2)) < max(SMALLEST_SHIFT_PX, 3 * float(np.median(noise[known]))):
+    known = noise < np.maximum(_SMALLEST_SHIFT_PX, length / 2)
+    if not known.any() or np.sqrt(np.mean(length[known] ** 2)) < max(_SMALLEST_SHIFT_PX, 3 * float(np.median(noise[known]))):
         return None
     height, width = residuals.frame_shape
     y, x = np.nonzero(known)

@@ -47,8 +47,8 @@ from photonpano.values import FloatArray, NotLocated, VirtualExposure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MAX_PAIRS = 8  # number of pairs whose exposures are shown
-EXPOSURE_PIXELS = 480  # longer side of an exposure on the page
+_MAX_PAIRS = 8  # number of pairs whose exposures are shown
+_EXPOSURE_PIXELS = 480  # longer side of an exposure on the page
 _WHITE_QUANTILE = 0.995
 
 
@@ -98,9 +98,9 @@ def _shown(lost: UntiedError, failures: Sequence[FailureRecord], groups: Sequenc
         return []
     edges = [edge for edge in lost.edges if isinstance(edge.motion, NotLocated)]
     edge_of = {id(failure): edge for failure, edge in zip(failures, edges, strict=True)}
-    each = max(1, MAX_PAIRS // max(1, len(groups)))
+    each = max(1, _MAX_PAIRS // max(1, len(groups)))
     found = []
-    for failure in [failure for group in groups for failure in _spread(group.failures, each)][:MAX_PAIRS]:
+    for failure in [failure for group in groups for failure in _spread(group.failures, each)][:_MAX_PAIRS]:
         edge = edge_of[id(failure)]
         moving, fixed = _pictures([lost.merged(edge.moving), lost.merged(edge.fixed)])
         found.append(ShownPair(failure, moving, fixed))
@@ -111,7 +111,7 @@ def _ends_of_parts(lost: UntiedError) -> list[dict[str, Any]]:
     """Return the first and the last exposure of each part that is tied together, where points can be clicked to tie parts."""
     if lost.merged is None:
         return []
-    parts = [np.flatnonzero(lost.parts == part) for part in np.flatnonzero(np.bincount(lost.parts) > 1)[:MAX_PAIRS]]
+    parts = [np.flatnonzero(lost.parts == part) for part in np.flatnonzero(np.bincount(lost.parts) > 1)[:_MAX_PAIRS]]
     ends = sorted({int(part[end]) for part in parts for end in (0, -1)}) if len(parts) > 1 else []
     return [{"frame": int(lost.groups[index].reference), "uri": _pictures([lost.merged(index)])[0]} for index in ends]
 
@@ -125,7 +125,7 @@ def _pictures(pair: Sequence[VirtualExposure]) -> list[str]:
     """Return exposures as data URIs, of one brightness."""
     seen = np.concatenate([exposure.flux[np.isfinite(exposure.flux)] for exposure in pair])
     white = (float(np.quantile(seen, _WHITE_QUANTILE)) if seen.size else 0.0) or 1.0
-    return [jpeg_uri(shrunk(picture_of(exposure.flux, white), EXPOSURE_PIXELS)) for exposure in pair]
+    return [jpeg_uri(shrunk(picture_of(exposure.flux, white), _EXPOSURE_PIXELS)) for exposure in pair]
 
 
 _MOST_DIFFERENCES = 60  # number of settings that are listed
@@ -167,11 +167,11 @@ def render_comparison(runs: Sequence[ComparedRun], output: Path) -> str:
         rows=_rows(runs),
         settings=shown,
         more_settings=hidden,
-        differences=differences_over_time(runs) if any(run.mean_difference_px for run in runs) else None,
+        differences=_differences_over_time(runs) if any(run.mean_difference_px for run in runs) else None,
     )
 
 
-def differences_over_time(runs: Sequence[ComparedRun]) -> str:
+def _differences_over_time(runs: Sequence[ComparedRun]) -> str:
     """Draw how far the motion of each run is from that of the first, frame by frame."""
     others = [run for run in runs if run.difference_px is not None]
     with plain_figure(WIDTH_IN, 3.0) as figure:
@@ -265,7 +265,7 @@ def render_batch(
     The page lies in `directory`. `spec` is its text, or its data, `common` what was changed in it for all runs, and `keys` are
     the swept keys.
     """
-    figures = {key: errors_over_setting(rows, key, number) for number, key in enumerate(keys)}
+    figures = {key: _errors_over_setting(rows, key, number) for number, key in enumerate(keys)}
     return filled(
         "batch.html",
         title=directory.name,
@@ -281,7 +281,7 @@ def render_batch(
         has_truth=any(row.true_error_px is not None or row.true_position_error is not None for row in rows),
         of_positions=any(row.expected_position_error is not None for row in rows),
         n_captures=len({row.name for row in rows}),
-        n_coloured=COLOURED,
+        n_coloured=_COLOURED,
         keys=keys,
         figures={key: figure for key, figure in figures.items() if figure},
         spec=spec if isinstance(spec, str) else yaml_of(spec),
@@ -294,7 +294,7 @@ def _link_of_row(directory: Path, row: BatchRow) -> str | None:
     return None if row.report is None else quote(os.fsencode(Path(os.path.relpath(row.report, directory)).as_posix()))
 
 
-COLOURED = len(SERIES)  # number of lines up to which each has a colour and a name
+_COLOURED = len(SERIES)  # number of lines up to which each has a colour and a name
 _ERRORS = {
     "true_error_px": "true error (px)",
     "expected_error_px": "expected error (px)",
@@ -303,7 +303,7 @@ _ERRORS = {
 }
 
 
-def errors_over_setting(rows: Sequence[BatchRow], key: str, number: int = 0) -> str | None:
+def _errors_over_setting(rows: Sequence[BatchRow], key: str, number: int = 0) -> str | None:
     """Draw the errors of runs over a swept setting, a line for each capture and for what else is swept.
 
     Numbers are drawn to scale, other values at equal distances. None if no run that is done has an error.
@@ -354,7 +354,7 @@ def _errors_by_series(
 
 
 def _draw(axes: Axes, lines: Mapping[str, tuple[list[float], list[float]]]) -> None:
-    if len(lines) <= COLOURED:
+    if len(lines) <= _COLOURED:
         for (name, (x, y)), colour in zip(lines.items(), SERIES, strict=False):
             axes.plot(x, y, "o-", markersize=4, color=colour, label=name)
         return

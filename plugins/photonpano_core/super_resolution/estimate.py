@@ -66,7 +66,7 @@ class Observations:
         In changing light it is `k sum_c n_c g_c / sum_c n_c (1 - exp(-g_c mean))` of counts k in n_c frames of gain g_c.
         """
         if self.light is None or not self.binary:
-            photon_ratio(self.lit, self.seen, mean, self.binary, into)
+            _photon_ratio(self.lit, self.seen, mean, self.binary, into)
         else:
             np.divide(self.lit * self.seen, self._counts(mean)[0], out=into)
 
@@ -210,7 +210,7 @@ def _lit_share(light: np.float32) -> np.float32:
 
 
 @compiled
-def photon_ratio(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool, into: FluxImage) -> None:
+def _photon_ratio(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool, into: FluxImage) -> None:
     """Write `k / (1 - exp(-mean))` of the counts k of each cell, (H, W), or k / mean of counts that are not binary."""
     least = np.float32(1e-9)
     for y in range(lit.shape[0]):
@@ -227,7 +227,7 @@ def photon_ratio(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool,
 
 @compiled
 def log_likelihood(lit: FluxImage, seen: FluxImage, mean: FluxImage, binary: bool, into: FluxImage) -> None:
-    """Write the log-likelihood of the counts of each cell, but for a constant: see `photon_ratio` for the arguments."""
+    """Write the log-likelihood of the counts of each cell, but for a constant: see `_photon_ratio` for the arguments."""
     least = np.float32(1e-9)
     for y in range(lit.shape[0]):
         k, n, m, out = lit[y], seen[y], mean[y], into[y]
@@ -262,7 +262,7 @@ Image = NDArray[np.float32]
 
 _PATCH = 8  # side of a patch, px
 GROUP = 16  # similar patches that are filtered together; a power of 2
-SEARCH = 10  # similar patches are looked for at this distance at most along x and y, px
+_SEARCH = 10  # similar patches are looked for at this distance at most along x and y, px
 STEP = 4  # distance of reference patches, px
 _THRESHOLD = np.float32(2.7)  # coefficients below this many standard deviations of the noise are set to 0
 _DCT: Image = dct(np.eye(_PATCH), axis=0, norm="ortho").astype(np.float32)
@@ -292,7 +292,7 @@ def find_similar(image: Image, patches: Patches) -> None:
     """Find the patches of an image, (H, W), that differ least from each reference patch."""
     rows, columns, found = patches
     height, width = image.shape
-    side = 2 * SEARCH + 1
+    side = 2 * _SEARCH + 1
     best = np.empty(GROUP, np.float32)
     distances = np.empty(side, np.float32)
     for r in range(len(rows)):
@@ -300,8 +300,8 @@ def find_similar(image: Image, patches: Patches) -> None:
             y0, x0 = rows[r], columns[c]
             places = found[r, c]
             n = 0
-            top, bottom = max(0, y0 - SEARCH), min(height - _PATCH, y0 + SEARCH)
-            left, right = max(0, x0 - SEARCH), min(width - _PATCH, x0 + SEARCH)
+            top, bottom = max(0, y0 - _SEARCH), min(height - _PATCH, y0 + _SEARCH)
+            left, right = max(0, x0 - _SEARCH), min(width - _PATCH, x0 + _SEARCH)
             size = right - left + 1
             for y in range(top, bottom + 1):
                 row = distances[:size]

@@ -214,12 +214,12 @@ def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: 
     image = np.where(unseen, np.nan, brightness).reshape(seen.canvas.shape)
     gradient = np.stack([np.nan_to_num(each).ravel() for each in gradient_of(image)])[:, seen.cells]
     columns = np.concatenate([gradient, np.ones((1, len(left)))])
-    normal, right = equations_of_groups(seen.times, len(seen.spans), columns, weight, left)
+    normal, right = _equations_of_groups(seen.times, len(seen.spans), columns, weight, left)
     shift = np.linalg.solve(normal + np.eye(3), right[..., None])[:, :2, 0]
     return np.asarray((shift[seen.times].T * gradient).sum(axis=0))
 
 
-def equations_of_groups(
+def _equations_of_groups(
     groups: NDArray[np.intp], number: int, columns: FloatArray, weight: FloatArray, target: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the least-squares equations of each group of observations, for K columns (K, N): (G, K, K) and (G, K)."""
@@ -305,7 +305,7 @@ def local_flicker(gains: Gains) -> LocalFlicker | None:
         return None
     near = float(frequencies[peak - 1]), float(frequencies[peak + 1])
     best = minimize_scalar(partial(_misfit, gains), bounds=near, options={"xatol": _ACCURACY * near[0]})
-    flicker = measured_flicker(gains, float(best.x))
+    flicker = _measured_flicker(gains, float(best.x))
     alike = replace(flicker, maps=np.zeros_like(flicker.maps), slow=gains.gain)
     # Medians, since things that move change the light of their places, too.
     left, common = (robust_std(_left(gains, each)[0]) ** 2 for each in (flicker, alike))
@@ -339,7 +339,7 @@ def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:
 
 def _misfit(gains: Gains, frequency: float) -> float:
     """Return the mean square that a flicker of a frequency leaves in the photons."""
-    left, noise = _left(gains, measured_flicker(gains, frequency))
+    left, noise = _left(gains, _measured_flicker(gains, frequency))
     return float(np.average(left**2, weights=1 / (SMOOTHING**2 * noise + STRUCTURE**2)))
 
 
@@ -356,7 +356,7 @@ def _waves(seen: SeenCells, frequency: float) -> FloatArray:
     return np.asarray((averaged * np.stack([np.cos(turns), np.sin(turns)]))[:, seen.times])
 
 
-def measured_flicker(gains: Gains, frequency: float) -> LocalFlicker:
+def _measured_flicker(gains: Gains, frequency: float) -> LocalFlicker:
     """Fit the amplitude and the phase of each square of the scene at a frequency; spans must be much shorter than a period."""
     seen, waves = gains.seen, _waves(gains.seen, frequency)
     period = max(1, round(1 / (frequency * float(np.median(np.diff(seen.instants))))))

@@ -40,7 +40,7 @@ class MotionField:
     def at(self, elapsed: float) -> Image:
         """Return the displacement at a time: (H, W, 2), x and y in px of the grid."""
         displacement = np.empty(self.coefficients.shape[1:], np.float32)
-        value_of_each(self.coefficients.reshape(len(self.coefficients), -1), np.float32(elapsed), displacement.reshape(-1))
+        _value_of_each(self.coefficients.reshape(len(self.coefficients), -1), np.float32(elapsed), displacement.reshape(-1))
         return displacement
 
     @property
@@ -116,7 +116,7 @@ def fit_each(moments: Image, right: Image, prior: float, where: BoolArray, found
 
 
 @compiled
-def value_of_each(coefficients: Image, time: np.float32, found: Image) -> None:
+def _value_of_each(coefficients: Image, time: np.float32, found: Image) -> None:
     """Evaluate polynomials with coefficients (D, N) of the powers 1 to D of time, by Horner's rule, into `found` (N,)."""
     found[:] = 0
     for degree in range(len(coefficients) - 1, -1, -1):

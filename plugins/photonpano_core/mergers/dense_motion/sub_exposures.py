@@ -187,7 +187,7 @@ class SubExposures:
         groups = divided(len(self.spans), n)
         times = [self.elapsed((self.spans[each.start].start + self.spans[each.stop - 1].stop - 1) / 2) for each in groups]
         reference = next(place for place, each in enumerate(groups) if self.reference in each)
-        return Joined([total_of(sums[each.start : each.stop]) for each in groups], times, reference)
+        return Joined([_total_of(sums[each.start : each.stop]) for each in groups], times, reference)
 
     def smoothed(self, photons: PhotonSum, blur_px: float) -> Smoothed:
         """Blur a sub-exposure by some px of a frame, and stabilise its noise."""
@@ -250,7 +250,7 @@ def halved(image: Image) -> Image:
     return np.asarray(cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def total_of(sums: Sequence[PhotonSum]) -> PhotonSum:
+def _total_of(sums: Sequence[PhotonSum]) -> PhotonSum:
     """Add sums up."""
     counts, weight = sums[0].counts.copy(), sums[0].weight.copy()
     for each in sums[1:]:
