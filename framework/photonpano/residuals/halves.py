@@ -54,7 +54,8 @@ class Agreements:
     # (C, 2) errors of the shift of one against the other that photon noise lets expect, in px of a frame: along the direction
     # that is known best, and least; half of the longer side of a frame where nothing is known
     std_px: FloatArray
-    angles_deg: FloatArray  # (C,) of the direction that is known least, from x towards y on the panorama, 0 to 180
+    # (C,) of the direction that is known least, from x towards y on the panorama, 0 to 180; NaN where no place was seen by both
+    angles_deg: FloatArray
 
     @classmethod
     def of(cls, firsts: Sequence[int], found: Sequence[_Agreement], scale: float) -> Agreements:
@@ -96,8 +97,8 @@ class Halves:
             return np.asarray(across_px)
         stretch = np.searchsorted(self.stretches.firsts, frames, side="right").clip(1) - 1
         # The noise of any short stretch is in the expected error of its exposures.
-        alone_px2 = self.stretches.std_px[:, 1] ** 2
-        beyond_px = np.sqrt(np.maximum(alone_px2 - np.median(alone_px2), 0))
+        seen, alone_px2 = np.isfinite(self.stretches.angles_deg), self.stretches.std_px[:, 1] ** 2
+        beyond_px = np.where(seen, np.sqrt(np.maximum(alone_px2 - np.median(alone_px2), 0)), 0)
         return np.asarray(np.maximum(across_px, beyond_px[stretch]))
 
 
@@ -121,7 +122,7 @@ class _Agreement(NamedTuple):
 def halves_of(source: Source, motion: FrameMotion, canvas: Canvas, context: Context) -> Halves:
     """Compare the halves of a capture along a motion across up to 32 cuts, and 33 stretches with all others, on any canvas."""
     span, canvas = motion.span, _reduced(canvas)
-    number = 2 * min(_CUTS + 1, len(span) // (2 * _FEWEST_FRAMES))
+    number = 2 * min(_CUTS + 1, len(span) // (2 * _FEWEST_FRAMES * channels_of(source)))  # a pixel has one colour in a frame
     if number < 4:
         return Halves.none()
     starts = np.linspace(span.start, span.stop, number + 1).round().astype(int).tolist()

@@ -177,13 +177,15 @@ def _one_direction(run: TestedRun) -> Found | None:
     halves = run.explained.halves
     if not len(halves.cuts.firsts):
         return None
+    ties = halves.cuts, halves.stretches
     between = "px between the frames before and after {:.0f}", "px between the frames from {:.0f} on for a while and all others"
-    ties, place = max(zip((halves.cuts, halves.stretches), between, strict=True), key=lambda each: each[0].std_px[:, 1].max())
-    weakest = int(np.argmax(ties.std_px[:, 1]))
-    (strong, weak), angle = ties.std_px[weakest].tolist(), ties.angles_deg[weakest]
-    if weak < _ASLANT * strong:
+    aslant = [np.where(weak >= _ASLANT * strong, weak, 0) for strong, weak in (each.std_px.T for each in ties)]
+    found, place, weak_px = max(zip(ties, between, aslant, strict=True), key=lambda each: float(each[2].max()))
+    weakest = int(np.argmax(weak_px))
+    (strong, weak), angle = found.std_px[weakest].tolist(), found.angles_deg[weakest]
+    if not weak_px[weakest]:
         return None
-    where = f"{place.format(ties.firsts[weakest])}, at {angle:.0f} degrees from x towards y"
+    where = f"{place.format(found.firsts[weakest])}, at {angle:.0f} degrees from x towards y"
     what_to_do = (
         "the motion may be wrong by any distance along it, which this panorama does not show; keep other structures in view"
     )

@@ -83,13 +83,13 @@ def test_what_a_mask_of_some_frames_leaves_out_is_not_merged(name: str, moves: b
     assert found.weight[:, :20].mean() == pytest.approx(expected.weight[:, :20].mean())
 
 
-def test_changing_light_and_a_lens_that_distorts_are_errors(motion: Trajectory, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changing_light_and_a_lens_that_distorts_are_errors(motion: Trajectory) -> None:
     source, merger = capture(), built("local-flow")
     with pytest.raises(InputError, match=r"local-flow does not divide by light that changes; use photon-mle"):
         merger.merge(in_light(source, Light.of_frames(np.ones(N))), GROUP, motion, 1.0)
-    monkeypatch.setattr(source, "camera", Camera.of(100.0, (HEIGHT, WIDTH), (-0.1, 0, 0, 0)), raising=False)
+    distorting = replace(capture_of(source), camera=Camera.of(100.0, (HEIGHT, WIDTH), (-0.1, 0, 0, 0)))
     with pytest.raises(InputError, match=r"local-flow does not warp through a lens that distorts; use photon-mle"):
-        merger.merge(source, GROUP, motion, 1.0)
+        merger.merge(distorting, GROUP, motion, 1.0)
 
 
 @pytest.mark.parametrize("tolerance_px", [0.25, 4.0])

@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, InputError, Light, Trajectory, VirtualExposure
+from photonpano import FrameSpan, Group, InputError, Light, Trajectory, VirtualExposure, capture_of
 from photonpano.corrections.lighting import in_light
 from photonpano.geometry import inverse, rescaling
 from photonpano.testing import KnownMotion, MemorySource
@@ -177,8 +178,7 @@ def test_splat_ignores_frames_behind_camera_or_off_grid(memory_source: type, fra
 
 def test_splat_refuses_source_with_corrected_sums() -> None:
     """Also at the first level, where frames are not splatted."""
-    source: Any = MemorySource(np.zeros((10, 8, 8)))
-    source.corrected = lambda counts, n_frames: counts - np.float32(n_frames)
+    source = replace(capture_of(MemorySource(np.zeros((10, 8, 8)))), steps=(lambda counts, n_frames: counts - n_frames,))
     for trajectory in (None, KnownMotion(lambda _: np.eye(3))):
         with pytest.raises(InputError) as caught:
             SplatMerger().merge(source, Group(FrameSpan(0, 10), 5), trajectory, 1.0)

@@ -32,7 +32,7 @@ def write(folder: Path, *, turns: bool = True, located: np.ndarray = LOCATED) ->
     camera = {"rotations": ROTATIONS, "camera_matrix": CAMERA.matrix, "distortion": CAMERA.distortion} if turns else {}
     homographies = CAMERA.homographies(ROTATIONS) if turns else np.tile(np.eye(3), (N_FRAMES, 1, 1))
     arrays = {"homographies": homographies, "canvas": np.eye(3), "frame_shape": np.array(SHAPE), "located": located}
-    np.savez(folder / "trajectory.npz", **arrays, **camera)
+    np.savez(folder / "trajectory.npz", std_px=np.full(N_FRAMES, 0.1), **arrays, **camera)
 
 
 def rows(path: Path) -> list[list[str]]:
