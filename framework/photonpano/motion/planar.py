@@ -121,7 +121,6 @@ class Plane(NamedTuple):
     """The homographies of the exposures of a graph."""
 
     homographies: FloatArray  # (N, 3, 3) to the anchor's frame
-    drifts: FloatArray  # (w,) mean step of each walk, times their number: in unit coordinates
     coupling: float = 0.0  # perspective that a shift brings along, in unit coordinates: -(s / f)^2 for a camera that turns
 
 
@@ -158,16 +157,15 @@ class PlanarAdjustment(Adjustment[Plane]):
     coupling of perspective to shift, where the model has both.
 
     Attributes:
-        variances: of the prior, in squares of unit coordinates: of each walk per frame, (w,), of the drift of each over the
-            capture, (w,), and then of the coupling.
+        variances: of the prior, in squares of unit coordinates: of each walk per frame, (w,), and then of the coupling.
     """
 
     def __init__(self, problem: Problem, model: PlanarName, *, bends: bool = False) -> None:
         """Set up the problem; `bends` has a model without perspective share the coupling, too."""
         self._problem, self._model, self._basis = problem, model, basis_of(model)
         self._n_walks = max(self._basis.shape[1] - _FREE, 0)
-        self._bends, self._couples = bends, model == "homography" or bends
-        super().__init__(problem, n_shared=self._n_walks + int(self._couples))
+        self._bends = bends
+        super().__init__(problem, n_shared=int(model == "homography" or bends))
         # Nodes are in order of time; those of one instant make no step.
         self._times = np.maximum(np.diff(problem.instants), 1.0)
         self._durations = np.array([max(float(self._times.sum()), 1.0)] * self._n_walks + [1.0] * self._n_shared)
@@ -181,24 +179,13 @@ class PlanarAdjustment(Adjustment[Plane]):
     @property
     def walks_px(self) -> dict[str, float]:
         """How far each walk moves the ends of a frame over the capture, in px: a standard deviation; none that are 0."""
-        walks, drifts = (self.variances * self._durations)[: 2 * self._n_walks].reshape(2, -1)
-        ends_px = np.sqrt(walks + drifts) * self._half
-        return {_WALKS[walk]: float(ends_px[walk]) for walk in np.flatnonzero(self._there[: self._n_walks])}
-
-    @property
-    def _there(self) -> BoolArray:
-        """Which walks are there, by their steps or their drift, and whether the coupling is: (w + 1,)."""
-        there, w = self.variances * self._durations > _NONE**2, self._n_walks
-        return np.append(there[:w] | there[w : 2 * w], there[2 * w :])
+        ends_px = np.sqrt(self.variances * self._durations) * self._half
+        return {name: float(px) for name, px in zip(_WALKS, ends_px[: self._n_walks], strict=False) if px > _NONE * self._half}
 
     @property
     def n_hyperparameters(self) -> int:
         """How many variances were estimated."""
-        return int((self.variances * self._durations > _NONE**2).sum())
-
-    def starting(self, homographies: FloatArray) -> Plane:
-        """Return a state of (N, 3, 3) homographies from which to begin."""
-        return Plane(homographies, np.zeros(self._n_walks))
+        return int((self.variances > _NONE**2 / self._durations).sum())
 
     def homographies(self, state: Plane) -> FloatArray:
         """Return those of the state."""
@@ -206,9 +193,7 @@ class PlanarAdjustment(Adjustment[Plane]):
 
     def changed(self, state: Plane, nodes: FloatArray, shared: FloatArray) -> Plane:
         """Return the homographies after a step."""
-        w = self._n_walks
-        homographies = moved(state.homographies, nodes, self._basis, self._frame_shape)
-        return Plane(homographies, state.drifts + shared[:w], state.coupling + float(shared[w:].sum()))
+        return Plane(moved(state.homographies, nodes, self._basis, self._frame_shape), state.coupling + float(shared.sum()))
 
     def anchored(self, state: Plane) -> Plane:
         """Return the homographies, of which the anchor's is the identity."""
@@ -221,7 +206,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         return np.asarray(np.einsum("pk,pij->kij", self._basis, generators(self._frame_shape)))
 
     def prior(self, state: Plane) -> Prior:
-        """Return the steps of the walks from each node to the next, their drifts, and the coupling."""
+        """Return the steps of the walks from each node to the next, and the coupling."""
         if not (parts := self._components(state)):
             return super().prior(state)
         stds = np.repeat(np.sqrt(self.variances), [len(part.residuals) for part in parts])
@@ -245,22 +230,22 @@ class PlanarAdjustment(Adjustment[Plane]):
             self.variances = assumed**2 / self._durations
             return bool(changed.any())
         before, problem = self.variances, self._around(state, weights)
-        # The variances of the drifts and the coupling are exact; others are those of draws.
-        shared, last = np.eye(problem.right.shape[0])[:, -self._n_shared :], np.zeros(len(before))
+        # The variance of the last shared unknown, the coupling, is exact; others are those of draws.
+        alone = np.zeros((problem.right.shape[0], 1))
+        alone[-1], last = self._n_shared, np.zeros(len(before))
         for _ in range(_ROUNDS):
             scales = np.ones((len(before), _DRAWS + 1)) / np.sqrt(self.variances)[:, None]
             scales[:, 0] **= 2
             given = problem.right + sum(side * scale for side, scale in zip(problem.sides, scales, strict=True))
-            changes = problem.factors(self.variances).solve(np.column_stack([given, shared]))
-            covariances = changes[-self._n_shared :, -self._n_shared :]
+            changes = problem.factors(self.variances).solve(np.column_stack([given, alone]))
             found = np.empty(len(before))
             for index, (part, variance) in enumerate(zip(problem.parts, self.variances, strict=True)):
-                moves, number = part.slopes @ changes[:, : 1 + _DRAWS], len(part.residuals)
-                left, place = part.residuals - moves[:, 0], index - self._n_walks
-                unsure = (moves[:, 1:] ** 2).sum() / _DRAWS if place < 0 else covariances[place, place]
+                moves, number = part.slopes @ changes, len(part.residuals)
+                left = part.residuals - moves[:, 0]
+                unsure = (moves[:, 1:-1] ** 2).sum() / _DRAWS if index < self._n_walks else changes[-1, -1]
                 found[index] = (left @ left) / max(number - unsure / variance, 1e-3 * number)
             # Steps that go on in one direction, as those to zero, are doubled.
-            self._of_coupling = float(covariances[-1, -1])
+            self._of_coupling = float(changes[-1, -1])
             step = np.log(np.maximum(found / self.variances, np.exp(-_MOST)))
             step, last = np.clip(np.where(step * last > 0, 2 * step, step), -_MOST, _MOST), step
             step = np.maximum(step, np.log(_NONE**2 / self._durations / self.variances))
@@ -268,7 +253,7 @@ class PlanarAdjustment(Adjustment[Plane]):
             if np.abs(step).max() < _SETTLED:
                 break
         least = problem.deviance(self.variances)
-        for index in range(2 * self._n_walks):  # none by which errors become larger
+        for index in range(self._n_walks):  # none by which errors become larger
             without = self.variances.copy()
             without[index] = _NONE**2 / self._durations[index]
             if without[index] < self.variances[index] and (other := problem.deviance(without)) < least + _WORTH:
@@ -293,7 +278,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         As many of the drawn errors as it is likely that perspective follows the shift (weights of Akaike) are those with it.
         """
         own = self.assess(state, norms, kept)
-        if self._couples:
+        if self._n_shared:
             return own
         bent = PlanarAdjustment(self._problem, self._model, bends=True)
         bent._noise_norm, bent.variances = self._noise_norm, np.append(self.variances, 1.0)
@@ -313,19 +298,15 @@ class PlanarAdjustment(Adjustment[Plane]):
         """Return the derivatives of the corners that each edge maps by the coupling, which the path follows."""
         if not self._bends:
             return super().shared_slopes(state)
-        there = self.mapped_corners(state._replace(homographies=self._bent(state))) - self.mapped_corners(state)
-        return self._by_coupling(there / _BEND)
+        there = self.mapped_corners(Plane(self._bent(state))) - self.mapped_corners(state)
+        return np.asarray(there.reshape(-1, 8, 1) / _BEND)
 
     def shared_errors(self, state: Plane) -> FloatArray:
         """Return the derivatives of the corners of each node's frame by the coupling."""
         if not self._bends:
             return super().shared_errors(state)
         there = transform_points(inverse(state.homographies) @ self._bent(state), self._corners) - self._corners
-        return self._by_coupling(there / _BEND)
-
-    def _by_coupling(self, corners: FloatArray) -> FloatArray:
-        """Return (N, 4, 2) derivatives by the coupling as those by all that is shared: (N, 8, s)."""
-        return np.pad(corners.reshape(-1, 8, 1), ((0, 0), (0, 0), (self._n_walks, 0)))
+        return np.asarray(there.reshape(-1, 8, 1) / _BEND)
 
     def _bent(self, state: Plane) -> Homography:
         """Return the homographies of a path of the same shifts and rolls, along which perspective follows the shift."""
@@ -336,30 +317,29 @@ class PlanarAdjustment(Adjustment[Plane]):
 
     def narrowed(self, state: Plane) -> tuple[PlanarAdjustment, Plane]:
         """Return the problem without walks that are none, and the nearest state that it holds."""
-        most = int(np.flatnonzero(self._there).max(initial=-1)) + 1
+        there = self.variances > _NONE**2 / self._durations
+        most = int(np.flatnonzero(there).max(initial=-1)) + 1
         model = next(name for name in PLANAR_NAMES[1:] if len(_MOVED[name]) - _FREE >= min(most, len(_WALKS)))
         if len(_MOVED[model]) >= self._n_node:
             return self, state
         narrow = PlanarAdjustment(self._problem, model)
-        n, w = narrow._n_walks, self._n_walks
-        narrow.variances, narrow._noise_norm = self.variances[: 2 * w].reshape(2, w)[:, :n].ravel(), self._noise_norm
-        return narrow, Plane(nearest(model, state.homographies, self._frame_shape), state.drifts[:n])
+        narrow.variances, narrow._noise_norm = self.variances[: narrow._n_walks], self._noise_norm
+        return narrow, Plane(nearest(model, state.homographies, self._frame_shape))
 
     @property
     def is_coupled(self) -> bool:
         """Whether perspective follows the shift (Schwarz 1978), as that of a camera that turns, or has a lens."""
-        return bool(self._couples and self.variances[-1] > self._of_coupling * self.price)
+        return bool(self._n_shared and self.variances[-1] > self._of_coupling * self.price)
 
     def turning_px(self, state: Plane) -> float | None:
         """Return the focal length of a camera that turns; None unless perspective follows the shift."""
         return self._half / float(np.sqrt(-state.coupling)) if self.is_coupled and state.coupling < 0 else None
 
     def _components(self, state: Plane) -> list[Prior]:
-        """Return the steps of each walk beyond drift and coupling, over the roots of their times; the drifts; the coupling."""
+        """Return the steps of each walk beyond the coupling, over the roots of their times; and the coupling."""
         n_steps, k, w = len(self._times), self._n_node, self._n_walks
-        if not self._n_shared:
+        if not w and not self._n_shared:
             return []
-        shared = np.append(state.drifts, [state.coupling] * self._couples)
         perspective = self._model == "homography"
         relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
         motions = logarithms(relative, self._frame_shape)
@@ -368,10 +348,10 @@ class PlanarAdjustment(Adjustment[Plane]):
         earlier = _coordinates(inverse(relative)[:, None] @ moves @ relative[:, None], self._frame_shape)
         by_nodes = np.stack([-back @ np.swapaxes(earlier, 1, 2), np.broadcast_to(back, (n_steps, w, 8))], axis=2) @ self._basis
         steps, roots = motions @ back.T, 1 / np.sqrt(self._times)
-        by_shared = np.zeros((w, n_steps, self._n_shared))
-        by_shared[np.arange(w), :, np.arange(w)] = -self._times / self._times.sum()
+        by_coupling = np.zeros((n_steps, w))
         if perspective:
-            by_shared[_PERSPECTIVE, :, -1] = -motions[:, 4:6].T
+            by_coupling[:, _PERSPECTIVE] = -motions[:, 4:6]
+            steps += state.coupling * by_coupling
             shifts = np.eye(8)[4:6]
             of_shift = np.stack([-shifts @ np.swapaxes(earlier, 1, 2), np.broadcast_to(shifts, (n_steps, 2, 8))], axis=2)
             by_nodes[:, _PERSPECTIVE] -= state.coupling * (of_shift @ self._basis)
@@ -380,11 +360,13 @@ class PlanarAdjustment(Adjustment[Plane]):
         parts = []
         for walk in range(w):
             entries = (by_nodes[:, walk].reshape(n_steps, 2 * k) * roots[:, None]).ravel()
-            of_nodes = sparse.csr_array((entries, (rows, columns)), shape=(n_steps, k * self._n_nodes))
-            of_shared = sparse.csr_array(by_shared[walk] * roots[:, None])
-            step = steps[:, walk] + by_shared[walk] @ shared
-            parts.append(Prior(step * roots, sparse.csr_array(sparse.hstack([of_nodes, of_shared]))))
-        return parts + [Prior(shared[[place]], self._of_shared(np.eye(len(shared))[[place]])) for place in range(len(shared))]
+            slopes = sparse.csr_array((entries, (rows, columns)), shape=(n_steps, k * self._n_nodes))
+            if self._n_shared:
+                slopes = sparse.csr_array(sparse.hstack([slopes, sparse.csr_array(by_coupling[:, [walk]] * roots[:, None])]))
+            parts.append(Prior(steps[:, walk] * roots, slopes))
+        if self._n_shared:
+            parts.append(Prior(np.array([state.coupling]), self._of_shared(np.ones((1, 1)))))
+        return parts
 
     def information(self, state: Plane, blocks: FloatArray) -> FloatArray:
         """Convert (N, k, k) information on changes of nodes to that on p1..p8 of their homographies.

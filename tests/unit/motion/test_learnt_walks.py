@@ -151,7 +151,7 @@ def test_the_model_that_moved_has_the_lower_deviance(true: np.ndarray, likelier:
     assert rivals[likelier].chi2 < 1.1
     assert {name: each.unknowns for name, each in rivals.items()} == {
         "rotation": 3 * (N_NODES - 1) + 1,
-        "homography": 8 * (N_NODES - 1) + 6,
+        "homography": 8 * (N_NODES - 1) + 1,
     }
 
 
@@ -191,18 +191,3 @@ def test_shifts_claim_what_a_turn_that_does_not_show_would_bend() -> None:
         claims.append(float(np.sqrt((solution.assess().std_px ** 2).mean())))
     assert np.mean(errors) > 10
     assert 0.5 < np.linalg.norm(errors) / np.linalg.norm(claims) < 2
-
-
-@pytest.mark.parametrize("walk", WALKS)
-def test_a_steady_drift_is_found_that_no_walk_shows(walk: str) -> None:
-    """Of 1 % over the capture, each step is far below its noise, but all have the same sense."""
-    basis = basis_of("homography")
-    steps = np.random.default_rng(0).normal(size=(N_NODES - 1, basis.shape[1])) * [0.1, 0.05, 0.02, 0, 0, 0, 0, 0]
-    steps[:, 3 + WALKS.index(walk)] = 0.01 / (N_NODES - 1)
-    found = [np.eye(3)]
-    for step in steps:
-        found.append(moved(found[-1][None], step[None], basis, SHAPE)[0])
-    solution = solve(GROUPS, measured_with(np.array(found), 0, 0.1), N_NODES // 2, SHAPE, model=HOMOGRAPHIES)
-    assert solution.walks_px[walk] == pytest.approx(0.01 * max(SHAPE) / 2, rel=0.2)
-    assert all(px < 0.1 for name, px in solution.walks_px.items() if name != walk)
-    assert rms_px(solution.homographies, np.array(found)) < 0.2

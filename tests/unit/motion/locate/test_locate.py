@@ -29,7 +29,7 @@ def test_homographies_are_in_pixels_of_frames_at_any_scale(
     assert found.n_located == len(found.groups) == 12
     np.testing.assert_array_equal(found.instants, np.arange(12) * 10 + 4.5)
     true = motion.at(found.instants)
-    np.testing.assert_allclose(found.homographies, normalised(inverse(true[6]) @ true), atol=1e-3)  # by the prior
+    np.testing.assert_allclose(found.homographies, normalised(inverse(true[6]) @ true), atol=2e-4)  # by the prior
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
