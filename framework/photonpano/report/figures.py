@@ -309,17 +309,20 @@ def halves_over_time(halves: Halves, n_frames: int) -> str | None:
     cuts, stretches = halves.cuts, halves.stretches
     if not len(cuts.firsts):
         return None
-    with plain_figure(WIDTH_IN, 4.4) as figure:
-        agree, tie = add_axes(figure, Margins(top=0.35), rows=(1, 1), gap_in=0.6)
-        band = 2 * cuts.std_coherence
-        agree.fill_between(cuts.firsts, cuts.coherence - band, cuts.coherence + band, color=MUTED, alpha=0.25, linewidth=0)
-        agree.axhline(1, color=MUTED, linewidth=1, linestyle="--")
-        agree.plot(cuts.firsts, cuts.coherence, "o-", color=SERIES[0], markersize=4)
-        agree.set_ylabel("coherence")
+    with plain_figure(WIDTH_IN, 4.6) as figure:
+        agree, tie = add_axes(figure, Margins(), rows=(1, 1), gap_in=0.85)
+        lacking, band = 100 * (cuts.coherence - 1), 200 * cuts.std_coherence
+        agree.fill_between(cuts.firsts, lacking - band, lacking + band, color=MUTED, alpha=0.25, linewidth=0)
+        agree.axhline(0, color=MUTED, linewidth=1, linestyle="--")
+        agree.plot(cuts.firsts, lacking, "o-", color=SERIES[0], markersize=4)
+        agree.yaxis.set_major_formatter("{x:g}")
+        agree.locator_params(axis="y", nbins=4)
+        agree.set_ylabel("coherence - 1 (%)")
         for values, name, colour in zip(cuts.std_px.T[::-1], ("least known direction", "best known"), SERIES, strict=False):
-            tie.semilogy(cuts.firsts, values, color=colour, label=name)
+            tie.plot(cuts.firsts, values, color=colour, label=name)
         edges = np.append(stretches.firsts, n_frames)
         tie.stairs(stretches.std_px[:, 1], edges, baseline=None, color=MUTED, label="stretch, least known")
+        mark_logarithmic(tie)
         tie.set_ylabel("error across (px)")
         tie.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, columnspacing=1.2)
         for axes in (agree, tie):

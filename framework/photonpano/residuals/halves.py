@@ -199,7 +199,7 @@ def _beside(pair: tuple[_Block, _Block], totals: FluxImage) -> FluxImage:
 
 
 def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreement:
-    """Compare two halves, of two parts each, (4, 2, H, W, C) sums of flux and weight, that are off by at most `widest_px`.
+    """Compare two sets of frames, that are off by at most `widest_px`: (4, 2, H, W, C) sums of flux and weight, two parts each.
 
     Where noise hides what fine structure ties, as before a scene that is blurred, coarser structure is compared.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import typing
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeAlias
@@ -97,12 +98,12 @@ class StageConformance(Conformance):
         assert [*self.contribution.check(self.settings(), STREAM)] == []
 
 
-class AnswerConformance(StageConformance):
+class AnswerConformance(StageConformance, ABC):
     """Checks of components whose answers a run checks."""
 
+    @abstractmethod
     def answers(self) -> Iterator[Answer]:
         """Yield what the component returns for several inputs."""
-        raise NotImplementedError
 
     def test_answers_keep_the_contract(self) -> None:
         """A run refuses what breaks it: see `photonpano.contracts`. Arguments are read-only: copy an array to change it."""

@@ -80,6 +80,14 @@ def test_bare_edges_tie_nothing_along_them(halves: Callable, scene: np.ndarray, 
     assert min(abs(found.angles_deg[middle] - angle), abs(found.angles_deg[middle] - angle - 180)) < 3
 
 
+def test_tremor_that_the_motion_lacks_blurs_both_halves_alike(halves: Callable, scene: np.ndarray) -> None:
+    """It makes gradients weak, and the shift unsure, but lowers no coherence."""
+    shaken = PAN @ np.array([translation(2 * np.sin(2 * frame), 2 * np.cos(2 * frame)) for frame in range(N_FRAMES)])
+    blurred, sharp = halves(0.3 * scene, shaken, PAN).cuts, halves(0.3 * scene).cuts
+    assert (blurred.std_px > 1.5 * sharp.std_px).mean() > 0.9
+    assert np.median(blurred.coherence) > 0.99
+
+
 def test_stretch_that_sees_a_bare_edge_is_tied_to_nothing_where_the_path_returns(halves: Callable, scene: np.ndarray) -> None:
     """Frames on both sides of each cut see the same places, so that no cut shows it."""
     wall = 0.3 * scene
