@@ -178,14 +178,15 @@ def _one_direction(run: TestedRun) -> Found | None:
     if not len(halves.cuts.firsts):
         return None
     ties = halves.cuts, halves.stretches
-    between = "px between the frames before and after {:.0f}", "px between the frames from {:.0f} on for a while and all others"
+    between = "the frames before and after {:.0f}", "frames {:.0f} to {:.0f} and all others"
     aslant = [np.where(weak >= _ASLANT * strong, weak, 0) for strong, weak in (each.std_px.T for each in ties)]
     found, place, weak_px = max(zip(ties, between, aslant, strict=True), key=lambda each: float(each[2].max()))
     weakest = int(np.argmax(weak_px))
     (strong, weak), angle = found.std_px[weakest].tolist(), found.angles_deg[weakest]
     if not weak_px[weakest]:
         return None
-    where = f"{place.format(found.firsts[weakest])}, at {angle:.0f} degrees from x towards y"
+    ends = np.append(found.firsts[1:], run.explained.motion.span.stop) - 1
+    where = f"px between {place.format(found.firsts[weakest], ends[weakest])}, at {angle:.0f} degrees from x towards y"
     what_to_do = (
         "the motion may be wrong by any distance along it, which this panorama does not show; keep other structures in view"
     )

@@ -343,7 +343,9 @@ def test_camera_that_pairs_contradict_by_ten_expected_errors_is_doubtful(
 
 @pytest.mark.parametrize(("along", "doubtful"), [(6.0, True), (0.8, False), (0.1, False)])
 @pytest.mark.parametrize("angle", [0, 37, 90])
-@pytest.mark.parametrize(("ties", "place"), [("cuts", "before and after 1500"), ("stretches", "from 1500 on for a while")])
+@pytest.mark.parametrize(
+    ("ties", "place"), [("cuts", "before and after 1500"), ("stretches", "frames 1500 to 1999 and all others")]
+)
 def test_motion_along_an_edge_is_doubtful(
     explained: Explained, ties: str, place: str, angle: int, along: float, doubtful: bool
 ) -> None:
