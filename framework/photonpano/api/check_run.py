@@ -11,7 +11,7 @@ from photonpano.api.opened_run import opened_run
 from photonpano.capture import capture_of
 from photonpano.execution.context import Context, Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
-from photonpano.motion.timeline import REPEATED
+from photonpano.motion.level import REPEATED
 from photonpano.pipeline.obstacles import timeline_of
 from photonpano.plugins.registry import Catalog
 from photonpano.residuals.refinement import MotionFit

@@ -10,8 +10,8 @@ import typer
 
 from photonpano.api.command import CHANGES, SPEC, WrongArgumentError, command, logger, require_trust, verdict_lines, warn
 from photonpano.execution.context import Progress
+from photonpano.motion.level import CUT, DARK_FRAMES, DARK_JUMP, REPEATED, SHOTS
 from photonpano.motion.pairs import GYROSCOPE
-from photonpano.motion.timeline import CUT, DARK_FRAMES, DARK_JUMP, REPEATED, SHOTS
 from photonpano.pipeline.estimate import START
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
 from photonpano.record.schema import PanoramaRecord

@@ -22,7 +22,7 @@ from photonpano.execution.context import Context
 from photonpano.filtering import gradient_of
 from photonpano.geometry import PATCHES, Camera, Canvas
 from photonpano.merging import Chunk, accumulate, binned_mean
-from photonpano.motion.consensus import APART
+from photonpano.motion.models import APART
 from photonpano.reading import reading
 from photonpano.robust import cauchy_weights, robust_std
 from photonpano.values import CELL_PX, Background, BoolArray, Decision, FloatArray, FluxImage, FrameSpan, Homography

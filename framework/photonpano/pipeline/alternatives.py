@@ -10,7 +10,7 @@ import numpy as np
 from photonpano.capture import before
 from photonpano.geometry import corners, inverse, transform_points
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.timeline import UNCUT_JUMP
+from photonpano.motion.level import UNCUT_JUMP
 from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
 from photonpano.residuals.causes import changing_places, distorting_lens

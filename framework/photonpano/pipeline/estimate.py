@@ -13,11 +13,10 @@ from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, LocationError
 from photonpano.execution.context import Context
 from photonpano.motion.diagnosis import UntiedError, tell_attempt
-from photonpano.motion.gyroscope import Gyroscope
+from photonpano.motion.gyroscope import Gyroscope, fit_rates
+from photonpano.motion.level import Timeline
 from photonpano.motion.loop import LevelResult
-from photonpano.motion.timeline import Timeline
-from photonpano.motion.tracking.rates_fit import fit_rates
-from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
+from photonpano.motion.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.obstacles import timeline_of

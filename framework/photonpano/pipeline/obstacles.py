@@ -18,8 +18,8 @@ from photonpano.execution.context import Context
 from photonpano.locating.images import correlation_peaks
 from photonpano.merging import binned_mean, binning_of
 from photonpano.merging.accumulate import weights_of
-from photonpano.motion.timeline import Timeline
-from photonpano.motion.tracking.spans import DARK
+from photonpano.motion.level import Timeline
+from photonpano.motion.tracking import DARK
 from photonpano.reading import other_order, sampled_spans
 from photonpano.robust import robust_std
 from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, true_spans

@@ -26,9 +26,9 @@ from photonpano.corrections.movers import find_background, without_layers
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import Camera, lenses_apart_px
 from photonpano.motion.diagnosis import UntiedError
+from photonpano.motion.level import UNCUT_JUMP, Cut
 from photonpano.motion.loop import TOO_NARROW, converges
-from photonpano.motion.model import SAME_LENS_PX
-from photonpano.motion.timeline import UNCUT_JUMP, Cut
+from photonpano.motion.models import SAME_LENS_PX
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.shots import ApartError, shots_of
 from photonpano.pipeline.state import State, within

@@ -13,7 +13,7 @@ from photonpano.contracts.protocols import Source
 from photonpano.geometry import BLOCK_FRAMES, FrameTrajectory, corner_displacements, inverse, likely_rotations
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.level import Recorder
-from photonpano.motion.uncertainty import REMAINING_SHARE
+from photonpano.motion.trajectories import REMAINING_SHARE
 from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.passes import Proposal, tried, without_what_changes
 from photonpano.pipeline.state import State

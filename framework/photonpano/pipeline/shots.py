@@ -17,8 +17,8 @@ from photonpano.execution.context import Progress
 from photonpano.geometry import corners, inverse, transform_points
 from photonpano.merging import binned_mean
 from photonpano.motion.graph import components
+from photonpano.motion.level import SHOTS
 from photonpano.motion.locate import LocatedLevel
-from photonpano.motion.timeline import SHOTS
 from photonpano.plugins.contributions import PartOfCapture
 from photonpano.record.run_warnings import other_shots
 from photonpano.record.schema import RunRecord

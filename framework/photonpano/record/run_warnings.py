@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.level import Timeline
 from photonpano.motion.loop import LevelResult
-from photonpano.motion.timeline import Timeline
 from photonpano.record.schema import DecisionRecord
 from photonpano.residuals.refinement import Refinement
 from photonpano.text import listed

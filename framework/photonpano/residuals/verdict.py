@@ -13,8 +13,8 @@ import numpy as np
 from scipy import ndimage
 
 from photonpano.geometry import corners, transform_points
+from photonpano.motion.level import DARK_JUMP, SHOTS, UNCUT_JUMP
 from photonpano.motion.loop import TOO_NARROW, LevelResult
-from photonpano.motion.timeline import DARK_JUMP, SHOTS, UNCUT_JUMP
 from photonpano.residuals.block_sums import M, V
 from photonpano.residuals.causes import CAUSES, changing_places, distorting_lens
 from photonpano.residuals.measure import FEWEST_FRAMES

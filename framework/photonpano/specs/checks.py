@@ -9,7 +9,7 @@ from typing import Any
 
 from photonpano.corrections import Correction, FlatField
 from photonpano.errors import InputError, Problem, described
-from photonpano.motion.rates import read_rates
+from photonpano.motion.gyroscope import read_rates
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.specs.plan import Choice, LevelPlan, Plan
 from photonpano.specs.settings import CameraSettings, MotionSettings
@@ -43,7 +43,7 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
         problems.append(plan.place("graph.exclude").problem(message))
     files: dict[str, Callable[[], object]] = {}
     if plan.graph.tie is not None:
-        from photonpano.motion.ties import read_ties  # with OpenCV, which other specs need not import
+        from photonpano.motion.pairs import read_ties  # with OpenCV, which other specs need not import
 
         files["graph.tie"] = partial(read_ties, plan.graph.tie, info)
     if plan.motion.prior is not None:

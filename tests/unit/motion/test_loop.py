@@ -12,11 +12,10 @@ from photonpano import FrameSpan, Group, InputError, PluginError
 from photonpano.contracts.attribution import attributed
 from photonpano.execution.context import Context, Quiet
 from photonpano.geometry import from_parameters, inverse, normalised, translation
-from photonpano.motion.level import Level
+from photonpano.motion.level import Cut, Level, Timeline
 from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import LevelResult, ReferencedTrajectory, converges, estimate_motion
-from photonpano.motion.timeline import Cut, Timeline
-from photonpano.motion.tracking.velocity import ConstantVelocity, Velocity
+from photonpano.motion.velocity import ConstantVelocity, Velocity
 from photonpano.specs.settings import GraphSettings
 
 N_FRAMES = 120

@@ -14,9 +14,9 @@ from scipy.signal import find_peaks
 
 from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.geometry import inverse, rescaling, translation
-from photonpano.motion.closures import _PROMINENCE, _visits, closure_candidates, exposure_similarity
 from photonpano.motion.graph import GraphSolution
 from photonpano.motion.pairs import alike, pairs_of, shared_share
+from photonpano.motion.registration import _PROMINENCE, _visits, closure_candidates, exposure_similarity
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import photographed
 from photonpano.testing.scenes import seen_along

@@ -25,14 +25,11 @@ from photonpano.geometry import (
 from photonpano.locating import fit_homography
 from photonpano.motion.adjustment import std_of
 from photonpano.motion.graph import GraphSolution, solve
-from photonpano.motion.lens_shift import LensShift
-from photonpano.motion.level import VirtualExposures
+from photonpano.motion.level import Timeline, VirtualExposures
 from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.loop import interpolate
-from photonpano.motion.model import ModelName, MotionModel
-from photonpano.motion.rotation_graph import Rotations
-from photonpano.motion.rotations import RotationTrajectory, fit_rotations
-from photonpano.motion.timeline import Timeline
+from photonpano.motion.models import ModelName, MotionModel
+from photonpano.motion.rotations import LensShift, Rotations, RotationTrajectory, fit_rotations
 from photonpano.values import Edge, FloatArray, Located, NotLocated, Patches
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators import GeodesicInterpolator, LucasKanadeInterpolator, SmoothingSplineInterpolator

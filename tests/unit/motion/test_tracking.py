@@ -21,9 +21,8 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.motion.frame_motion import FrameMotion, smooth_view
-from photonpano.motion.tracking import StartingMotion, starting_motion
-from photonpano.motion.tracking.start import _steady
-from photonpano.motion.tracking.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
+from photonpano.motion.tracking import StartingMotion, _steady, starting_motion
+from photonpano.motion.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
 from photonpano.testing.scenes import detected, seen_along, textured
 
 SHAPE = (64, 96)

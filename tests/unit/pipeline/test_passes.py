@@ -18,7 +18,7 @@ from photonpano.errors import CanvasTooLargeError
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, corner_displacements, inverse, likely_rotations, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.timeline import Cut, Timeline
+from photonpano.motion.level import Cut, Timeline
 from photonpano.pipeline.passes import Pass, Proposal, cut_at_jumps, later_levels, tried, worse_in_light
 from photonpano.pipeline.refiners import refine
 from photonpano.pipeline.state import State

@@ -16,7 +16,7 @@ from photonpano.geometry import FrameTrajectory, nearest_rotations, steps_px
 from photonpano.merging import chunks_of
 from photonpano.merging.panorama import RenderedPanorama, plan_canvas
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.timeline import Timeline
+from photonpano.motion.level import Timeline
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.report import render_report
 from photonpano.report.viewer import shared_instant

@@ -12,9 +12,9 @@ from scipy import ndimage
 from photonpano import FrameSpan
 from photonpano.geometry import Camera
 from photonpano.motion.graph import Freed, Rival
+from photonpano.motion.level import DARK_JUMP, UNCUT_JUMP
 from photonpano.motion.loop import LevelResult
-from photonpano.motion.model import SAME_LENS_PX, MotionModel
-from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
+from photonpano.motion.models import SAME_LENS_PX, MotionModel
 from photonpano.residuals import tested_run
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
 from photonpano.residuals.halves import Agreements, Halves

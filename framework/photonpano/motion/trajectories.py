@@ -1,18 +1,36 @@
-"""The expected error of a trajectory, frame by frame."""
+"""What a level adds to a trajectory: its expected error, frame by frame, and the corrections of a refined motion."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from photonpano.contracts.protocols import Trajectory, camera_of_motion
-from photonpano.geometry import align_planes, align_rotations, corner_displacements, inverse
+from photonpano.geometry import (
+    Camera,
+    FrameTrajectory,
+    align_planes,
+    align_rotations,
+    corner_displacements,
+    from_parameters,
+    inverse,
+    likely_rotations,
+    nearest_rotations,
+    parameters,
+    scaled_ahead,
+)
+from photonpano.motion.level import Timeline
 from photonpano.motion.locate import LocatedLevel
-from photonpano.motion.rotations import RotationTrajectory
-from photonpano.motion.timeline import Timeline
+from photonpano.motion.rotations import Rotations, RotationTrajectory
 from photonpano.values import FloatArray
+
+_COMPARED = 1000  # number of frames at which two levels are compared
+# Error after a level, as a share of the change it made: each level removes at least three quarters of the error.
+REMAINING_SHARE = 0.25
+_BLUR_SHARE = 0.02  # error after the first level, as a share of the motion within a group, by which its exposures are blurred
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,12 +40,6 @@ class Interpolated:
     trajectory: Trajectory
     std_px: FloatArray  # (N,) its expected errors at their instants due to photon noise: a part of those of the exposures
     beyond_px: FloatArray  # (N,) how far exposures lie beside it, beyond what noise explains
-
-
-_COMPARED = 1000  # number of frames at which two levels are compared
-# Error after a level, as a share of the change it made: each level removes at least three quarters of the error.
-REMAINING_SHARE = 0.25
-_BLUR_SHARE = 0.02  # error after the first level, as a share of the motion within a group, by which its exposures are blurred
 
 
 class Uncertainty:
@@ -108,3 +120,72 @@ class Uncertainty:
             beyond = np.maximum((instants[0] - frames[here]) / first, (frames[here] - instants[-1]) / last)
             noise_px[here] = inside * (1 + 2 * np.maximum(beyond, 0))
         return np.asarray(np.hypot(noise_px, self._timeline.unknown_px(frames)))
+
+
+class Knots(NamedTuple):
+    """What an interpolator passes at the instants of N located exposures."""
+
+    instants: FloatArray  # (N,)
+    homographies: FloatArray  # (N, 3, 3)
+    information: FloatArray | None  # see `LocatedLevel`
+    rotations: Rotations | None  # of a camera that turns; None for homographies
+
+    @classmethod
+    def of(cls, located: LocatedLevel) -> Knots:
+        """Return the motions of the exposures themselves."""
+        return cls(located.instants, located.homographies, located.information, located.solution.rotations)
+
+    def moved(self, homographies: FloatArray) -> Knots:
+        """Return the knots after a small motion of each frame: (N, 3, 3)."""
+        found, rotations = scaled_ahead(self.homographies @ homographies), self.rotations
+        if rotations is not None:
+            turned = rotations.rotations @ nearest_rotations(rotations.camera.rotations(homographies))
+            found, rotations = rotations.camera.homographies(turned), Rotations(turned, rotations.camera)
+        return self._replace(homographies=found, rotations=rotations)
+
+
+class RefinedMotion:
+    """A refined motion, which exposures merged along it correct.
+
+    The corrections change slowly, even where the motion trembles faster than the exposures follow each other.
+    """
+
+    def __init__(self, motion: Trajectory, n_frames: int, camera: Camera | None, frame_shape: tuple[int, int]) -> None:
+        """Take the motion of the frames as that of a camera, if it turns: one of another focal length moves the image alike."""
+        known = motion.at(np.arange(n_frames))
+        if camera is not None:
+            if isinstance(motion, RotationTrajectory):
+                turned = Rotations(motion.camera.rotations(known), motion.camera).seen_by(camera).rotations
+            else:
+                turned = likely_rotations(camera, known, frame_shape)
+            known = camera.homographies(turned)
+        self._known = FrameTrajectory(known)
+
+    def corrections(self, knots: Knots) -> Knots:
+        """Return the small motions of the frames after which the known motion is that of the exposures."""
+        instants, homographies, information, rotations = knots
+        known, middle = self._known.at(instants), len(homographies) // 2
+        back = inverse(known) @ known[middle] @ inverse(homographies[middle])
+        found = scaled_ahead(back @ homographies)
+        if rotations is not None:
+            turned = nearest_rotations(rotations.camera.rotations(found))
+            return Knots(instants, found, information, Rotations(turned, rotations.camera))
+        if information is not None:
+            # The derivatives of p1..p8 of what was found by those of the homographies.
+            changes = (back[:, None] @ (from_parameters(np.eye(8)) - np.eye(3))) / (back @ homographies)[:, None, 2:, 2:]
+            slopes = parameters(np.eye(3) + changes - found[:, None] * changes[..., 2:, 2:])
+            to_corrections = np.linalg.inv(np.swapaxes(slopes, -1, -2))
+            information = np.swapaxes(to_corrections, -1, -2) @ information @ to_corrections
+        return Knots(instants, found, information, None)
+
+    def corrected(self, corrections: Trajectory) -> Trajectory:
+        """Return the known motion, each frame of which is corrected."""
+        return _Corrected(self._known, corrections)
+
+
+class _Corrected(NamedTuple):
+    known: Trajectory
+    corrections: Trajectory
+
+    def at(self, frame_indices: ArrayLike) -> FloatArray:
+        return np.asarray(self.known.at(frame_indices) @ self.corrections.at(frame_indices))

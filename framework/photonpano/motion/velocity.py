@@ -27,7 +27,6 @@ _SPANS = 128  # a capture is divided into at most this many spans
 _FEWEST_SPANS = 8
 _FEWEST_PIXELS = 2  # binned pixels of the shorter side of a frame
 _LAGS = 4  # spans that are up to this many apart are compared in the search over all velocities
-_FASTEST = np.radians(20)  # fastest turn that is considered, in radians from span to span
 _FASTEST_SHIFT = 8.0  # fastest shift that is considered, in binned pixels from span to span
 # Standard deviations of the Gaussians between whose scales structure is compared, in binned pixels. Brightness that varies over
 # longer distances is light rather than scene, and has no sharp optimum.
@@ -40,6 +39,9 @@ _SIGNIFICANT = 8.0
 _STEADY = 0.8
 _LEAST_PX = 1.0  # what moves by less over the whole capture, in binned pixels, stands still
 _WITHOUT = "; if the velocity is not constant, leave out motion.start"
+
+
+_FASTEST = np.radians(20)  # fastest turn that is considered, in radians from span to span
 
 Images = NDArray[np.float32]
 

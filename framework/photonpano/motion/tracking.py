@@ -1,35 +1,31 @@
-"""The speed of the image before the first level, from sums of a few frames, whose shifts are too small to be mistaken."""
+"""Track the image by sums of a few frames in binned pixels: its speed before the first level, and where registrations start."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import fft
 
 from photonpano.contracts.protocols import Source
 from photonpano.execution.context import Context
-from photonpano.geometry import translation
-from photonpano.locating import Follows, correlation_peaks, correlation_surface
-from photonpano.merging import binning_of
+from photonpano.geometry import corners, inverse, normalised, transform_points, translation
+from photonpano.locating import Follows, correlation_peaks, correlation_surface, follows, shift_of_spectra
+from photonpano.merging import binned_mean, binning_of
+from photonpano.motion.level import FrameHomography, Timeline
 from photonpano.motion.pairs import lengths_of
-from photonpano.motion.timeline import Timeline
-from photonpano.motion.tracking.spans import (
-    SHORTEST,
-    Spectrum,
-    following,
-    noise_of_difference,
-    shifted,
-    span_image,
-    spectra_of,
-    stabilised,
-)
+from photonpano.photometry import hann_window
 from photonpano.robust import robust_std
-from photonpano.values import FloatArray, FrameSpan, Group
+from photonpano.values import FloatArray, FluxImage, FrameSpan, Group, Homography
 
+SHORTEST = {"binary": 4, "intensity": 1}  # frames of the shortest span: sums of fewer binary frames are mostly noise
+PEAK_PX = 1.5  # standard deviation of the peak of the phase correlation, in binned pixels
+DARK = 0.2  # sums, and frames, with less than this share of the usual light show nothing
 _SPANS = 16  # a window is divided into 16 spans: between two of them the image moves by a sixteenth of a group's motion blur
 _PEAK_PX = 1.0  # standard deviation of the peak of the phase correlation, in binned pixels
 # Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5.
@@ -47,6 +43,60 @@ _SLOWER = 3.0  # motions that are faster than the slowest by this factor are lef
 _NEAR_WINDOWS, _LEAP = 6, 6.0
 _FAR = 1e6  # frames beyond the first and last instant within which the velocity is constant
 _TIE = 4.0  # difference of the log likelihoods of hypotheses below which both are kept
+
+
+Spectrum = NDArray[np.complexfloating]
+_hann_window = cache(hann_window)
+
+
+def span_image(source: Source, span: FrameSpan) -> FluxImage:
+    """Return the mean counts of a span, binned: (h, w); where no pixel is valid, the mean of the others."""
+    image = binned_mean(source, span)
+    return np.nan_to_num(image, nan=float(np.nanmean(image)))
+
+
+def stabilised(source: Source, mean_count: FluxImage, n_frames: float) -> FluxImage:
+    """Return mean counts of binned pixels on the scale on which their noise is uniform."""
+    frames = float(n_frames * binning_of(source) ** 2)
+    return source.response.stabilised(source.response.flux(mean_count, frames), frames)
+
+
+def noise_of_difference(source: Source, n_frames: float) -> float:
+    """Return the variance of the difference of two `stabilised` images."""
+    return 2 * float(source.response.stabilised_std(float(n_frames * binning_of(source) ** 2))) ** 2
+
+
+def spectra_of(images: Sequence[FluxImage] | FluxImage, weight: FluxImage | None = None) -> Spectrum:
+    """Return the spectra of images (S, h, w), of weighted mean 0, under a Hann window: (S, h, w // 2 + 1)."""
+    window = _hann_window(images[0].shape)
+    if weight is not None:
+        window = window * weight
+    share = window / max(float(window.sum()), 1e-12)
+    return np.array([fft.rfft2(window * (image - float((share * image).sum()))) for image in images])
+
+
+def shifts_between(moving: Spectrum, fixed: Spectrum, shape: tuple[int, ...]) -> list[FloatArray | None]:
+    """Return the shift (x, y) of each pair of spectra, in binned pixels; None without texture."""
+    pairs = zip(moving, fixed, strict=True)
+    return [shift_of_spectra(before, after, shape, PEAK_PX, gaussian_peak=False) for before, after in pairs]
+
+
+def shifted(image: FluxImage, shift: FloatArray) -> FluxImage:
+    """Return an image seen along a shift: `shifted(p) = image(p + shift)`; NaN outside."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(
+        cv2.warpAffine(image, translation(*shift)[:2], image.shape[::-1], flags=flags, borderValue=np.nan), np.float32
+    )
+
+
+def following(moving: FluxImage, fixed: FluxImage, noise: float) -> Follows:
+    """Find the part of an image that shows the same as another one, seen along a motion.
+
+    Both are (h, w) on the scale on which noise is uniform, NaN where nothing is seen; `noise` is the variance of their
+    difference.
+    """
+    seen = np.isfinite(moving) & np.isfinite(fixed)
+    return follows(np.nan_to_num(moving), np.nan_to_num(fixed), np.where(seen, np.float32(noise), np.float32(np.inf)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -289,3 +339,78 @@ def _link(before: Hypotheses, after: Hypotheses) -> FloatArray:
     change = before.velocities[:, None] - after.velocities
     std = min(_CONTINUITY_PX * max(before.px_per_frame, after.px_per_frame), _CONTINUITY_SHARE * min(before.apart, after.apart))
     return np.asarray(-np.sum((change / std) ** 2, axis=-1) / 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where an exposure lies."""
+
+    segment: int  # number of the first exposure of those that are tied to this one
+    homography: Homography  # (3, 3), pixels of its frame to those of that exposure's frame
+    # (2,) shift of the middle of the image per frame period, px, along the last pair that was located; None where none was
+    velocity: FloatArray | None
+
+
+class Track:
+    """The exposures of the first level, each tied to the nearest earlier one."""
+
+    def __init__(
+        self, start: StartingMotion | None, groups: Sequence[Group], frame_shape: tuple[int, int], places: Mapping[int, Place]
+    ) -> None:
+        """Take the motion that short spans show, all groups of the level, and the places of some of them."""
+        self._start, self._groups = start, groups
+        self._middle = corners(frame_shape).mean(axis=0)
+        self.places = dict(places)  # where exposures lie, by their numbers: those that were given, and those settled since
+        # of the pairs that may just as well have another motion, how far that is from the one they start at
+        self.alternatives_px: dict[tuple[int, int], float] = {}
+
+    def expected(
+        self, place: Place | None, moving: int, fixed: int, hypotheses: Callable[[], Sequence[Homography]]
+    ) -> FrameHomography | None:
+        """Return where the registration of a pair starts: (3, 3); None if nothing is known.
+
+        `place` is where `moving` lies, if one of its pairs was located before; `hypotheses` returns the motions that the two
+        images themselves suggest, likeliest first.
+        """
+        there = self.places[fixed]
+        if place is not None and place.segment == there.segment:
+            return FrameHomography(normalised(inverse(there.homography) @ place.homography))
+        instants = self._groups[moving].reference, self._groups[fixed].reference
+        timeline = None if self._start is None else self._start.timeline
+        if timeline is not None and timeline.is_dark_between(instants[1], instants[0]):
+            return self._steadiest(hypotheses(), None, moving, fixed)
+        if self._start is not None and (motion := self._start.between(*instants)) is not None:
+            if alternative_px := self._start.alternative_px(*instants):
+                self.alternatives_px[moving, fixed] = alternative_px
+            return FrameHomography(motion)
+        return self._steadiest(hypotheses(), there.velocity, moving, fixed)
+
+    def placed(self, moving: int, fixed: int, motion: Homography) -> Place:
+        """Return where an exposure lies by its motion to an earlier one."""
+        there = self.places[fixed]
+        velocity = self._shift(motion) / self._frames_between(moving, fixed)
+        return Place(there.segment, normalised(there.homography @ motion), velocity)
+
+    def settle(self, moving: int, place: Place | None) -> None:
+        """Keep where an exposure lies; None for the first of its segment."""
+        self.places[moving] = Place(moving, np.eye(3), None) if place is None else place
+
+    def _steadiest(
+        self, hypotheses: Sequence[Homography], velocity: FloatArray | None, moving: int, fixed: int
+    ) -> FrameHomography | None:
+        """Return the hypothesis nearest to the motion so far, or the likeliest at the start."""
+        if not len(hypotheses):
+            return None
+        shifts = np.array([self._shift(each) for each in hypotheses])
+        if velocity is None:
+            if len(shifts) > 1:
+                self.alternatives_px[moving, fixed] = float(np.linalg.norm(shifts[1] - shifts[0]))
+            return FrameHomography(hypotheses[0])
+        going_on = velocity * self._frames_between(moving, fixed)
+        return FrameHomography(hypotheses[int(np.linalg.norm(shifts - going_on, axis=1).argmin())])
+
+    def _frames_between(self, moving: int, fixed: int) -> float:
+        return self._groups[moving].reference - self._groups[fixed].reference
+
+    def _shift(self, motion: Homography) -> FloatArray:
+        return np.asarray(transform_points(motion, self._middle[None])[0] - self._middle)
