@@ -31,7 +31,7 @@ from trust import scored
 from trust_scores import is_honest, reasons, status
 
 from photonpano import evaluate, load_panorama, open_source, parse_spec
-from photonpano.api.opened_run import opened_run
+from photonpano.api.run_folders import opened_run
 from photonpano.capture import before, capture_of
 from photonpano.capture.writing import truth_path
 from photonpano.corrections import divided_by, estimate_vignette

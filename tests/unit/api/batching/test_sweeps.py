@@ -13,9 +13,8 @@ import pytest
 
 from photonpano import BatchRow, InputError, OutputError, SpecError, discover
 from photonpano.api.batch import Batch, prepare_batch
-from photonpano.api.batching.captures import find_captures
-from photonpano.api.batching.summary import require_own, write_summary
-from photonpano.api.batching.sweeps import combinations, folder_name
+from photonpano.api.batch_jobs import combinations, find_captures, folder_name
+from photonpano.api.batch_running import require_own, write_summary
 
 Find = Callable[..., dict[str, Path]]
 

@@ -21,8 +21,8 @@ from rich.console import Console
 import photonpano
 from photonpano.api.cli import progress
 from photonpano.api.cli.app import commands
-from photonpano.api.cli.plans import capture_plan
 from photonpano.api.cli.progress import Bars, Lines, progress_for_stderr
+from photonpano.api.cli.signatures import capture_plan
 from photonpano.api.cli.verbosity import is_quiet, is_verbose
 from photonpano.api.command import WrongArgumentError
 from photonpano.errors import SpecError

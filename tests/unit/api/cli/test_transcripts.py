@@ -35,7 +35,7 @@ from photonpano import (
     discover,
     hookimpl,
 )
-from photonpano.api.batching.sweeps import Job
+from photonpano.api.batch_jobs import Job
 from photonpano.api.cli.app import commands
 from photonpano.api.command import COMMANDS
 from photonpano.photometry import IntensityResponse
@@ -62,8 +62,7 @@ class World:
     def answer(self, name: str, result: Any) -> None:
         """Let a command have a result without work."""
         commands()[name]  # imports its module
-        module = f"photonpano.api.{name.replace('-', '_')}"
-        self.patch.setitem(COMMANDS, module, replace(COMMANDS[module], calls=lambda **_: result))
+        self.patch.setitem(COMMANDS, name, replace(COMMANDS[name], calls=lambda **_: result))
 
     def runs(self, verdict: Verdict, *others: Verdict, **record: Any) -> None:
         """Let `run` have a verdict, and those of other shots of 120 frames."""

@@ -1,4 +1,4 @@
-"""List components that a spec can use, with their plugins."""
+"""List and describe the components of the installed plugins."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import Any
 
 import typer
 
-from photonpano.api.command import command, json_lines
+from photonpano.api.command import command, component_names, json_lines
+from photonpano.plugins.contributions import install_command
 from photonpano.plugins.registry import KINDS, Catalog, Entry, Origin
+from photonpano.plugins.registry.description import config_rows, snippet
 from photonpano.text import columns
 
 
@@ -28,7 +30,7 @@ def kind_option(help_text: str) -> Any:
     return typer.Option(metavar="KIND", parser=_kind, autocompletion=complete, help=f"{help_text}: {', '.join(KINDS)}.")
 
 
-def _lines(catalog: Catalog, *, kind: str | None = None, broken: bool = False, as_json: bool = False) -> Iterator[str]:
+def _lines_of_list(catalog: Catalog, *, kind: str | None = None, broken: bool = False, as_json: bool = False) -> Iterator[str]:
     rows = [] if broken else [entry for entry in catalog.rows if kind in (None, entry.kind)]
     if as_json:
         yield from json_lines(
@@ -51,11 +53,11 @@ def _lines(catalog: Catalog, *, kind: str | None = None, broken: bool = False, a
 
 @command(
     "--kind locator",
-    _lines,
+    _lines_of_list,
     kind=kind_option("Only components of this kind"),
     broken=typer.Option(help="Only plugins that cannot be loaded, with the error."),
 )
-def list_plugins(catalog: Catalog) -> Catalog:
+def plugins_list(catalog: Catalog) -> Catalog:
     """List components that a spec can use, with their plugins."""
     return catalog
 
@@ -92,3 +94,54 @@ def facts(entry: Entry) -> dict[str, Any]:
     """Return what a component is, and where it comes from."""
     named = {"kind": entry.kind, "name": entry.name, "summary": entry.contribution.summary}
     return named | asdict(entry.origin) | {"unavailable": entry.unavailable}
+
+
+def _lines_of_components(entries: list[Entry], *, as_json: bool = False) -> Iterator[str]:
+    if as_json:
+        yield from json_lines({"components": [_details(entry) for entry in entries]})
+    else:
+        yield "\n\n".join(map(_page, entries))
+
+
+@command(
+    "opencv-sift",
+    _lines_of_components,
+    name=typer.Argument(metavar="NAME", autocompletion=component_names()),
+    kind=kind_option("The kind, if components of several kinds share the name"),
+)
+def _plugins_show(name: str, kind: str | None = None, *, catalog: Catalog) -> list[Entry]:
+    """Describe a component: its keys, and YAML to paste.
+
+    Args:
+        name: the name of the component in specs.
+        kind: the kind, if components of several kinds share the name.
+        catalog: what can be chosen.
+    """
+    kinds = dict.fromkeys(entry.kind for entry in catalog.rows if entry.name == name and kind in (None, entry.kind))
+    if not kinds:
+        raise typer.BadParameter(catalog.unknown(kind, name), param_hint="'NAME'")
+    return [catalog.find(each, name) for each in kinds]
+
+
+def _details(entry: Entry) -> dict[str, Any]:
+    return facts(entry) | {
+        "api_version": entry.contribution.api_version,
+        "requires": [asdict(each) for each in entry.contribution.requires],
+        "keys": [asdict(row) for row in config_rows(entry.contribution.config)],
+        "snippet": snippet(entry.contribution),
+    }
+
+
+def _page(entry: Entry) -> str:
+    facts = [["kind", entry.kind], ["plugin", str(entry.origin)]]
+    if modules := ", ".join(each.module for each in entry.contribution.requires):
+        state = f"(not installed): {install_command(entry.missing)}" if entry.missing else "(installed)"
+        facts.append(["needs", f"{modules} {state}"])
+    table = [
+        [row.key, row.type, "required" if row.default is None else row.default, row.bounds, row.description]
+        for row in config_rows(entry.contribution.config)
+    ]
+    parts = [f"{entry.name}: {entry.contribution.summary}", columns(facts)]
+    if table:
+        parts.append(columns([["KEY", "TYPE", "DEFAULT", "BOUNDS", "MEANING"], *table]))
+    return "\n\n".join([*parts, snippet(entry.contribution).rstrip()])

@@ -1,21 +1,25 @@
-"""Print a spec with all defaults, explained in comments."""
+"""Look at specs: check one, print one with all defaults, and print the JSON Schema of all."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from photonpano.api.command import command
+from photonpano.api.command import CHANGES, SPEC, command
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, PhotonpanoError
+from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import require_new
 from photonpano.motion.pairs import pairs_of
 from photonpano.pipeline.components import foreseen_groups, open_source, scale_of
 from photonpano.plugins.registry import KINDS, Catalog, discover
 from photonpano.plugins.registry.description import flow
-from photonpano.specs import Plan
+from photonpano.specs import Plan, json_schema, load_spec
 from photonpano.specs.written import joined
 from photonpano.text import byte_size, counted, duration
 
@@ -23,6 +27,24 @@ if TYPE_CHECKING:
     from photonpano.pipeline.forecast import Forecast  # imports numba, which only a forecast needs
 
 _DESCRIBED_LEVELS = 3  # maximum number of levels described under `levels: until-converged`
+
+
+@command("scan.yaml", lambda lines: lines, spec=SPEC, changes=CHANGES)
+def _check(spec: Path, changes: Sequence[str] = ()) -> Iterator[str]:
+    """Check a spec without running it.
+
+    Prints every problem with its file, line and column, and exits with 2 if there is one. Opens the capture to check the
+    stages against its size, and samples the frames of packed .npy files: what depends on all frames stays open.
+    """
+    plan = load_spec(spec, changes)
+    with open_source(plan, look=False) as source:
+        what = f"poses by {plan.pose.contribution.name}" if plan.pose else counted(len(plan.levels), "level")
+        up_to = "up to " if plan.until_converged else ""
+        yield f"{spec}: ok, {up_to}{what} on {plan.source.contribution.name}: {source.info}"
+        for decision in plan.decisions:
+            yield f"{decision.what} is {decision.value}: {decision.reason}"
+        for reason in dict.fromkeys(groups for groups in foreseen_groups(plan, source) if isinstance(groups, str)):
+            yield f"groups are {reason}"
 
 
 def forecast(plan: Plan) -> Forecast:
@@ -169,3 +191,23 @@ class _Writer:
         if place.is_written and place.override is not None:
             return "--set"
         return "default" if not place.is_written or place.line is None else ""
+
+
+@command("--output photonpano.schema.json", lambda line: [line], output=typer.Option("--output", "-o", metavar="FILE"))
+def schema(output: Path | None = None, *, overwrite: bool = False) -> str:
+    """Print the JSON Schema of specs, for editors.
+
+    The schema holds the keys of all installed plugins. Editors with a YAML language server complete and check specs whose first
+    line is '# yaml-language-server: $schema=FILE'.
+
+    Args:
+        output: write the schema to a file instead of printing it.
+        overwrite: replace the file that is there under this name.
+    """
+    text = json.dumps(json_schema(discover()), indent=2, ensure_ascii=False)
+    if output is None:
+        return text
+    require_new(output, overwrite)
+    with atomic_path(output) as temporary:
+        temporary.write_text(f"{text}\n", encoding="utf-8")
+    return str(output)

@@ -1,25 +1,32 @@
-"""Open a finished run: its capture, as the run has seen it, and its motion."""
+"""Run folders: open a run with its capture and its motion, verify its files, and remove what killed processes have left."""
 
 from __future__ import annotations
 
+import os
+import re
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import typer
 
-from photonpano.api.batching.sweeps import capture_override
+from photonpano.api.batch_jobs import capture_override
+from photonpano.api.command import command
 from photonpano.capture import seen_through
 from photonpano.contracts.protocols import Source
 from photonpano.corrections import Vignette, divided_by, read_vignette
 from photonpano.corrections.lighting import in_light_of
 from photonpano.corrections.movers import before_background_of
-from photonpano.errors import InputError, SpecError
+from photonpano.errors import InputError, OutputError, SpecError
 from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.evaluation import load_panorama as read_panorama
 from photonpano.evaluation.inputs import read_tiff
+from photonpano.files.atomic import in_use, is_lock, locked, remove
+from photonpano.files.folders import NEW, OLD, recover
 from photonpano.files.paths import location
 from photonpano.geometry import FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion
@@ -28,14 +35,27 @@ from photonpano.pipeline.components import open_source
 from photonpano.pipeline.state import model_of
 from photonpano.plugins.registry import Catalog
 from photonpano.reading import library
-from photonpano.record.contents import require_one_run, require_same_frames
+from photonpano.record.contents import (
+    changed_files,
+    changes,
+    fingerprint,
+    recorded_contents,
+    require_one_run,
+    require_same_frames,
+)
 from photonpano.record.run_json import read_record
-from photonpano.record.schema import RunRecord
+from photonpano.record.schema import CaptureRecord, RunRecord
 from photonpano.specs import Plan, parse_spec
+from photonpano.text import byte_size, counted
 from photonpano.values import FrameSpan, Panorama
 
 if TYPE_CHECKING:
     import xarray
+
+_OF_LOCKED = re.compile(rf"\.(.+)\.(lock|{NEW}|{OLD})")  # what the holder of a lock makes, and the file or folder that it locks
+_PARTIAL = re.compile(r"\.(.+\.)?[0-9a-f]{8}\.partial(\.\w+)?")
+_UNPACKED = ".unpacked.npy"
+_IDLE_S = 600.0  # an unfinished file to which nothing was written for this time is left over
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,3 +200,135 @@ def load_xarray(run_folder: Path | str) -> xarray.Dataset:
     variables = {"flux": (panorama.flux, photons), "std": (std, photons), "coverage": (panorama.weight, {"units": "frames"})}
     found: xarray.Dataset = module.Dataset({name: (dimensions, *each) for name, each in variables.items()}, coordinates)
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What `verify` found.
+
+    Attributes:
+        n_files: number of files that were compared.
+        n_bytes: their size.
+        problems: what is not as the run left it, a clause each.
+        capture: what became of the capture, if that is no problem: a clause.
+        folder: the run folder.
+    """
+
+    n_files: int
+    n_bytes: int
+    problems: tuple[str, ...]
+    capture: str
+    folder: Path = Path()
+
+
+def _lines_of_verification(found: Verification) -> Iterator[str]:
+    if found.problems:
+        raise InputError(f"{found.folder} is not as its run wrote it: {'; '.join(found.problems)}")
+    yield f"files     {counted(found.n_files, 'file')}, {byte_size(found.n_bytes)}, as the run wrote them"
+    yield f"capture   {found.capture}"
+
+
+@command("runs/first", _lines_of_verification)
+def verify(run_folder: Path | str, catalog: Catalog | None = None) -> Verification:
+    """Verify that a run folder is as its run wrote it.
+
+    Compares the size and SHA-256 of each file with `run.json`, and the capture with its fingerprint there.
+
+    Args:
+        run_folder: written by `run`.
+        catalog: what can be chosen; by default what the installed plugins offer.
+
+    Raises:
+        InputError: the folder is no run folder.
+    """
+    folder = Path(run_folder)
+    record = read_record(folder)
+    recorded = recorded_contents(folder)
+    problems = [] if recorded else ["run.json lists no files"]
+    problems += [f"{name} is missing" for name in recorded if not os.path.lexists(folder / name)]
+    problems += [f"{name} is not the file that the run wrote" for name in changed_files(folder)]
+    others, capture = _recorded_capture(folder, record["spec"], record.get("capture"), catalog)
+    size = sum(content["bytes"] for content in recorded.values())
+    return Verification(len(recorded), size, (*problems, *others), capture, folder)
+
+
+def _recorded_capture(folder: Path, spec: object, old: CaptureRecord | None, catalog: Catalog | None) -> tuple[list[str], str]:
+    """Return the problems of the capture; and if there are none, what became of it."""
+    if old is None:
+        return [], "not compared: run.json has no fingerprint of it"
+    try:
+        plan = parse_spec(spec, name=str(folder / "run.json"), catalog=catalog)  # type: ignore[arg-type]  # checked there
+        with open_source(plan) as source:
+            new = fingerprint(plan, source)
+    except SpecError as error:
+        return [], f"not compared: {error.problems[0].message}"
+    except InputError as error:
+        return [], f"not compared: {error}"
+    found = changes(old, new)
+    sizes = [[(file["path"], file["bytes"]) for file in record["files"]] for record in (old, new)]
+    same = sizes[0] == sizes[1] and all(old[key] == new[key] for key in ("frames_sha256", "pixels_sha256"))
+    return ([], "; ".join(["the same frames", *found])) if same else (found, "")
+
+
+def _lines_of_clean(found: list[Path], *, dry_run: bool = False) -> Iterator[str]:
+    yield from map(str, found)
+    yield f"{counted(len(found), 'leftover')} {'found' if dry_run else 'removed'}"
+
+
+@command(
+    ". --dry-run",
+    _lines_of_clean,
+    directory=typer.Argument(metavar="DIR", help="A folder with captures or run folders."),
+    dry_run=typer.Option("--dry-run", "-n"),
+)
+def clean(directory: Path | str, dry_run: bool = False) -> list[Path]:
+    """Remove what killed processes have left in a folder and those in it: unfinished files, locks, unpacked archives.
+
+    A folder that was put aside, and has no successor, is put back. An unfinished file is removed if nothing was written to it
+    for ten minutes, an unpacked archive if the archive is there, from which it can be unpacked again. What is locked is left
+    alone, and unfinished conversions (`.part`) are kept, since `convert` continues them.
+
+    Args:
+        directory: symbolic links in it are not followed.
+        dry_run: list what would be removed, and remove nothing.
+
+    Returns:
+        What was removed, or would be.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    folder = Path(directory)
+    if not folder.is_dir():
+        raise InputError(f"there is no folder {folder}; check the path")
+    found = list(_leftovers(folder))
+    for path in () if dry_run else found:
+        if (locks := _locked_by(path)) is None:
+            remove(path)
+        else:
+            with suppress(OutputError), locked(locks, str(locks)):  # the lock file goes with the lock
+                recover(locks)
+    return found
+
+
+def _leftovers(folder: Path) -> Iterator[Path]:
+    for inside, folders, files in os.walk(folder):
+        named = [name for name in (*folders, *files) if _is_leftover(Path(inside, name))]
+        folders[:] = [name for name in folders if name not in named]
+        yield from (Path(inside, name) for name in sorted(named))
+
+
+def _is_leftover(path: Path) -> bool:
+    if path.is_symlink():
+        return False
+    if (locks := _locked_by(path)) is not None:
+        return not in_use(locks) and (path.is_dir() or is_lock(path))
+    if path.name.endswith(f".gz{_UNPACKED}"):
+        return path.with_name(path.name.removesuffix(_UNPACKED)).is_file()
+    return _PARTIAL.fullmatch(path.name) is not None and time.time() - path.stat().st_mtime > _IDLE_S
+
+
+def _locked_by(path: Path) -> Path | None:
+    """Return the file or folder whose lock protects what has this name; None for another name."""
+    found = _OF_LOCKED.fullmatch(path.name)
+    return None if found is None else path.with_name(found[1])
