@@ -14,7 +14,7 @@ from photonpano import parse_spec
 from photonpano.evaluation import corner_errors, load_run_trajectory
 from photonpano.geometry import corner_displacements
 from photonpano.residuals.verdict import NARROW
-from photonpano.testing.scenes import detected, seen_along, textured
+from photonpano.testing.captures import detected, seen_along, textured
 
 SHAPE, SCENE_SHAPE, N_FRAMES, FLUX = (96, 128), (400, 520), 900, 0.3
 FEW_ROWS = (8, 512)

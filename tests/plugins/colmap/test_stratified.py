@@ -14,7 +14,7 @@ from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
 from photonpano.geometry import Camera, positions_of, rotation_matrices
 from photonpano.testing import MemorySource
-from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses
+from photonpano.testing.motions import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("gtsam")
@@ -36,12 +36,12 @@ from photonpano_colmap.locating import Found, Observations, Patches, adjust, fin
 from photonpano_colmap.stratified import Merged, Scene, StratifiedEstimator, interpolate, locate, merge, resample
 from photonpano_colmap.tremor import _beyond_noise, find_tremor
 
-CAMERA = Camera.of(FOCAL_PX, SHAPE)
+CAMERA = Camera.of(FOCAL_PX, POSES_SHAPE)
 MATRIX = CAMERA.matrix
 LENS = (-0.2, 0.0, 0.0, 0.0)
 LENS_CAMERA = Camera(MATRIX, np.array(LENS))
 TRUE = Path(true_poses())
-EVERYWHERE = np.ones(N_FRAMES, np.bool_)
+EVERYWHERE = np.ones(N_POSES, np.bool_)
 
 
 def points_on_planes(number: int, seed: int = 0) -> np.ndarray:
@@ -63,12 +63,12 @@ def test_inverse_depth_of_a_plane_is_exact_between_points() -> None:
     normal, pose = np.array([0.1, -0.05, 0.25]), true_poses()[40]
     rays = np.concatenate([np.random.default_rng(0).uniform(-0.6, 0.6, (300, 2)), np.ones((300, 1))], axis=1)
     points = (rays / (rays @ normal)[:, None] - pose[:, 3]) @ pose[:, :3]
-    found = inverse_depth_of(pose, points, CAMERA, SHAPE)
+    found = inverse_depth_of(pose, points, CAMERA, POSES_SHAPE)
     y, x = np.mgrid[20:108, 20:140]
     expected = ((x - 79.5) * normal[0] + (y - 63.5) * normal[1]) / FOCAL_PX + normal[2]
     assert found is not None
     np.testing.assert_allclose(found[20:108, 20:140], expected, rtol=0.02)
-    assert inverse_depth_of(pose, points[:3], CAMERA, SHAPE) is None
+    assert inverse_depth_of(pose, points[:3], CAMERA, POSES_SHAPE) is None
 
 
 def test_frames_merge_sharp_through_depth_and_blurred_without() -> None:
@@ -76,7 +76,7 @@ def test_frames_merge_sharp_through_depth_and_blurred_without() -> None:
     source, group, instant = capture(), Group(FrameSpan(0, 320), 159.5), TRUE.at([159.5])[0]
     edges = {}
     for name, depth in (("true", 3.0), ("wrong", 5.0)):
-        plane = np.full(SHAPE, 1 / depth, np.float32)
+        plane = np.full(POSES_SHAPE, 1 / depth, np.float32)
         found = merge_through_depth(source, group, TRUE, plane, CAMERA)
         assert found.exposure.weight.max() == pytest.approx(320, rel=1e-3)
         np.testing.assert_array_equal(found.pose, instant)
@@ -86,7 +86,7 @@ def test_frames_merge_sharp_through_depth_and_blurred_without() -> None:
 
 
 def test_path_is_interpolated_between_frames_and_rests_beyond() -> None:
-    spline = PoseSpline(np.arange(N_FRAMES, dtype=float), true_poses())
+    spline = PoseSpline(np.arange(N_POSES, dtype=float), true_poses())
     np.testing.assert_allclose(TRUE.at([0, 7]), true_poses()[[0, 7]], atol=1e-12)
     np.testing.assert_allclose(TRUE.at([3.5, 100.25]), spline.at([3.5, 100.25]), atol=1e-4)
     np.testing.assert_allclose(TRUE.at([-5, 400]), true_poses()[[0, -1]], atol=1e-12)
@@ -126,8 +126,8 @@ def test_corrected_path_keeps_no_motion_within_groups_that_was_only_interpolated
 
 
 def trembling(rms_px: float) -> tuple[Path, np.ndarray]:
-    """Return a path that misses a tremor, and the tremor: rotation vectors of the camera, (N_FRAMES, 3)."""
-    frames = np.arange(N_FRAMES)
+    """Return a path that misses a tremor, and the tremor: rotation vectors of the camera, (N_POSES, 3)."""
+    frames = np.arange(N_POSES)
     turns = [np.sin(2 * np.pi * (frames / period + phase)) for period, phase in ((41, 0.1), (27, 0.4), (35, 0.7))]
     tremor = np.sqrt(2) * rms_px / FOCAL_PX * np.stack(turns, axis=1)
     return TRUE.rotated(-tremor), tremor
@@ -230,7 +230,7 @@ def test_exposures_along_the_true_path_are_found_where_they_are() -> None:
 
 
 def test_exposures_without_anything_in_common_are_an_error() -> None:
-    source = MemorySource(np.random.default_rng(0).integers(0, 2, (40, *SHAPE)))
+    source = MemorySource(np.random.default_rng(0).integers(0, 2, (40, *POSES_SHAPE)))
     with ThreadPoolExecutor(2) as pool:
         everywhere = np.ones(40, np.bool_)
         merged = merge(source, resample(everywhere, 20), Scene(TRUE, everywhere, _seen_points()), CAMERA, pool)
@@ -240,7 +240,7 @@ def test_exposures_without_anything_in_common_are_an_error() -> None:
 
 def test_lens_is_undone_and_images_nothing_beyond_the_frame() -> None:
     camera = Camera(MATRIX, np.array([-0.3, 0.05, 0.01, -0.02]))
-    lens = lens_of(camera, SHAPE)
+    lens = lens_of(camera, POSES_SHAPE)
     for x, y in ((0, 0), (159, 0), (80, 64), (3, 120)):
         np.testing.assert_allclose(imaged(lens, *lens.ideal[y, x]), (x, y), atol=1e-9)
         moved = camera.distorted(lens.ideal[y, x] + (0.01, -0.02)) - (x, y)
@@ -250,8 +250,8 @@ def test_lens_is_undone_and_images_nothing_beyond_the_frame() -> None:
 
 
 def test_frames_from_one_place_merge_as_they_are_through_a_lens() -> None:
-    source, rests = capture(distortion=LENS), Path(np.repeat(true_poses()[:1], N_FRAMES, axis=0))
-    found = merge_through_depth(source, Group(FrameSpan(0, 8), 3.5), rests, np.full(SHAPE, 0.2, np.float32), LENS_CAMERA)
+    source, rests = capture(distortion=LENS), Path(np.repeat(true_poses()[:1], N_POSES, axis=0))
+    found = merge_through_depth(source, Group(FrameSpan(0, 8), 3.5), rests, np.full(POSES_SHAPE, 0.2, np.float32), LENS_CAMERA)
     np.testing.assert_allclose(found.exposure.weight[1:-1, 1:-1], 8, atol=1e-4)
     counts = source.frames(FrameSpan(0, 8)).sum(axis=0)
     unsaturated = counts < 8
@@ -279,7 +279,7 @@ def test_adjustment_tells_distortion_that_is_not_that_of_the_lens(k1: float) -> 
 
 def test_adjustment_finds_the_focal_length() -> None:
     poses, points, observations = observed_through(CAMERA)
-    found = adjust(poses, points, observations, Camera.of(1.04 * FOCAL_PX, SHAPE), finds_focal=True)
+    found = adjust(poses, points, observations, Camera.of(1.04 * FOCAL_PX, POSES_SHAPE), finds_focal=True)
     assert found.std_focal_px < 0.7
     assert abs(found.focal_px - FOCAL_PX) < 3 * found.std_focal_px
     given = adjust(poses, points, observations, CAMERA, finds_focal=False)
@@ -310,7 +310,7 @@ def test_lens_is_seen_through_and_a_wrong_one_is_doubted(given: tuple[float, flo
 
 
 def test_frames_that_show_nothing_are_lost_and_the_others_refined() -> None:
-    frames = capture().frames(FrameSpan(0, N_FRAMES)).copy()
+    frames = capture().frames(FrameSpan(0, N_POSES)).copy()
     frames[140:160] = 0
     source = MemorySource(frames)
     config, context = StratifiedPoseConfig(group_size=20, levels=2), StageContext(source.info, source.response, 0, 2)

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
 from photonpano.geometry import Camera, corner_displacements, rotation_vectors
-from photonpano.testing.scenes import z_scores
+from photonpano.testing.captures import z_scores
 from photonpano_simulator import scenes
 from photonpano_simulator.config import CameraSimulatorConfig, SimulatorConfig
 from photonpano_simulator.scenes import street

@@ -11,7 +11,7 @@ from photonpano import Capture, FrameSpan
 from photonpano.corrections import DarkFrames, corrected_source, hot_in_the_dark, write_dark
 from photonpano.geometry import translation
 from photonpano.testing import MemorySource
-from photonpano.testing.scenes import seen_along
+from photonpano.testing.captures import seen_along
 
 SHAPE = (60, 80)
 N = 2000

@@ -19,7 +19,7 @@ from photonpano.motion.pairs import alike, pairs_of, shared_share
 from photonpano.motion.registration import _PROMINENCE, _visits, closure_candidates, exposure_similarity
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import photographed
-from photonpano.testing.scenes import seen_along
+from photonpano.testing.captures import seen_along
 
 
 def groups(*starts: int, size: int = 100) -> list[Group]:

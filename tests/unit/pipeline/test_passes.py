@@ -28,8 +28,7 @@ from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.refinement import Explained, MotionFit, NamedRefiner
 from photonpano.specs import parse_spec
 from photonpano.testing import MemorySource
-from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded
-from photonpano.testing.scenes import Scene
+from photonpano.testing.captures import KnownMotion, ReadOnlySource, Scene, recorded
 from photonpano.values import Background
 
 PLAN = parse_spec({"version": 1, "source": {"use": "simulator"}})

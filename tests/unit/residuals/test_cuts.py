@@ -14,7 +14,7 @@ from photonpano.motion.level import Cut
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import MotionFit
 from photonpano.testing import MemorySource
-from photonpano.testing.scenes import detected, seen_along
+from photonpano.testing.captures import detected, seen_along
 
 SHAPE, N_FRAMES, JUMP = (96, 128), 600, 330
 

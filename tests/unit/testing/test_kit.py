@@ -11,8 +11,8 @@ from photonpano.execution import LocalExecutor
 from photonpano.geometry import translation
 from photonpano.testing import ExecutorConformance, KnownMotion, MemorySource, Scene, photographed, recorded
 from photonpano.testing.captures import ReadOnlySource
+from photonpano.testing.conformance import fingerprint, in_threads
 from photonpano.testing.executors import N_FRAMES, capture
-from photonpano.testing.sameness import fingerprint, in_threads
 
 SHAPE = (30, 44)
 STILL = KnownMotion(lambda _: np.eye(3))

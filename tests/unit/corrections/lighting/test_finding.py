@@ -16,7 +16,7 @@ from photonpano.geometry import Camera, Canvas, FrameTrajectory, rotation_matric
 from photonpano.merging.accumulate import gain_image
 from photonpano.merging.panorama import render
 from photonpano.testing import KnownMotion, MemorySource, Scene
-from photonpano.testing.scenes import detected, seen_along
+from photonpano.testing.captures import detected, seen_along
 
 SHAPE, N = (48, 64), 1024
 MOTION = KnownMotion(lambda frame: translation(0.06 * float(frame), 0.01 * float(frame)))

@@ -19,7 +19,7 @@ from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
 from photonpano.motion.registration import MIN_SIMILARITY
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import KnownMotion, MemorySource, photographed
-from photonpano.testing.scenes import seen_along
+from photonpano.testing.captures import seen_along
 from photonpano.values import Edge
 
 pytestmark = pytest.mark.usefixtures("one_thread")
