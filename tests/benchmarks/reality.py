@@ -35,7 +35,7 @@ from photonpano.api.run_folders import opened_run
 from photonpano.capture import before, capture_of
 from photonpano.capture.writing import truth_path
 from photonpano.corrections import divided_by, estimate_vignette
-from photonpano.corrections.moments import showing
+from photonpano.corrections.movers import showing
 from photonpano.evaluation import image_score, load_run_trajectory, load_truth, true_panorama, white_flux
 from photonpano.geometry import FrameTrajectory
 

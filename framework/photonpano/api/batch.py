@@ -28,7 +28,7 @@ from photonpano.api.command import SPEC, DoubtfulError, WrongArgumentError, comm
 from photonpano.errors import InputError, OutputError, PhotonpanoError, Problem, SpecError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import thread_count
-from photonpano.files.atomic import locked
+from photonpano.files.folders import locked
 from photonpano.files.paths import Location
 from photonpano.notebooks import facts, from_here, table
 from photonpano.plugins.registry import discover

@@ -21,8 +21,7 @@ from photonpano.plugins.registry import Catalog
 from photonpano.record.batch_row import BatchRow, written
 from photonpano.record.contents import RECORD
 from photonpano.specs import Plan, parse_spec
-from photonpano.specs.written import Place
-from photonpano.specs.yaml_reader import read_yaml
+from photonpano.specs.yaml_reader import Place, read_yaml
 
 _TRUTH = ".truth.npz"
 _COMPRESSED = (".gz",)

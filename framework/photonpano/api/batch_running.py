@@ -29,7 +29,7 @@ from photonpano.capture.writing import truth_path
 from photonpano.errors import InputError, OutputError, PhotonpanoError, SpecError, described
 from photonpano.evaluation import evaluate, evaluate_poses
 from photonpano.execution.context import Quiet
-from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_path
 from photonpano.files.paths import Url
 from photonpano.pipeline.run import RunResult, run
 from photonpano.record.batch_row import FIGURES, BatchRow, ranked, written

@@ -19,20 +19,19 @@ from photonpano.capture import capture_of
 from photonpano.capture.writing import truth_path, write_folder, write_packed
 from photonpano.contracts.protocols import Source
 from photonpano.corrections import hot_in_the_dark, measure_dark, write_dark
-from photonpano.corrections.hot_pixels import THRESHOLD
+from photonpano.corrections.dark import THRESHOLD
 from photonpano.errors import InputError, OutputError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import thread_count
-from photonpano.files.atomic import atomic_path, part_path
-from photonpano.files.folders import require_new
+from photonpano.files.folders import atomic_path, part_path, require_new
 from photonpano.notebooks import facts
 from photonpano.pipeline.components import build_source
 from photonpano.plugins.contributions import SourceContribution
+from photonpano.plugins.description import flow
 from photonpano.plugins.registry import Catalog, discover
-from photonpano.plugins.registry.description import flow
 from photonpano.record.contents import capture_files
 from photonpano.specs import Plan
-from photonpano.specs.corrections import written_corrections
+from photonpano.specs.components import written_corrections
 from photonpano.text import columns, counted
 from photonpano.values import BoolArray, FluxImage, StreamInfo
 

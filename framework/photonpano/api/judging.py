@@ -32,8 +32,7 @@ from photonpano.evaluation.inputs import RunTrajectory
 from photonpano.evaluation.run_scores import motion_difference, on_canvas, reduced
 from photonpano.execution.context import Context, Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
-from photonpano.files.atomic import atomic_path
-from photonpano.files.folders import require_new
+from photonpano.files.folders import atomic_path, require_new
 from photonpano.geometry import Canvas
 from photonpano.merging.colour import composed
 from photonpano.merging.panorama import render

@@ -9,9 +9,9 @@ from typing import Any
 import typer
 
 from photonpano.api.command import command, component_names, json_lines
-from photonpano.plugins.contributions import install_command
-from photonpano.plugins.registry import KINDS, Catalog, Entry, Origin
-from photonpano.plugins.registry.description import config_rows, snippet
+from photonpano.plugins.contributions import KINDS, install_command
+from photonpano.plugins.description import config_rows, snippet
+from photonpano.plugins.registry import Catalog, Entry, Origin
 from photonpano.text import columns
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from photonpano.api.command import command
 from photonpano.api.run_folders import OpenedRun, load_trajectory, opened_run
 from photonpano.capture import before
-from photonpano.corrections.moments import showing
+from photonpano.corrections.movers import showing
 from photonpano.errors import InputError
 from photonpano.execution.context import Context, Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count

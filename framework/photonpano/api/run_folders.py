@@ -25,8 +25,7 @@ from photonpano.errors import InputError, OutputError, SpecError
 from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.evaluation import load_panorama as read_panorama
 from photonpano.evaluation.inputs import read_tiff
-from photonpano.files.atomic import in_use, is_lock, locked, remove
-from photonpano.files.folders import NEW, OLD, recover
+from photonpano.files.folders import NEW, OLD, in_use, is_lock, locked, recover, remove
 from photonpano.files.paths import location
 from photonpano.geometry import FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from photonpano.capture import before, capture_of, leaving_out
+from photonpano.capture import before, capture_of, in_light, leaving_out
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
 from photonpano.corrections.lighting import (
@@ -18,7 +18,6 @@ from photonpano.corrections.lighting import (
     corrected_light,
     decision_of,
     find_light,
-    in_light,
     measure_light,
     measure_pixel_gain,
 )

@@ -17,7 +17,7 @@ from photonpano.contracts.protocols import Source
 from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError, PhotonpanoError, PluginError
 from photonpano.execution.context import Context, Progress, TimeLimit
 from photonpano.execution.threads import one_thread_inside
-from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_path
 from photonpano.motion.loop import LevelResult
 from photonpano.pipeline.checkpoints.fingerprint import finished_run, run_fingerprint
 from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, work_folder

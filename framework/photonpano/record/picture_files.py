@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import OutputError
-from photonpano.files.atomic import atomic_path
-from photonpano.files.folders import atomic_folder
+from photonpano.files.folders import atomic_folder, atomic_path
 from photonpano.plugins.contributions import Requirement, install_command
 
 Picture = NDArray[np.uint8] | NDArray[np.uint16]  # of 16 bits in a folder of PNGs only

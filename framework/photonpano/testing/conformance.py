@@ -23,8 +23,7 @@ from pydantic import BaseModel
 from photonpano.contracts.requirements import BrokenContract
 from photonpano.errors import CaptureUnreadError, PluginError
 from photonpano.photometry import BinaryResponse
-from photonpano.plugins.contributions import Contribution, StageContext, StageContribution, install_command
-from photonpano.plugins.registry import KINDS
+from photonpano.plugins.contributions import KINDS, Contribution, StageContext, StageContribution, install_command
 from photonpano.values import CaptureSummary, StreamInfo
 
 T = TypeVar("T")

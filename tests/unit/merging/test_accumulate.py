@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Light
-from photonpano.capture import capture_of
-from photonpano.corrections.lighting import in_light
+from photonpano.capture import capture_of, in_light
 from photonpano.geometry import from_parameters, rescaling, translation
 from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of, divided
 from photonpano.photometry import BinaryResponse

@@ -22,17 +22,15 @@ from photonpano import (
     StageContext,
     StreamInfo,
 )
-from photonpano.capture import seen_through
+from photonpano.capture import in_light, seen_through
 from photonpano.contracts.attribution import attributed, label_of
 from photonpano.contracts.protocols import Renderer
-from photonpano.corrections.lighting import in_light
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, canvas_around, covered_by, rotation_matrices
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import build_levels, build_source, foreseen_groups, scale_of
 from photonpano.pipeline.forecast import TRIAL_GROUPS, forecast
 from photonpano.pipeline.rendering import ChosenRenderer, build_renderer
-from photonpano.plugins.registry import Catalog, Origin
-from photonpano.plugins.registry.catalog import make_entry
+from photonpano.plugins.registry import Catalog, Origin, make_entry
 from photonpano.specs import Plan, parse_spec
 from photonpano.testing import MemorySource
 from photonpano.values import Decision, Light

@@ -10,7 +10,7 @@ from pydantic import ByteSize, Field, JsonValue
 from ruamel.yaml import YAML
 
 from photonpano import Config, LocatorContribution, Requirement, SpecPath
-from photonpano.plugins.registry.description import (
+from photonpano.plugins.description import (
     ConfigRow,
     bounds_words,
     config_rows,

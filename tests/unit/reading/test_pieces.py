@@ -182,7 +182,7 @@ def test_long_capture_is_sampled_from_start_to_end_within_its_budget() -> None:
 
 
 def test_large_frames_are_sampled_by_their_first_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.reading.guessed_layout._VALUES", 16 * 8 * 5)
+    monkeypatch.setattr("photonpano.reading.npy._VALUES", 16 * 8 * 5)
     frames = np.random.default_rng(0).integers(0, 256, (50, 8, 40), np.uint8)
     np.save(tmp_path / "cube.npy", frames)
     (found,) = sampled_frames(tmp_path / "cube.npy", npy_header(tmp_path / "cube.npy"))
@@ -190,7 +190,7 @@ def test_large_frames_are_sampled_by_their_first_columns(tmp_path: Path, monkeyp
 
 
 def test_compressed_capture_is_sampled_from_its_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.reading.guessed_layout._VALUES", 1000)
+    monkeypatch.setattr("photonpano.reading.npy._VALUES", 1000)
     frames = np.random.default_rng(0).integers(0, 2**16, (50, 8, 40), np.uint16)
     np.save(tmp_path / "cube.npy", frames)
     header = npy_header(tmp_path / "cube.npy")

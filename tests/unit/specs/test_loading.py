@@ -12,8 +12,8 @@ import pytest
 from ruamel.yaml import YAML, YAMLError
 
 from photonpano import Config, ExporterContribution, PluginError, SpecError
+from photonpano.plugins.description import snippet
 from photonpano.plugins.registry import Catalog
-from photonpano.plugins.registry.description import snippet
 from photonpano.specs import builtin, json_schema, load_spec, parse_spec
 
 MINIMAL = {"version": 1, "source": {"use": "simulator"}}

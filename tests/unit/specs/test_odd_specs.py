@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from pydantic import ConfigDict, Field
 
 from photonpano import Config, MergerContribution, SpecError
-from photonpano.plugins.registry import KINDS, Catalog, discover
-from photonpano.plugins.registry.description import config_schema
+from photonpano.plugins.contributions import KINDS
+from photonpano.plugins.description import config_schema
+from photonpano.plugins.registry import Catalog, discover
 from photonpano.specs import json_schema, load_spec, parse_spec
 from photonpano.specs.settings import GraphSettings, RenderSettings, RunSettings
 

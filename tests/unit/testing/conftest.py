@@ -23,9 +23,8 @@ from photonpano import (
 from photonpano.api.cli.errors import reported
 from photonpano.geometry import camera_matrix, translation
 from photonpano.pipeline.run import run
-from photonpano.plugins.registry import KINDS as OF_CATALOG
-from photonpano.plugins.registry import Catalog, Observer, discover
-from photonpano.plugins.registry.catalog import make_entry
+from photonpano.plugins.contributions import KINDS as OF_CATALOG
+from photonpano.plugins.registry import Catalog, Observer, discover, make_entry
 from photonpano.specs import parse_spec
 from photonpano.testing import KnownMotion, MemorySource, Scene, motions
 from photonpano.testing.captures import recorded

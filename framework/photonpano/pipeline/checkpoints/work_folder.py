@@ -22,7 +22,7 @@ import numpy as np
 
 from photonpano.errors import InputError, OutputError, PhotonpanoError
 from photonpano.execution.context import Checkpoints, KeepNothing, Progress
-from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_path
 from photonpano.pipeline.checkpoints.fingerprint import Fingerprint, differences
 from photonpano.text import byte_size, counted
 from photonpano.values import Decision

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from photonpano.api.batch_jobs import Job
 from photonpano.api.batch_jobs import SpecText
-from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_path
 from photonpano.record.batch_row import BatchRow
 
 @dataclass(frozen=True)

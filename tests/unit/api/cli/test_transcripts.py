@@ -40,9 +40,7 @@ from photonpano.api.cli.app import commands
 from photonpano.api.command import COMMANDS
 from photonpano.photometry import IntensityResponse
 from photonpano.pipeline.run import RunResult
-from photonpano.plugins.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin
-from photonpano.plugins.registry.catalog import make_entry
-from photonpano.plugins.registry.plugins import observation_of
+from photonpano.plugins.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin, make_entry, observation_of
 from photonpano.values import Reason, Verdict
 
 INSTALLED = f"photonpano {version('photonpano')}"

@@ -8,9 +8,15 @@ import pytest
 
 from photonpano import FrameSpan, InputError
 from photonpano.corrections import Vignette, divided_by
-from photonpano.corrections.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
-from photonpano.corrections.lighting.finding import flicker_frequency, gain_of_frames
-from photonpano.corrections.lighting.gains import SeenCells, _amplitudes, local_flicker, solve_gains
+from photonpano.corrections.gains import SeenCells, _amplitudes, local_flicker, solve_gains
+from photonpano.corrections.lighting import (
+    PixelGain,
+    decision_of,
+    find_light,
+    flicker_frequency,
+    gain_of_frames,
+    measure_pixel_gain,
+)
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, Canvas, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging.accumulate import gain_image
