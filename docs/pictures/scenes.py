@@ -19,7 +19,7 @@ from photonpano.capture.writing import truth_path
 from photonpano.photometry import BinaryResponse, Tone, picture_of
 from photonpano_simulator.config import NightScene
 from photonpano_simulator.scenes import scene_flux
-from photonpano_simulator.travel.truth import depth, sharp_view, truth_of
+from photonpano_simulator.travel import depth, sharp_view, truth_of
 
 from . import finished
 

@@ -1,3 +1,3 @@
 from .averages import AveragesEstimator as AveragesEstimator
+from .reconstruction import TwoViewLocator as TwoViewLocator
 from .stratified import StratifiedEstimator as StratifiedEstimator
-from .two_view import TwoViewLocator as TwoViewLocator

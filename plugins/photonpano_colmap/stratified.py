@@ -37,15 +37,16 @@ from photonpano_colmap.exposures import (
     Path,
     PosedExposure,
     PoseSpline,
+    Tremor,
     between,
     exceeding_noise_of_poses,
+    find_tremor,
     inverse_depth_of,
     merge_through_depth,
     moves,
 )
 from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Adjusted, Found, Observations, adjust, find_patches, patches_of, stabilised
-from photonpano_colmap.tremor import Tremor, find_tremor
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
 _CONTRADICTION, _CONTRADICTION_PX = 10.0, 0.5

@@ -3,9 +3,9 @@ from .exporters import RadianceExporter as RadianceExporter
 from .interpolators import GeodesicInterpolator as GeodesicInterpolator
 from .interpolators import LucasKanadeInterpolator as LucasKanadeInterpolator
 from .interpolators import SmoothingSplineInterpolator as SmoothingSplineInterpolator
-from .mergers.local_flow import LocalFlowMerger as LocalFlowMerger
-from .mergers.photon_mle import PhotonMleMerger as PhotonMleMerger
-from .mergers.splat import SplatMerger as SplatMerger
+from .local_flow import LocalFlowMerger as LocalFlowMerger
+from .mergers import PhotonMleMerger as PhotonMleMerger
+from .mergers import SplatMerger as SplatMerger
 from .refiners import ShortSpansRefiner as ShortSpansRefiner
 from .resamplers import AutoResampler as AutoResampler
 from .resamplers import ConstantGroupsResampler as ConstantGroupsResampler
@@ -18,4 +18,4 @@ from .sources import PACKED_RAW as PACKED_RAW
 from .sources import NpyConfig as NpyConfig
 from .sources import PackedNpyConfig as PackedNpyConfig
 from .sources import PackedRawConfig as PackedRawConfig
-from .super_resolution.renderer import SuperResolutionRenderer as SuperResolutionRenderer
+from .super_resolution import SuperResolutionRenderer as SuperResolutionRenderer

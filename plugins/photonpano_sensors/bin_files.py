@@ -1,17 +1,42 @@
-"""Captures in .bin files, packed frames without a header: sources `swissspad-half`, `swissspad-full` and `spad512`."""
+"""Sources of files without a header: packed frames in .bin files, addresses of lit pixels, and .dat files of spike cameras."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from photonpano import Arrived, Config, InputError, Location, Recognised, SourceContribution, SpecLocation, Url
-from photonpano.reading import FrameFile, FrameLayout, PackedFileSource, files_in, objections, size_of
+from photonpano import (
+    Arrived,
+    Config,
+    FrameSpan,
+    InputError,
+    Location,
+    Recognised,
+    SourceContribution,
+    SpecLocation,
+    SpecPath,
+    Url,
+)
+from photonpano.photometry import IntensityResponse
+from photonpano.reading import (
+    BinarySource,
+    FrameFile,
+    FrameLayout,
+    PackedFileSource,
+    as_written,
+    files_in,
+    objections,
+    read_start,
+    reading,
+    size_of,
+)
 
 Pixels = TypeVar("Pixels", bound=np.generic)
 
@@ -27,6 +52,20 @@ _SPAD512_FILES = {
     1000 * _SPAD512.stored_bytes: "1000 frames",
     256 * _SPAD512.stored_bytes + _FOOTER_BYTES: "256 frames and a footer",
 }
+# Rows and columns of the cameras and simulators whose files are public.
+_SHAPES = ((250, 400), (1000, 1000), (480, 640), (360, 640), (396, 640))
+# The flux is spikes per pixel per frame. A pixel keeps the light that is left when it fires, so that spikes are proportional
+# to the light. Their variance is taken to be their number, as of single photons, which is too large: that of a visit of many
+# may be a fifth. In the dark, what is left at the ends of a visit counts: 1/6 spike squared, here in 200 frames.
+RESPONSE = IntensityResponse(photons_per_level=1.0, black_level=0.0, saturation_level=1.0, read_noise=(1 / 6 / 200) ** 0.5)
+_COMPARED_ROWS = 16  # frames at the beginning of a file that are compared to recognise its shape, at most
+_SURE = 5.0  # standard errors by which the correlations of a shape exceed those of all others
+_SIZE = 512
+_PIXELS = _SIZE**2
+_END = _PIXELS  # the address that ends a frame
+_WORD = np.dtype("<u4")
+_MOST_FRAMES = 32  # frames unpacked at once
+_BLOCK_WORDS = 1024**2
 
 
 class BinConfig(Config):
@@ -213,4 +252,208 @@ SPAD512 = bin_source(
     _SPAD512,
     _recognise_spad512,
     _FOOTER_BYTES,
+)
+
+
+class SpikeDatConfig(Config):
+    """Frames one after the other: a bit for each pixel, the lowest bit of a byte first, without gaps between rows or frames."""
+
+    path: SpecLocation = Field(description="the .dat file, or its URL")
+    frame_shape: tuple[int, int] = Field(description="rows and columns of a frame, in px, such as [250, 400]")
+    frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
+
+    @field_validator("frame_shape")
+    @classmethod
+    def _whole_bytes(cls, shape: tuple[int, int]) -> tuple[int, int]:
+        if min(shape) < 1 or max(shape) > 65535 or shape[0] * shape[1] % 8:
+            raise ValueError("rows and columns are from 1 to 65535, and a frame has a multiple of eight pixels")
+        return shape
+
+
+def layout_of(shape: tuple[int, int]) -> FrameLayout:
+    """Return the layout of frames of (rows, columns); rows that are no whole bytes are repacked."""
+    n_rows, n_columns = shape
+
+    def to_rows(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        pixels = np.unpackbits(stored, axis=1, bitorder="little").reshape(-1, n_rows, n_columns)
+        return np.packbits(pixels, axis=2, bitorder="little")
+
+    if n_columns % 8:
+        return FrameLayout(shape, (n_rows * n_columns // 8,), "little", to_rows=to_rows)
+    return FrameLayout(shape, (n_rows, n_columns // 8), "little")
+
+
+def _open(config: SpikeDatConfig) -> PackedFileSource:
+    """Open a capture; raises an `InputError` if it is missing, or its size is no whole number of frames."""
+    size, frame_bytes = size_of(config.path), layout_of(config.frame_shape).stored_bytes
+    n_frames, rest = divmod(size, frame_bytes)
+    if n_frames and not rest:
+        return _source(config, n_frames)
+    shape, fitting = "x".join(map(str, config.frame_shape)), [f"[{h}, {w}]" for h, w in _fitting(size)]
+    known = f"of the usual shapes, {' and '.join(fitting)} would fit" if fitting else "none of the usual shapes would fit"
+    raise InputError(
+        f"{config.path} has {size:,} bytes, and a frame of {shape} px takes {frame_bytes:,}: after {n_frames:,} frames, "
+        f"{rest:,} bytes are left over; {known}: correct frame_shape, or copy the file again"
+    )
+
+
+def _source(config: SpikeDatConfig, n_frames: int) -> PackedFileSource:
+    source = PackedFileSource([FrameFile(config.path, n_frames)], layout_of(config.frame_shape), config.frame_rate_hz)
+    source.response = RESPONSE
+    return source
+
+
+def _arrived(config: SpikeDatConfig) -> Arrived:
+    """Open the frames that are there of a file that is still being written."""
+    path = config.path
+    if isinstance(path, Url):
+        raise InputError(f"{path} is a URL, which cannot be followed: follow a file, or a pipe")
+    n_frames = size_of(path) // layout_of(config.frame_shape).stored_bytes if path.exists() else 0
+    return Arrived(_source(config, n_frames) if n_frames else None)
+
+
+def _fitting(size: int) -> Iterator[tuple[int, int]]:
+    """Yield the usual shapes of which a file holds whole frames."""
+    return (shape for shape in _SHAPES if size and size % layout_of(shape).stored_bytes == 0)
+
+
+def _recognise_spikes(path: Location) -> Recognised | None:
+    """Take a .dat file if neighbouring rows, and earlier and later frames, are most alike in one of the usual shapes."""
+    if isinstance(path, Url) or path.suffix.lower() != ".dat" or not path.is_file():
+        return None
+    found = sorted(((_likeness(path, shape), shape) for shape in _fitting(size_of(path))), reverse=True)
+    if not found or found[0][0] - max([0.0, *(score for score, _ in found[1:])]) < _SURE:
+        return None
+    shape = found[0][1]
+    because = f"a .dat file of whole frames of {shape[0]}x{shape[1]} px, in which neighbouring rows and frames are alike"
+    return Recognised({"path": as_written(path), "frame_shape": list(shape)}, because)
+
+
+def _likeness(path: Location, shape: tuple[int, int]) -> float:
+    """Return the smaller correlation, of neighbouring rows or of neighbouring frames, in standard errors."""
+    layout = layout_of(shape)
+    start = np.frombuffer(read_start(path, _COMPARED_ROWS * layout.stored_bytes), np.uint8)
+    frames = layout.unpacked(layout.rows(start.reshape(-1, *layout.stored_shape)))
+    total = frames.sum(axis=0, dtype=np.float32)
+    neighbours = (total[1:], total[:-1]), (frames[1:], frames[:-1])
+    return min(correlation(first, second) * math.sqrt(first.size) for first, second in neighbours)
+
+
+SPIKE_DAT = SourceContribution(
+    name="spike-dat",
+    summary="Binary frames of a spike camera in a .dat file, as SpikeCV and Spike-Zoo read it",
+    config=SpikeDatConfig,
+    build=lambda config, _: _open(config),
+    check=lambda config: objections(_open, config),
+    recognise=_recognise_spikes,
+    arrived=_arrived,
+    suffixes=(".dat",),
+)
+
+
+class Spad512SparseConfig(Config):
+    """A sparse capture of the SPAD512, 512 x 512 px. It is read once when it is opened, to find its frames."""
+
+    path: SpecPath = Field(
+        description="a file with addresses of lit pixels, or a folder of such .bin files, nested or not, in natural order"
+    )
+    frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
+
+
+class Spad512SparseSource(BinarySource):
+    """Little-endian uint32 addresses, 512 y + x, of lit pixels; 512 x 512 ends a frame."""
+
+    def __init__(self, config: Spad512SparseConfig) -> None:
+        self._paths = _files(config.path)
+        self._ends = [_frame_ends(path) for path in self._paths]
+        self._starts = list(accumulate(map(len, self._ends), initial=0))
+        super().__init__(self._starts[-1], FrameLayout((_SIZE, _SIZE), (_SIZE, _SIZE // 8)), config.frame_rate_hz)
+
+    def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
+        """Sum the frames of a span: (H, W) uint32."""
+        self.info.require(span)
+        counts = np.zeros(_PIXELS, np.uint32)
+        for _, lit in self._lit(span):
+            counts += np.bincount(lit % _PIXELS, minlength=_PIXELS).astype(np.uint32)
+        return counts.reshape(_SIZE, _SIZE)
+
+    def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Yield the frames of a span, a few at a time: see `BinarySource`."""
+        for place, lit in self._lit(span):
+            frames = np.zeros((place.stop - place.start) * _PIXELS, np.uint8)
+            frames[lit] = 1
+            yield place, np.packbits(frames).reshape(-1, _SIZE, _SIZE // 8)
+
+    def _lit(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.int64]]]:
+        """Yield the place of some frames in the span, and the indices of their lit pixels in (n, H, W), each once."""
+        for path, ends, offset in zip(self._paths, self._ends, self._starts, strict=False):
+            for first in range(max(0, span.start - offset), min(len(ends), span.stop - offset), _MOST_FRAMES):
+                stop = min(first + _MOST_FRAMES, len(ends), span.stop - offset)
+                begin = ends[first - 1] if first else 0
+                words = np.empty(int(ends[stop - 1] - begin), _WORD)
+                self.files.read(path, int(begin) * _WORD.itemsize, words.view(np.uint8))
+                at = slice(offset + first - span.start, offset + stop - span.start)
+                yield at, _places(words)
+
+
+def _places(words: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Return the indices of lit pixels in (n, H, W), from addresses that end with an `_END`."""
+    end = words == _END
+    places = (np.cumsum(end) * _PIXELS + words)[~end]
+    # A pixel that is listed twice in a frame is lit once.
+    return places if np.all(np.diff(places) > 0) else np.unique(places)
+
+
+def _files(path: Path) -> list[Path]:
+    """Return the files of a capture, once their sizes and last words are checked."""
+    files = files_in(path, ".bin")
+    for file in files:
+        size = file.stat().st_size
+        if not size or size % _WORD.itemsize or _words(file, size // _WORD.itemsize - 1)[0] != _END:
+            raise InputError(
+                f"{file} does not end with the end of a frame, the uint32 {_END}; it is cut short, or not sparse: copy it "
+                "again, or choose another source"
+            )
+    return files
+
+
+def _words(path: Path, start: int, n_words: int = 1) -> NDArray[np.uint32]:
+    with reading(path):
+        return np.fromfile(path, _WORD, n_words, offset=start * _WORD.itemsize)
+
+
+def _frame_ends(path: Path) -> NDArray[np.int64]:
+    """Return the number of words of a file up to the end of each frame."""
+    found, start = [], 0
+    while len(words := _words(path, start, _BLOCK_WORDS)):
+        if words.max() > _END:
+            place = int(np.argmax(words > _END))
+            raise InputError(
+                f"{path} names the pixel {words[place]} at byte {(start + place) * _WORD.itemsize:,}, and the last of a frame "
+                f"is {_PIXELS - 1}; it is damaged, or not sparse: copy it again, or choose another source"
+            )
+        found.append(start + np.flatnonzero(words == _END) + 1)
+        start += len(words)
+    return np.concatenate(found)
+
+
+def _recognise_sparse(path: Path) -> Recognised | None:
+    try:
+        files = _files(path)
+    except InputError:
+        return None
+    start = np.frombuffer(read_start(files[0], _WORD.itemsize), _WORD)
+    if files[0].suffix.lower() != ".bin" or start[0] > _END:
+        return None
+    return Recognised({"path": str(path)}, f"its last four bytes are the {_END} that ends a frame of addresses")
+
+
+SPAD512_SPARSE = SourceContribution(
+    name="spad512-sparse",
+    summary="Binary frames of the SPAD512, 512 x 512 px, as the addresses of their lit pixels",
+    config=Spad512SparseConfig,
+    build=lambda config, _: Spad512SparseSource(config),
+    check=lambda config: objections(_files, config.path),
+    recognise=_recognise_sparse,
+    suffixes=(".bin",),
 )

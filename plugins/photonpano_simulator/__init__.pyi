@@ -1,4 +1,4 @@
 from .paths import camera_path as camera_path
 from .source import SimulatorSource as SimulatorSource
-from .travel.source import TravelSource as TravelSource
-from .travel.source import placed as placed
+from .travel import TravelSource as TravelSource
+from .travel import placed as placed

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from photonpano import FloatArray, InputError
 from photonpano.compiling import compiled
+from photonpano_simulator.camera import Draw, camera, generator, outline, pixel_grid, texture_of, undistorted
 from photonpano_simulator.config import Clutter, People, SimulationConfig
 from photonpano_simulator.paths import camera_positions, pace
-from photonpano_simulator.sensor import Draw, generator
-from photonpano_simulator.views import camera, outline, pixel_grid, texture_of, undistorted
 
 _FINEST = 4096  # largest side of a texture, in texels
 _SAMPLES, _COARSE = 100, 4  # frames, and px between pixels, in which the share that people or boards cover is measured

@@ -18,6 +18,7 @@ import numpy as np
 from photonpano import FloatArray, InputError
 from photonpano.geometry import Camera, camera_matrix, inverse, normalised, rescaling, rotation_matrices, transform_points
 from photonpano.reading import read_array, read_arrays
+from photonpano_simulator.camera import Draw, camera, generator, middle_of, outline
 from photonpano_simulator.config import (
     FilePath,
     HandShakePath,
@@ -30,8 +31,6 @@ from photonpano_simulator.config import (
     SplinePath,
     TurnPath,
 )
-from photonpano_simulator.sensor import Draw, generator
-from photonpano_simulator.views import camera, middle_of, outline
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

@@ -10,6 +10,18 @@ from numpy.typing import NDArray
 from photonpano import FloatArray, FrameSpan, SourceContext, StreamInfo
 from photonpano.geometry import corner_displacements, corners, inverse
 from photonpano.reading import SingleFrameSource
+from photonpano_simulator.camera import (
+    DrawnObject,
+    IntensityCamera,
+    SpadSensor,
+    Views,
+    bayer_of,
+    camera,
+    distorts,
+    filter_array,
+    transmission,
+    undistorted,
+)
 from photonpano_simulator.config import (
     CameraSimulatorConfig,
     IntensitySensor,
@@ -22,9 +34,7 @@ from photonpano_simulator.config import (
 from photonpano_simulator.foreground import Foreground
 from photonpano_simulator.paths import camera_path, camera_positions, camera_rotations, scene_motion
 from photonpano_simulator.scenes import brightness, scene_flux, shares
-from photonpano_simulator.sensor import IntensityCamera, SpadSensor, bayer_of, filter_array
 from photonpano_simulator.travel_config import TravelConfig
-from photonpano_simulator.views import DrawnObject, Views, camera, distorts, transmission, undistorted
 
 _LABELLED_EVERY, _LABELLED_AT_MOST = 25, 400  # frames
 

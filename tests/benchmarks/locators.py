@@ -37,7 +37,7 @@ from photonpano.contracts.protocols import KnowsTruth
 from photonpano.geometry import FrameTrajectory, corner_displacements, corners, inverse, normalised, transform_points
 from photonpano.plugins.registry import Catalog
 from photonpano_core.configs import PhotonMleConfig
-from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.mergers import PhotonMleMerger
 
 SHAPE = (254, 496)
 GROUP_SIZE = 250

@@ -36,15 +36,13 @@ from photonpano.geometry import FrameTrajectory, inverse, transform_points, tran
 from photonpano_baselines.burst import BurstMerger
 from photonpano_baselines.configs import BurstConfig
 from photonpano_core.configs import LocalFlowConfig, PhotonMleConfig
-from photonpano_core.mergers.local_flow import LocalFlowMerger
-from photonpano_core.mergers.photon_mle import PhotonMleMerger
-from photonpano_core.mergers.splat import SplatMerger
+from photonpano_core.local_flow import LocalFlowMerger
+from photonpano_core.mergers import PhotonMleMerger, SplatMerger
 from photonpano_core.sources import PACKED_NPY, PackedNpyConfig
 from photonpano_simulator.config import SimulatorConfig, StreetScene
 from photonpano_simulator.scenes import scene_flux
 from photonpano_simulator.source import SimulatorSource
-from photonpano_simulator.travel.source import TravelSource
-from photonpano_simulator.travel.truth import flow, truth_of
+from photonpano_simulator.travel import TravelSource, flow, truth_of
 from photonpano_simulator.travel_config import TravelConfig
 
 SHAPE = (254, 496)

@@ -43,7 +43,7 @@ from photonpano.merging.panorama import View, plan_canvas
 from photonpano.merging.warping import Grid, Texture, add_warped, footprints_of
 from photonpano.values import FloatArray
 from photonpano_core.configs import MidpointConfig, PhotonMleConfig
-from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.mergers import PhotonMleMerger
 from photonpano_core.resamplers import MidpointResampler
 from photonpano_core.sources import PACKED_NPY, PackedNpyConfig
 

@@ -1,4 +1,4 @@
-from .mraw import FastcamMrawSource as FastcamMrawSource
-from .mraw import open_recording as open_recording
+from .pictures import FastcamMrawSource as FastcamMrawSource
 from .pictures import ImageFolderSource as ImageFolderSource
+from .pictures import open_recording as open_recording
 from .video import VideoSource as VideoSource

@@ -17,7 +17,7 @@ from photonpano.testing import MemorySource
 from photonpano_baselines.burst import BurstMerger, PatchGrid, aligned, at_instant, wiener_mean
 from photonpano_baselines.configs import BurstConfig
 from photonpano_core.configs import PhotonMleConfig
-from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.mergers import PhotonMleMerger
 
 NOISE = np.random.default_rng(1).standard_normal((72, 160))
 SCENE = 0.6 * np.exp(0.6 * sum(sigma * cv2.GaussianBlur(NOISE, (0, 0), sigma) for sigma in (1.5, 4.0)))

@@ -22,7 +22,9 @@ pytest.importorskip("gtsam")
 from photonpano_colmap.exposures import (
     Path,
     PoseSpline,
+    _beyond_noise,
     between,
+    find_tremor,
     imaged,
     inverse_depth_of,
     lens_of,
@@ -34,7 +36,6 @@ from photonpano_colmap.exposures import (
 from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Found, Observations, Patches, adjust, find_patches
 from photonpano_colmap.stratified import Merged, Scene, StratifiedEstimator, interpolate, locate, merge, resample
-from photonpano_colmap.tremor import _beyond_noise, find_tremor
 
 CAMERA = Camera.of(FOCAL_PX, POSES_SHAPE)
 MATRIX = CAMERA.matrix

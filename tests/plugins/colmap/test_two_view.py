@@ -20,7 +20,7 @@ pytest.importorskip("pycolmap")
 from collections.abc import Callable
 
 from photonpano_colmap.hooks import PycolmapTwoViewConfig
-from photonpano_colmap.two_view import Features, TwoViewLocator
+from photonpano_colmap.reconstruction import Features, TwoViewLocator
 
 SHAPE = (160, 240)
 STILL = np.eye(3)
@@ -110,7 +110,7 @@ import numpy as np
 from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.photometry import BinaryResponse
 from photonpano_colmap.hooks import PycolmapTwoViewConfig
-from photonpano_colmap.two_view import TwoViewLocator
+from photonpano_colmap.reconstruction import TwoViewLocator
 
 flux = np.random.default_rng(0).random((12, 16), np.float32).repeat(8, axis=0).repeat(8, axis=1)
 exposure = VirtualExposure(flux, np.full(flux.shape, 250, np.float32), Group(FrameSpan(0, 250), 0), 1.0, BinaryResponse())

@@ -12,10 +12,9 @@ from photonpano import FrameSpan, Group, Source, Trajectory, VirtualExposure
 from photonpano.photometry import flux_std
 from photonpano.testing import MemorySource
 from photonpano_core.configs import LocalFlowConfig, PhotonMleConfig
-from photonpano_core.mergers.dense_motion.fields import MotionField, fit_each
-from photonpano_core.mergers.dense_motion.sub_exposures import blurred, noise_area_px2
-from photonpano_core.mergers.local_flow import LocalFlowMerger, number_of
-from photonpano_core.mergers.photon_mle import PhotonMleMerger
+from photonpano_core.local_flow import LocalFlowMerger, number_of
+from photonpano_core.mergers import PhotonMleMerger
+from photonpano_core.motion_fields import MotionField, blurred, fit_each, noise_area_px2
 
 N, HEIGHT, WIDTH = 270, 80, 112
 GROUP = Group(FrameSpan(0, N), (N - 1) / 2)

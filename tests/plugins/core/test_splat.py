@@ -11,7 +11,7 @@ from photonpano import FrameSpan, Group, InputError, Light, Trajectory, VirtualE
 from photonpano.capture import in_light
 from photonpano.geometry import inverse, rescaling
 from photonpano.testing import KnownMotion, MemorySource
-from photonpano_core.mergers.splat import SplatMerger
+from photonpano_core.mergers import SplatMerger
 
 N, HEIGHT, WIDTH = 24, 30, 41
 GROUP = Group(FrameSpan(2, N - 2), 10.5)
@@ -163,7 +163,7 @@ def test_splat_reads_frames_in_blocks(memory_source: type, frames: np.ndarray, r
             spans.append(span)
             return super().frames(span)
 
-    monkeypatch.setattr("photonpano_core.mergers.splat._READ_BYTES", 7 * HEIGHT * WIDTH)
+    monkeypatch.setattr("photonpano_core.mergers._READ_BYTES", 7 * HEIGHT * WIDTH)
     parts = SplatMerger().merge(Told(frames), GROUP, rigid, 1.0)
     assert spans == [FrameSpan(2, 9), FrameSpan(9, 16), FrameSpan(16, 22)]
     np.testing.assert_array_equal(parts.flux, whole.flux)

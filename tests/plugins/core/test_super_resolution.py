@@ -17,8 +17,7 @@ from photonpano.merging import Chunk, MergeRenderer, PhotonSum
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import SuperResolutionConfig
-from photonpano_core.mergers.dense_motion.sub_exposures import count_variance, sharpened
-from photonpano_core.super_resolution.estimate import (
+from photonpano_core.fine_grid import (
     Observations,
     Patches,
     counts_in_light,
@@ -28,7 +27,8 @@ from photonpano_core.super_resolution.estimate import (
     pixel_area,
     rounds_of,
 )
-from photonpano_core.super_resolution.renderer import SuperResolutionRenderer, add_observations, sums_on
+from photonpano_core.motion_fields import count_variance, sharpened
+from photonpano_core.super_resolution import SuperResolutionRenderer, add_observations, sums_on
 
 SIDE, CHUNKS, FRAMES, FINE = 40, 96, 40, 8
 """Pixels of a side of a frame, its stops, the frames of each, and the samples of the scene along the side of a pixel."""

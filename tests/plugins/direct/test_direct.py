@@ -27,9 +27,8 @@ from photonpano.geometry import (
 from photonpano.locating import NO_TEXTURE, NOTHING_SEEN
 from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano_direct.hooks import DirectConfig
-from photonpano_direct.locator import DirectLocator
+from photonpano_direct.locator import JUDGED, DirectLocator, part_following
 from photonpano_direct.normal_equations import Buffers, Layer, derivative_moments, differentiate, residuals_and_moments
-from photonpano_direct.pyramid import JUDGED, part_following
 
 SHAPE = (160, 240)
 STILL = np.eye(3)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from photonpano import FrameSpan, InputError, SourceContext, discover
-from photonpano_sensors.intensity.mraw import read_header
+from photonpano_sensors.intensity.pictures import read_header
 
 CATALOG = discover()
 PHOTRON = Path(__file__).parents[2] / "data" / "photron"

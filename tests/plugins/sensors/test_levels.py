@@ -11,7 +11,7 @@ from photonpano import FrameSpan, InputError
 from photonpano.contracts.requirements import require_response
 from photonpano.photometry import srgb_to_linear
 from photonpano_sensors.intensity.contributions import FastcamMrawConfig, ResponseConfig
-from photonpano_sensors.intensity.mraw import FastcamMrawSource
+from photonpano_sensors.intensity.pictures import FastcamMrawSource
 from photonpano_sensors.intensity.source import Encoding, LinearLevels, linear_levels
 
 LIMITED = Encoding(8, 16.0, 235.0)

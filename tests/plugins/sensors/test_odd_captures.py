@@ -15,7 +15,7 @@ import tifffile
 from scipy.io import savemat
 
 from photonpano import Arrived, FrameSpan, InputError, PackedSource, Source, SourceContext, Url, discover
-from photonpano_sensors.intensity.mraw import read_header
+from photonpano_sensors.intensity.pictures import read_header
 from photonpano_sensors.intensity.source import Encoding
 
 CATALOG = discover()

@@ -9,7 +9,7 @@ import pytest
 
 from photonpano import SourceContext
 from photonpano.photometry import flux_std
-from photonpano_sensors.spike_dat import SPIKE_DAT, SpikeDatConfig
+from photonpano_sensors.bin_files import SPIKE_DAT, SpikeDatConfig
 
 SHAPE, N_FRAMES, PHOTONS = (40, 50), 300, 20
 

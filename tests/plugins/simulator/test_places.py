@@ -12,10 +12,10 @@ from pydantic import ValidationError
 from photonpano import InputError, SourceContext
 from photonpano.geometry import Camera
 from photonpano_simulator import scenes
+from photonpano_simulator.camera import SpadSensor
 from photonpano_simulator.config import Sensor, SimulatorConfig
 from photonpano_simulator.paths import camera_path, pace
 from photonpano_simulator.scenes import street
-from photonpano_simulator.sensor import SpadSensor
 from photonpano_simulator.source import SimulatorSource
 
 SHAPE = (64, 96)

@@ -16,10 +16,9 @@ from photonpano.geometry import Camera, camera_matrix, corners, positions_of, ro
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
 from photonpano_simulator.paths import camera_path
-from photonpano_simulator.travel.planes import Planes, Scene, View, atlas_of, trace
-from photonpano_simulator.travel.source import TravelSource
-from photonpano_simulator.travel.truth import TravelTruth, depth, flow, read_truth, sharp_view, truth_of
+from photonpano_simulator.travel import TravelSource, TravelTruth, depth, flow, read_truth, sharp_view, truth_of
 from photonpano_simulator.travel_config import TravelConfig
+from photonpano_simulator.travel_planes import Planes, Scene, View, atlas_of, trace
 
 SHAPE = (48, 64)
 K = camera_matrix(60.0, (31.5, 23.5))

@@ -35,7 +35,7 @@ from photonpano.record.contents import changes, fingerprint
 from photonpano.record.schema import CaptureRecord
 from photonpano.testing import MemorySource
 from photonpano.values import Decision
-from photonpano_simulator.travel.truth import sharp_view, truth_of
+from photonpano_simulator.travel import sharp_view, truth_of
 
 DARK = (
     "no pixel is lit in any of {} frames sampled all over the capture; "

@@ -17,9 +17,8 @@ from photonpano import FloatArray, FrameSpan, Group, Response, Source, Trajector
 from photonpano.compiling import compiled
 from photonpano.merging import PhotonSum
 from photonpano_baselines.configs import BurstConfig
-from photonpano_core.mergers.dense_motion.fields import Frames
-from photonpano_core.mergers.dense_motion.sub_exposures import WeightedFrames, count_variance, halved, rescaled, smoothed
-from photonpano_core.mergers.photon_mle import equal_spans, exposure_of, parts_of, require_plain
+from photonpano_core.mergers import equal_spans, exposure_of, parts_of, require_plain
+from photonpano_core.motion_fields import Frames, WeightedFrames, count_variance, halved, rescaled, smoothed
 
 _DETAIL_PX = 1.0  # blur of blocks before they are compared, in px
 _LEVELS = 4  # levels of the pyramid, each of half the size of the one before

@@ -19,7 +19,7 @@ from ruamel.yaml import YAML
 from photonpano.photometry import srgb_to_linear
 from photonpano.specs import load_spec, parse_spec
 from photonpano.values import Reason
-from photonpano_simulator.travel.truth import read_truth, sharp_view
+from photonpano_simulator.travel import read_truth, sharp_view
 
 SPEC = "version: 1\nsource: {use: packed-npy, with: {path: covered.npy}}\n"
 

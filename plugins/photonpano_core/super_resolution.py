@@ -36,7 +36,7 @@ from photonpano.geometry import Canvas, corners, inverse, transform_points, tran
 from photonpano.merging import Chunk, LightTerms, LitFrames, chunks_of, divided
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano_core.configs import SuperResolutionConfig
-from photonpano_core.super_resolution.estimate import STRENGTHS, Observations, coarser, gain_of, pixel_area, rounds_of
+from photonpano_core.fine_grid import STRENGTHS, Observations, coarser, gain_of, pixel_area, rounds_of
 
 Decide = Callable[[str, int | bool, str], None]
 

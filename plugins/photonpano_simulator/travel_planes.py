@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray, InputError
 from photonpano.compiling import compiled
 from photonpano.geometry import Camera
-from photonpano_simulator.views import pixel_grid
+from photonpano_simulator.camera import pixel_grid
 
 _EDGE_ON = 1e-9  # a rectangle is not seen from its plane: the volume that it spans with the camera, relative to that of a box
 

@@ -34,11 +34,10 @@ from numpy.typing import NDArray
 from photonpano import FloatArray
 from photonpano.compiling import compiled
 from photonpano.photometry import srgb_to_linear
+from photonpano_simulator.camera import Draw, generator, texture_of
 from photonpano_simulator.scenes import Chance, Drawing, Names, photograph, pictures_of, read_scene
-from photonpano_simulator.sensor import Draw, generator
-from photonpano_simulator.travel.planes import Planes, Scene
 from photonpano_simulator.travel_config import TravelConfig, WorldObject
-from photonpano_simulator.views import texture_of
+from photonpano_simulator.travel_planes import Planes, Scene
 
 _SPACING_M = 0.1  # distance between the places of a plane at which light is computed
 _MOST_PLACES = 90  # places along a side, at most

@@ -1,1 +1,0 @@
-"""Mergers: the flux of a group of frames along its motion."""

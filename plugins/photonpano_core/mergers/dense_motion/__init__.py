@@ -1,1 +1,0 @@
-"""Motion beyond the global one: a dense field for each group, and what contradicts the global motion."""
