@@ -24,11 +24,13 @@ from photonpano.api.cli.app import app
 from photonpano.capture.writing import truth_path
 from photonpano.geometry import inverse
 
+pytestmark = pytest.mark.documentation
+
 EXAMPLES = Path(__file__).parents[2] / "examples" / "pipelines"
 SMALL = {"source.with.n_frames": 240, "source.with.frame_shape": "[128, 160]", "source.with.path.length_px": 40}
 SMALL_STREET = SMALL | {"source.with.scene": "{kind: street, width: 1024, height: 682}"}
 GROUPS = {"resample.with.group_size": 50}
-UNREFINED = GROUPS | {"refine": "[]", "light": "steady"}
+UNREFINED = GROUPS | {"refine": "[]", "light": "steady", "source.with.frames": "[0, 200]"}
 SHORT = UNREFINED | {"levels": 2}
 """For specs that leave the number of levels to its default: 3 show no more than 2."""
 CROPPED = {"corrections": "[{crop: {rows: [0, 80], columns: [0, 112]}}]"}
