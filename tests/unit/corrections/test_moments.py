@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.capture import before, capture_of
+from photonpano.capture import before
 from photonpano.corrections.moments import showing
 from photonpano.execution.threads import in_order
 from photonpano.geometry import Canvas, translation
@@ -63,20 +63,6 @@ def bright_columns(flux: np.ndarray) -> np.ndarray:
     return flux[44 : 40 + SIDE - 4].mean(axis=0) > BRIGHT / 2
 
 
-def test_a_camera_at_rest_shows_the_background_without_holes() -> None:
-    """All its frames may be warped at once, but not all show the same cells."""
-    flux, said = merged("hide")
-    assert not said
-    assert np.isfinite(flux).all()
-    assert np.nanmax(flux[:, 20:]) < 1
-
-
-def test_all_photons_are_merged_where_movers_are_shown() -> None:
-    flux, said = merged("show")
-    assert not said
-    assert 0.5 < flux[50, 60] < 2
-
-
 @pytest.mark.parametrize("speed_px", [0.0, 0.02])
 @pytest.mark.parametrize("frame", [0, 300, 420])
 def test_movers_are_shown_where_they_were_at_a_frame(frame: int, speed_px: float) -> None:
@@ -98,14 +84,6 @@ def test_an_action_shot_shows_a_mover_several_times_apart_from_itself() -> None:
     assert (np.abs(ends - starts - SIDE) <= 6).all()
     assert np.isfinite(flux).all()
     assert flux[:36].mean() < 0.3
-
-
-def test_nothing_is_said_where_nothing_moves() -> None:
-    source, motion = crossed(0.0)
-    plain = before(source, None)
-    found, decisions = showing(plain, motion, None, "action")
-    assert capture_of(found).background is None
-    assert not decisions
 
 
 @pytest.mark.parametrize("movers", ["hide", "show"])
