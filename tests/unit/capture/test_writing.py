@@ -220,6 +220,16 @@ def test_symbolic_links_are_neither_followed_nor_replaced(tmp_path: Path, plante
     assert (tmp_path / planted).is_symlink()
 
 
+def test_partial_file_longer_than_the_capture_is_cut(tmp_path: Path) -> None:
+    path = tmp_path / "cube.npy"
+    write_packed(RandomSource(20, 6, 19), path)
+    whole = path.read_bytes()
+    path.rename(tmp_path / "cube.npy.part").write_bytes(whole + b"more")
+    found: list[int] = []
+    write_packed(RandomSource(20, 6, 19), path, resumed=found.append)
+    assert (found, path.read_bytes()) == ([20], whole)
+
+
 def test_second_process_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "cube.npy"
 

@@ -118,3 +118,12 @@ def test_still_pixels_masks_nothing_of_moving_scene(flux: float, panned: Callabl
     source = found_in(panned(0.15, flux), corrections)
     assert source.valid.all()
     assert decided(source) == {"still_pixels": 0, "standing_share": 0}
+
+
+def test_still_pixels_masks_nothing_but_records_share_if_most_stands(
+    panned: Callable, street: np.ndarray, corrections: Callable
+) -> None:
+    source = found_in(in_front(panned(0.15), street, slice(0, 96)), corrections)
+    assert source.valid.all()
+    assert decided(source)["standing_share"] == pytest.approx(0.75, abs=0.06)
+    assert "of the frame stands still, so that it is open which part is the scene" in source.decisions[0].reason

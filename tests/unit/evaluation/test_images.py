@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from photonpano import Panorama
 from photonpano.evaluation import (
     corner_errors,
+    covered,
     evaluate,
     image_score,
     true_panorama,
@@ -64,6 +65,13 @@ def test_image_score_compares_pixels_that_are_known_in_both_images_and_asked_for
     score = image_score(panorama, truth, EVERYWHERE, WHITE)
     assert score.psnr_db == np.inf
     assert score.compared_share == pytest.approx(90 * 120 / encoded.size)
+
+
+def test_covered_is_false_for_hardly_seen_pixels():
+    weight = np.full((10, 10), 400, dtype=np.float32)
+    weight[0], weight[1], weight[2] = 0, 19, 20
+    np.testing.assert_array_equal(covered(weight).all(axis=1), [False, False, *[True] * 8])
+    assert not covered(np.zeros((3, 3), dtype=np.float32)).any()
 
 
 def test_true_panorama_samples_scene_through_canvas_and_alignment():

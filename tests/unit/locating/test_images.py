@@ -161,3 +161,16 @@ def test_too_little_overlap_is_rejected_with_its_share(seen_from: Callable) -> N
         "after alignment both exposures see 0% of the image, less than min_overlap = 10%", {"overlap": 0.0}
     )
     assert judged(moving, fixed, translation(235, 0)) == NotLocated("the images overlap by 2% (at least 10% is needed)")
+
+
+def test_implausible_motion_is_rejected(seen_from: Callable) -> None:
+    exposure = seen_from(STILL)
+    assert judged(exposure, exposure, np.diag([-1.0, 1, 1])).reason == "the homography mirrors or folds the image"
+
+
+def test_uncertain_corners_are_rejected(seen_from: Callable) -> None:
+    moving, fixed = (view_of(seen_from(STILL, seed, 0.1), BLUR_PX) for seed in (1, 2))
+    failure = motion_from_images(moving, fixed, STILL, ImageLimits(max_std_px=0.01))
+    assert isinstance(failure, NotLocated)
+    assert "the images leave the corners uncertain by 0." in failure.reason
+    assert failure.reason.endswith("px, more than max_std_px = 0.01")

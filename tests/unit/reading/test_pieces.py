@@ -2,13 +2,14 @@
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from threading import Lock
 
 import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError
-from photonpano.reading import Pieces, PixelOrder, other_order, sampled_spans
+from photonpano.reading import Pieces, PixelOrder, npy_header, other_order, sampled_frames, sampled_spans
 from photonpano.testing.scenes import detected
 
 FRAMES = np.arange(1000, dtype=np.uint16).reshape(1000, 1)
@@ -140,3 +141,10 @@ PLAIN = {
 @pytest.mark.parametrize("scene", PLAIN)
 def test_no_order_is_found_in_noise_plain_light_and_regular_patterns(scene: str, flux: float) -> None:
     assert other_order(samples_of(detected(np.broadcast_to(flux * PLAIN[scene], (256, 64, 96)), 1))) is None
+
+
+def test_file_that_is_cut_short_is_not_sampled(tmp_path: Path) -> None:
+    np.save(tmp_path / "cube.npy", np.zeros((50, 8, 40), np.uint8))
+    header = npy_header(tmp_path / "cube.npy")
+    (tmp_path / "cube.npy").write_bytes((tmp_path / "cube.npy").read_bytes()[:-1])
+    assert sampled_frames(tmp_path / "cube.npy", header) == []
