@@ -203,3 +203,31 @@ def test_changes_name_a_touched_file_and_other_frames_of_the_same_size_and_time(
     np.save(cube, FRAMES[::-1])
     os.utime(cube, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     assert changes(before, fingerprint_of(cube)) == ["the frames are others"]
+
+
+def test_changes_name_another_mask(cube: Path, tmp_path: Path) -> None:
+    mask = tmp_path / "mask.npy"
+    np.save(mask, np.zeros((16, 24), bool))
+    corrections = [{"mask": {"file": str(mask)}}]
+    before, stat = fingerprint_of(cube, corrections=corrections), mask.stat()
+    np.save(mask, np.eye(16, 24) == 1)
+    os.utime(mask, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    after = fingerprint_of(cube, corrections=corrections)
+    assert changes(before, after) == ["the mask or another correction gives other pixels"]
+    assert changes(fingerprint_of(cube), before) == [f"{mask} is read as well"]
+
+
+def test_fingerprint_of_a_folder_leaves_out_runs_in_it(tmp_path: Path) -> None:
+    for index in range(2):
+        (tmp_path / f"RAW{index:05}.bin").write_bytes(bytes(512 * 512 // 8 * 64))
+    plan_of = {"version": 1, "source": {"use": "spad512", "with": {"path": str(tmp_path)}}, "corrections": []}
+    plan = parse_spec(plan_of)
+    with open_source(plan) as source:
+        before = fingerprint(plan, source)
+        (tmp_path / "runs" / "scan").mkdir(parents=True)
+        for name in ("run.json", "big.bin"):
+            (tmp_path / "runs" / "scan" / name).write_bytes(b"content")
+        (tmp_path / "notes.txt").write_text("a note")
+        assert changes(before, fingerprint(plan, source)) == []
+        (tmp_path / "more.bin").write_bytes(b"content")
+        assert changes(before, fingerprint(plan, source)) == [f"{tmp_path} has another size"]

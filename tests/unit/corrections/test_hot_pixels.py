@@ -59,6 +59,17 @@ def test_edges_and_lines_of_the_scene_are_not_hot(corrections: Callable) -> None
     assert source.valid.mean() > 0.999
 
 
+@pytest.mark.parametrize("every", [2, 3])
+def test_masked_pixels_are_not_used_as_neighbours(every: int, corrections: Callable, tmp_path: Path) -> None:
+    """They are so bright that nothing would stand out among them. Of every third column, too few are left to tell."""
+    bad, hot = np.broadcast_to(np.arange(SHAPE[1]) % every != 0, SHAPE), hot_ones()
+    np.save(tmp_path / "bad.npy", bad)
+    frames = exposed(np.where(bad, 3.0, 0.1) + 0.4 * hot)
+    source = corrected_source(MemorySource(frames), corrections({"mask": {"file": "bad.npy"}}, "hot-pixels"))
+    assert source.valid[~bad & ~hot].all()
+    assert (source.valid[~bad & hot].mean() < 0.2) == (every == 2)
+
+
 FRAME, N_PANNED = (96, 128), 640
 
 
@@ -118,6 +129,14 @@ def test_still_pixels_masks_nothing_of_moving_scene(flux: float, panned: Callabl
     source = found_in(panned(0.15, flux), corrections)
     assert source.valid.all()
     assert decided(source) == {"still_pixels": 0, "standing_share": 0}
+
+
+def test_still_pixels_masks_nothing_if_all_stands(panned: Callable, corrections: Callable) -> None:
+    """Light that drifts is no motion."""
+    light = np.linspace(0.7, 1.3, N_PANNED)[:, None, None]
+    source = found_in(1 - (1 - panned(0.0)) ** light, corrections)
+    assert source.valid.all()
+    assert decided(source)["standing_share"] == 0
 
 
 def test_still_pixels_masks_nothing_but_records_share_if_most_stands(

@@ -96,6 +96,17 @@ def test_masked_frames_count_in_no_sum(source: MemorySource, corrections: Callab
     assert np.isnan(binned_mean(capture, FrameSpan(20, 30))[bad]).all()
 
 
+def test_masks_that_leave_no_pixel_in_some_frames_are_refused(refused: Callable, tmp_path: Path) -> None:
+    half = np.arange(10) < 5
+    for name, bad in (("left", half), ("right", ~half), ("all", half | True)):
+        np.save(tmp_path / f"{name}.npy", np.broadcast_to(bad, SHAPE))
+    masks = [{"mask": {"file": f"{name}.npy", "frames": span}} for name, span in (("left", [10, 30]), ("right", [20, 40]))]
+    left_over = "mask leaves no pixel that may be used in frames 20 to 29; mask less of them, or read other frames"
+    assert refused(*masks) == refused(*masks[::-1]) == left_over
+    assert refused(masks[0], {"mask": {"file": "right.npy"}}) == left_over.replace("20", "10")
+    assert refused({"mask": {"file": "all.npy"}}) == "mask leaves no pixel that may be used"
+
+
 def pattern_of(red: np.ndarray) -> np.ndarray:
     return np.where(red[..., None], np.uint8(RED), np.uint8(WHITE))
 

@@ -67,6 +67,15 @@ def test_image_score_compares_pixels_that_are_known_in_both_images_and_asked_for
     assert score.compared_share == pytest.approx(90 * 120 / encoded.size)
 
 
+def test_image_score_clips_at_white(encoded):
+    truth = flux_of(encoded)
+    truth[50:60, 50:60] = WHITE
+    panorama = truth.copy()
+    panorama[50:60, 50:60] = 10 * WHITE
+    score = image_score(panorama, truth, EVERYWHERE, WHITE)
+    assert (score.psnr_db, score.ssim, score.compared_share) == (np.inf, pytest.approx(1), 1)
+
+
 def test_covered_is_false_for_hardly_seen_pixels():
     weight = np.full((10, 10), 400, dtype=np.float32)
     weight[0], weight[1], weight[2] = 0, 19, 20
@@ -215,3 +224,13 @@ def test_corner_errors_of_random_shifts_follow_rayleigh_distribution(true_motion
     assert score.median_px == pytest.approx(0.4 * np.sqrt(2 * np.log(2)), rel=0.04)
     assert score.p95_px == pytest.approx(0.4 * np.sqrt(-2 * np.log(0.05)), rel=0.04)
     assert score.max_px == score.errors_px.max()
+
+
+def test_corner_errors_ignore_frames_that_are_not_located(true_motion, frame_shape):
+    estimated = true_motion.copy()
+    estimated[:30] = normalised(true_motion[:30] @ translation(40, 0))
+    located = np.arange(len(true_motion)) >= 30
+    score = corner_errors(estimated, true_motion, frame_shape, located)
+    assert score.max_px < 1e-6
+    assert score.located_share == 0.75
+    np.testing.assert_allclose(score.errors_px[:30], 40, atol=1e-5)

@@ -88,6 +88,12 @@ def test_perfect_poses_have_no_error() -> None:
     assert score.honest_shares is None
 
 
+def test_mirrored_poses_are_not_right() -> None:
+    mirrored = path() * np.array([-1.0, 1, 1])[:, None]
+    mirrored[:, :, 0] *= -1
+    assert pose_errors(mirrored, path(), np.ones(N_FRAMES, bool), 10).ate_m > 0.01
+
+
 def test_command_prints_ate_and_rpe(folder: Path, tmp_path: Path) -> None:
     arguments = ["evaluate", str(folder), "--truth", str(tmp_path / "truth.npz")]
     done = CliRunner().invoke(app, arguments)

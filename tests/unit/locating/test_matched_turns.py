@@ -145,6 +145,10 @@ def test_wrong_matches_alone_are_rejected(guided: bool) -> None:
         assert isinstance(motion, NotLocated), (seed, motion)
 
 
+def test_too_few_matches_are_rejected() -> None:
+    assert reason(turn(matches(4))) == "4 matches, and a rotation needs 5"
+
+
 def test_one_structure_that_matches_often_counts_once() -> None:
     once = matches(4)
     jitter = np.random.default_rng(0).normal(0, 0.5, (20, 1, 2))
@@ -158,6 +162,13 @@ def test_matches_in_a_spot_or_strip_are_rejected() -> None:
     strip = np.abs(every.moving[:, 1] - 80) < 20
     found = turn(Matches(every.moving[strip], every.fixed[strip], guided=False))
     assert reason(found).endswith("matches agree, but lie in a spot or strip of 12 px (at least 16 px are needed)")
+
+
+def test_implausible_rotation_is_rejected() -> None:
+    points = np.random.default_rng(0).uniform((150, 0), (239, 159), (40, 2))
+    far = scaled_ahead(CAMERA.homographies(rotation_matrices([0.0, -0.6, 0.0])))
+    found = reason(turn(Matches(points, transform_points(far, points), guided=False)))
+    assert found == "the homography changes the area of the image by a factor of 2.1 (at most 2 is plausible), from 39 matches"
 
 
 @given(right=st.integers(0, 20), wrong=st.integers(0, 20), seed=st.integers(0, 2**32 - 1), spot=st.booleans())

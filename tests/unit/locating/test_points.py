@@ -55,6 +55,13 @@ def test_motion_from_points_fits_inliers_and_counts_outliers() -> None:
     assert motion.evidence == {"keypoints": 400, "matches": 120, "inliers": 90}
 
 
+def test_second_round_adds_inliers_that_initial_motion_missed() -> None:
+    start = translation(1.8, 0) @ TRUE
+    once, twice = (located(motion_from_points(*matches(), start, SHAPE, LIMITS, rounds=rounds)) for rounds in (1, 2))
+    assert once.evidence["inliers"] < 90
+    assert twice.evidence["inliers"] == 120
+
+
 def test_too_few_inliers_are_rejected_with_their_number() -> None:
     failure = lost(motion_from_points(*matches(40, wrong=29), NEAR, SHAPE, LIMITS))
     assert failure.reason == "11 of 40 matches lie within 2 px of the motion, fewer than min_inliers = 12"
@@ -67,6 +74,18 @@ def test_clustered_points_are_rejected_for_uncertain_corners() -> None:
     failure = lost(motion_from_points(points[near], moved[near], TRUE, SHAPE, PointLimits(max_std_px=0.5)))
     assert failure.reason.startswith(f"{near.sum()} inliers leave the corners of the frame uncertain by ")
     assert failure.reason.endswith(" px, more than max_std_px = 0.5")
+
+
+@pytest.mark.parametrize(
+    ("start", "reason"),
+    [
+        (np.diag([0.5, 0.5, 1]), "the homography changes the area of the image by a factor of 0.25 (at most 2 is plausible)"),
+        (np.full((3, 3), np.nan), "the homography is not finite"),
+    ],
+    ids=["shrinks", "nan"],
+)
+def test_implausible_initial_motion_is_rejected(start: np.ndarray, reason: str) -> None:
+    assert lost(motion_from_points(*matches(), start, SHAPE, LIMITS)).reason == f"{reason}, from 120 matches"
 
 
 @given(count=st.integers(0, 30), seed=st.integers(0, 2**32 - 1), degenerate=st.booleans())

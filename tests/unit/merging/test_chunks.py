@@ -28,6 +28,13 @@ def test_chunks_of_splits_pan_where_it_moved_by_tolerance(pan: Callable) -> None
     assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 7), pan(3), SHAPE, 0.25)] == [1] * 7
 
 
+@pytest.mark.parametrize("zoom", [0.5, 2.0])
+def test_chunks_of_measures_tolerance_in_frame_pixels(known_motion: type, zoom: float) -> None:
+    """The number of chunks does not depend on the scale of the reference plane."""
+    motion = known_motion(lambda frame: np.diag([zoom, zoom, 1.0]) @ translation(0.125 * frame, 0))
+    assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 8), motion, SHAPE, 0.5)] == [4, 4]
+
+
 wobbles = st.tuples(*[st.floats(-2e-3, 2e-3)] * 4, *[st.floats(-1, 1)] * 2, *[st.floats(-1e-6, 1e-6)] * 2)
 
 

@@ -39,6 +39,16 @@ def test_plan_canvas_refuses_canvas_far_beyond_memory(pan: Callable) -> None:
     )
 
 
+@pytest.mark.parametrize(("scale", "memory"), [(8.0, GIB // 8), (1.0, GIB // 256), (0.9, GIB // 256)])
+def test_plan_canvas_suggests_largest_scale_that_fits(pan: Callable, scale: float, memory: int) -> None:
+    with pytest.raises(CanvasTooLargeError) as caught:
+        plan_canvas(pan(5), ALL, (1000, 2000), scale, memory)
+    suggested = float(str(caught.value).split(f"render.scale from {scale:g} to ")[1].split(",")[0])
+    plan_canvas(pan(5), ALL, (1000, 2000), suggested, memory)
+    with pytest.raises(CanvasTooLargeError):
+        plan_canvas(pan(5), ALL, (1000, 2000), 1.1 * suggested, memory)
+
+
 def test_plan_canvas_refuses_turn_to_the_horizon(known_motion: type) -> None:
     motion = known_motion(lambda frame: from_parameters([0, 0, 0, 0, 0, 0, -frame / N / 20, 0]))
     with pytest.raises(LocationError) as caught:

@@ -110,6 +110,14 @@ def test_measurable_range_ends_at_noise_and_at_saturation(frames: int, dark: flo
     assert found.low == pytest.approx(bound(found.low, dark, frames), rel=0.02)
 
 
+def test_measurable_range_through_a_vignette_is_as_without() -> None:
+    """Its correction is a line around the mean count, which at low flux promises photons that there are not."""
+    found, plain = measurable_range(N, BinaryResponse(), 1.2, 0.04), measurable_range(N, BinaryResponse())
+    assert found is not None
+    assert plain is not None
+    assert found.decibels == pytest.approx(plain.decibels, abs=5)
+
+
 N_SIMILAR = 20_000
 
 

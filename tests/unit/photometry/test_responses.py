@@ -42,6 +42,11 @@ def test_flux_of_saturated_pixel_is_that_of_half_a_dark_frame(frames: int) -> No
     assert RESPONSE.flux(f32(1 - 1 / frames), frames) < RESPONSE.flux(f32(1), frames)
 
 
+def test_flux_clips_means_above_1_and_keeps_nan() -> None:
+    flux = RESPONSE.flux(f32(1.0000001, np.nan, -1e-9), f32(10, 10, 10))
+    np.testing.assert_allclose(flux, [np.log(20), np.nan, 0], rtol=1e-6)
+
+
 @pytest.mark.parametrize("frames", [100, 400])
 def test_stabilised_noise_is_uniform(frames: int) -> None:
     """The standard deviation of 20,000 draws has an error of 0.5 %; the rest is that of the approximation."""
