@@ -13,7 +13,7 @@ from photonpano import FrameSpan
 from photonpano.geometry import Camera
 from photonpano.motion.graph import Freed, Rival
 from photonpano.motion.loop import LevelResult
-from photonpano.motion.model import MotionModel
+from photonpano.motion.model import SAME_LENS_PX, MotionModel
 from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
 from photonpano.residuals.halves import Agreements, Halves
@@ -236,6 +236,21 @@ def level_with(
     )
     level.narrow = LevelResult.narrow.fget(level)
     return level
+
+
+@pytest.mark.parametrize(("times", "deviance", "doubtful"), [(9.0, 0.0, False), (2.0, 40.0, False), (9.0, 40.0, True)], ids=str)
+def test_model_that_holds_less_than_the_motion_is_doubtful(
+    explained: Explained, times: float, deviance: float, doubtful: bool
+) -> None:
+    """Homographies are likelier, and farther away than the motion is expected to err."""
+    rivals = {"homography": Rival(1.0, 232, 0.0, times * float(np.hypot(1, SAME_LENS_PX))), "affine": Rival(1.0, 88, deviance)}
+    reasons = judge(explained, [level_with(None, rivals, model=MotionModel("affine"))]).reasons
+    assert [(reason.what, pytest.approx(reason.figure)) for reason in reasons] == [(NARROW, times)] * doubtful
+    assert all("affine" in reason.where for reason in reasons)
+    # More light would not help: the distance to homographies is in the expected error.
+    unsure = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + 3))
+    [reason] = judge(unsure, [level_with(None, rivals, model=MotionModel("affine"))]).reasons
+    assert (reason.what == NARROW) == doubtful
 
 
 FIND = "camera: {distortion: {k1: find}}"
