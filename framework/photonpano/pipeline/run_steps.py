@@ -29,7 +29,7 @@ from photonpano.pipeline.summary import require_photons
 from photonpano.record.contents import capture_files, fingerprint
 from photonpano.record.run_json import level_record, peak_memory_bytes, started_record, verdict_of
 from photonpano.record.schema import CaptureRecord, RunRecord
-from photonpano.report import loading_figures, render_failure
+from photonpano.report import render_failure
 from photonpano.specs.plan import Plan
 from photonpano.values import Decision, Verdict
 
@@ -100,7 +100,6 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
         notify_on_first_compile(partial(progress.note, COMPILING)),
         open_source(plan) as source,
         run_folder(plan.output.directory, overwrite=overwrite, inputs=read) as folder,
-        loading_figures(),
         one_thread_inside(),
     ):
         run = BegunRun(plan, source, folder, observers, progress, time.perf_counter())

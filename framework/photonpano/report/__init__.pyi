@@ -1,4 +1,3 @@
-from .drawing import loading_figures as loading_figures
 from .live_page import LiveFigures as LiveFigures
 from .live_page import render_live as render_live
 from .other_pages import ComparedRun as ComparedRun

@@ -6,11 +6,9 @@ The page's style sheet decides the colours of a figure, for light, dark and prin
 from __future__ import annotations
 
 import base64
-import importlib
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -73,14 +71,6 @@ _STYLE: Any = {
     "lines.solid_joinstyle": "round",
     "legend.frameon": False,
 }
-
-
-@contextmanager
-def loading_figures() -> Iterator[None]:
-    """Import matplotlib in another thread while the block runs: it takes a second that nothing waits for."""
-    with ThreadPoolExecutor(1) as aside:
-        aside.submit(lambda: [importlib.import_module(f"matplotlib.{name}") for name in ("figure", "backends.backend_svg")])
-        yield
 
 
 @contextmanager
