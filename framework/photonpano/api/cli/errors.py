@@ -5,6 +5,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,19 +23,28 @@ SIGNALLED = 128  # plus the number of the signal: 130 for Ctrl-C
 INTERRUPTED = "\ninterrupted; no file is left half-written under its final name"
 
 
+_CALLBACKS = "llvmlite.binding.executionengine"  # what is raised in them is lost
+_LATER_S = 0.01
+
+
 class Signalled(KeyboardInterrupt):
-    """SIGTERM or SIGHUP: they end a command as Ctrl-C does, with exit codes of their own."""
+    """SIGINT, SIGTERM or SIGHUP: they end a command, with exit codes of their own."""
 
 
 def end_on_signals() -> None:
     """Have SIGTERM and SIGHUP end the program as Ctrl-C does, unless the caller ignores them, as `nohup` does SIGHUP."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    del frame
+    """Raise `Signalled`; a moment later if LLVM, which loads compiled code, has called Python just now."""
+    while frame is not None:
+        if frame.f_globals.get("__name__") == _CALLBACKS:
+            threading.Timer(_LATER_S, os.kill, (os.getpid(), number)).start()
+            return
+        frame = frame.f_back
     raise Signalled(number)
 
 
