@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
@@ -121,8 +121,8 @@ class Adjustment(ABC, Generic[StateT]):
         """Return the maps from pixels of each node's frame to those of the anchor's: (N, 3, 3)."""
 
     @abstractmethod
-    def changed(self, state: StateT, nodes: FloatArray, shared: FloatArray) -> Iterator[StateT]:
-        """Yield states after a step, of which the best is taken: (N, k) changes of the nodes, and (s,) of what they share."""
+    def changed(self, state: StateT, nodes: FloatArray, shared: FloatArray) -> StateT:
+        """Return the state after a step: (N, k) changes of the nodes, and (s,) of what they share."""
 
     def anchored(self, state: StateT) -> StateT:
         """Return the state without rounding errors of the anchor."""
@@ -291,19 +291,16 @@ class Adjustment(ABC, Generic[StateT]):
 
         A chain of many frames is far from linear: the perspective of the first bends the path of all others.
         """
-        n_nodes, best, least = self._n_node * self._n_nodes, None, cost * (1 + NO_WORSE)
+        n_nodes = self._n_node * self._n_nodes
         for _ in range(MAX_HALVINGS):
             # Too large a step may leave homographies that cannot be inverted.
             with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):
-                for changed in self.changed(state, step[:n_nodes].reshape(self._n_nodes, -1), step[n_nodes:]):
-                    norms = self._norms(changed)
-                    cost = float(8 * weights @ norms**2) + float((self.prior(changed).residuals ** 2).sum())
-                    if cost <= least:
-                        best, least = (changed, norms), cost
-            if best is not None:
-                break
+                changed = self.changed(state, step[:n_nodes].reshape(self._n_nodes, -1), step[n_nodes:])
+                norms = self._norms(changed)
+                if 8 * weights @ norms**2 + float((self.prior(changed).residuals ** 2).sum()) <= cost * (1 + NO_WORSE):
+                    return changed, norms
             step = step / 2
-        return best
+        return None
 
     def _free(self, state: StateT) -> BoolArray:
         """The unknowns of all nodes but the anchor, and those that are shared: (k N + s,)."""

@@ -27,7 +27,7 @@ from photonpano.motion.adjustment import Adjustment, Assessment, Problem
 from photonpano.motion.consensus import agreed_share, agreeing, contradicting, layers, tolerances_px, travelled
 from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
 from photonpano.motion.pairs import GYROSCOPE, TIE, adjacency, component_labels, instants_of
-from photonpano.motion.planar import PlanarAdjustment, PlanarName, nearest
+from photonpano.motion.planar import PlanarAdjustment, PlanarName, Plane, nearest
 from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, FrameSpan, Group, Located
 
@@ -156,7 +156,7 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
         if _in_front(free.homographies, tied.frame_shape):
             assert isinstance(free.adjustment, PlanarAdjustment)
             # Where all that is left of homographies is that perspective follows the shift, they are rotations.
-            still = free.adjustment.is_coupled and not free.adjustment.walks_px(free.state)
+            still = free.adjustment.is_coupled and not free.adjustment.walks_px
             fits[plane] = _planar(tied, start, "euclidean") if still else _nearer(tied, start, free)
             if not free.adjustment.is_coupled:
                 return fits
@@ -310,7 +310,7 @@ def _planar(tied: _Tied, start: FloatArray | None, model: PlanarName) -> _Fit:
     given = tied.given(start)
     found = nearest(model, tied.problem.observed if given is None else given, tied.frame_shape)
     adjustment = PlanarAdjustment(tied.problem, model)
-    return tied.fit(adjustment, adjustment.starting(tied.composed(found) if given is None else found))
+    return tied.fit(adjustment, Plane(tied.composed(found) if given is None else found))
 
 
 def _nearer(tied: _Tied, start: FloatArray | None, fit: _Fit) -> _Fit:
@@ -456,7 +456,7 @@ class _Tied:
             partial(assess, found, fit.norms, fit.kept),
             model,
             found if isinstance(found, Rotations) else None,
-            adjustment.walks_px(found) if isinstance(adjustment, PlanarAdjustment) else {},
+            adjustment.walks_px if isinstance(adjustment, PlanarAdjustment) else {},
             adjustment.turning_px(found) if isinstance(adjustment, PlanarAdjustment) else None,
             compare,
             self.layers,

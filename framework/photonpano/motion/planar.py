@@ -3,16 +3,12 @@
 A homography has eight numbers; most cameras move by fewer. From each exposure to the next one in time, the image shifts and
 rolls by any amount. Its zoom, two shears and two perspectives are normally distributed, with variances that grow with the time
 between both exposures, and that are estimated from the pairs. Where nothing zooms, the variance of the zoom goes to zero, and
-with it the zoom.
-
-What no two exposures show adds up over a capture where it goes on in one direction. So each walk may drift in proportion to
-the shift, as before a wall that a camera flies past; and a camera that turns changes perspective by -1 / f^2 of the shift.
-These couplings are estimated, too, and the walk is what is left.
+with it the zoom. A camera that turns changes perspective in proportion to the shift, by -1 / f^2: this coupling is estimated,
+too, and the walk is what perspective does beyond it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import accumulate
 from typing import Literal, NamedTuple
 
@@ -40,7 +36,6 @@ PLANAR_NAMES: tuple[PlanarName, ...] = tuple(_MOVED)
 _FREE = 3  # the first of these motions have no prior
 _WALKS = ("zoom", "shear of the axes", "shear of the diagonals", "perspective along x", "perspective along y")
 _PERSPECTIVE = slice(3, 5)  # of the walks
-_SHIFT = slice(4, 6)  # of p1..p8
 _TERMS = 12  # of the exponential and the logarithmic series
 _HALVINGS = 2  # of a logarithm, by square roots, before its series
 _ROOTS = 8  # Newton steps of a square root
@@ -126,7 +121,6 @@ class Plane(NamedTuple):
     """The homographies of the exposures of a graph."""
 
     homographies: FloatArray  # (N, 3, 3) to the anchor's frame
-    drifts: FloatArray  # (w, 2) by how much each walk goes on as the image shifts by 1 along x, and along y
     coupling: float = 0.0  # perspective that a shift brings along, in unit coordinates: -(s / f)^2 for a camera that turns
 
 
@@ -160,19 +154,18 @@ class PlanarAdjustment(Adjustment[Plane]):
     """The least-squares problem of a graph of homographies.
 
     The unknowns of a node are those of a small motion of its own frame, in coordinates of about unit size. All share the
-    drifts of the walks, and the coupling of perspective to shift, where the model has both.
+    coupling of perspective to shift, where the model has both.
 
     Attributes:
-        variances: of the prior, in squares of unit coordinates: of each walk per frame, (w,), and of each number that
-            all share: the drifts of the walks, and then the coupling.
+        variances: of the prior, in squares of unit coordinates: of each walk per frame, (w,), and then of the coupling.
     """
 
     def __init__(self, problem: Problem, model: PlanarName, *, bends: bool = False) -> None:
         """Set up the problem; `bends` has a model without perspective share the coupling, too."""
         self._problem, self._model, self._basis = problem, model, basis_of(model)
         self._n_walks = max(self._basis.shape[1] - _FREE, 0)
-        self._bends, self._couples = bends, model == "homography" or bends
-        super().__init__(problem, n_shared=2 * self._n_walks + int(self._couples))
+        self._bends = bends
+        super().__init__(problem, n_shared=int(model == "homography" or bends))
         # Nodes are in order of time; those of one instant make no step.
         self._times = np.maximum(np.diff(problem.instants), 1.0)
         self._durations = np.array([max(float(self._times.sum()), 1.0)] * self._n_walks + [1.0] * self._n_shared)
@@ -183,64 +176,24 @@ class PlanarAdjustment(Adjustment[Plane]):
     def _n_node(self) -> int:
         return int(self._basis.shape[1])
 
-    def walks_px(self, state: Plane) -> dict[str, float]:
-        """How far each walk moves the ends of a frame over the capture, in px: a standard deviation; none that are 0."""
-        drifted = state.drifts @ self._steps(state)[1][:, _SHIFT].sum(axis=0)
-        ends_px = np.hypot(np.sqrt(self.variances * self._durations)[: self._n_walks], drifted) * self._half
-        return {name: float(px) for name, px, there in zip(_WALKS, ends_px, self._there, strict=False) if there}
-
     @property
-    def _there(self) -> BoolArray:
-        """Which walks are there, by their steps or a drift, and whether the coupling is: (w,) or (w + 1,)."""
-        there, w = self.variances * self._durations > _NONE**2, self._n_walks
-        return np.append(there[:w] | there[w : 3 * w].reshape(w, 2).any(axis=1), there[3 * w :])
+    def walks_px(self) -> dict[str, float]:
+        """How far each walk moves the ends of a frame over the capture, in px: a standard deviation; none that are 0."""
+        ends_px = np.sqrt(self.variances * self._durations) * self._half
+        return {name: float(px) for name, px in zip(_WALKS, ends_px[: self._n_walks], strict=False) if px > _NONE * self._half}
 
     @property
     def n_hyperparameters(self) -> int:
         """How many variances were estimated."""
-        return int((self.variances * self._durations > _NONE**2).sum())
-
-    def starting(self, homographies: FloatArray) -> Plane:
-        """Return a state of (N, 3, 3) homographies from which to begin."""
-        return Plane(homographies, np.zeros((self._n_walks, 2)))
+        return int((self.variances > _NONE**2 / self._durations).sum())
 
     def homographies(self, state: Plane) -> FloatArray:
         """Return those of the state."""
         return state.homographies
 
-    def changed(self, state: Plane, nodes: FloatArray, shared: FloatArray) -> Iterator[Plane]:
-        """Yield the homographies after a step, of each by itself, and of each motion from one to the next.
-
-        Walks that are none hold the latter to a manifold, from which the former leads away.
-        """
-        drifts, coupling = shared[: 2 * self._n_walks].reshape(-1, 2), float(shared[2 * self._n_walks :].sum())
-        alone = moved(state.homographies, nodes, self._basis, self._frame_shape)
-        there = Plane(alone, state.drifts + drifts, state.coupling + coupling)
-        yield there
-        if self._n_walks and len(alone) > 1:
-            relative, motions = self._steps(state)
-            moves = nodes @ self._basis.T
-            changes = np.einsum("nbpk,nbk->np", self._of_nodes(relative, motions), np.stack([moves[:-1], moves[1:]], axis=1))
-            steps = moved(np.broadcast_to(np.eye(3), relative.shape), motions + changes, np.eye(8), self._frame_shape)
-            chain = np.stack(list(accumulate(steps, lambda before, step: scaled_ahead(before @ step), initial=np.eye(3))))
-            yield there._replace(homographies=scaled_ahead(alone[self._anchor] @ inverse(chain[self._anchor]) @ chain))
-
-    def _steps(self, state: Plane) -> tuple[FloatArray, FloatArray]:
-        """Return the motions from each node to the next, (N - 1, 3, 3), and their logarithms, (N - 1, 8)."""
-        relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
-        return relative, logarithms(relative, self._frame_shape)
-
-    def _of_nodes(self, relative: FloatArray, motions: FloatArray) -> FloatArray:
-        """Return the derivatives of the logarithms by motions of the node before, and of that after: (N - 1, 2, 8, 8).
-
-        They are the first terms of the series of Baker, Campbell and Hausdorff.
-        """
-        before = inverse(relative)[:, None] @ generators(self._frame_shape) @ relative[:, None]
-        moves = np.stack([-before, np.broadcast_to(generators(self._frame_shape), before.shape)], axis=1)
-        motion = np.einsum("np,pij->nij", motions, generators(self._frame_shape))[:, None, None]
-        once = motion @ moves - moves @ motion
-        twice = motion @ once - once @ motion
-        return np.swapaxes(_coordinates(moves + once / 2 + twice / 12, self._frame_shape), 2, 3)
+    def changed(self, state: Plane, nodes: FloatArray, shared: FloatArray) -> Plane:
+        """Return the homographies after a step."""
+        return Plane(moved(state.homographies, nodes, self._basis, self._frame_shape), state.coupling + float(shared.sum()))
 
     def anchored(self, state: Plane) -> Plane:
         """Return the homographies, of which the anchor's is the identity."""
@@ -253,7 +206,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         return np.asarray(np.einsum("pk,pij->kij", self._basis, generators(self._frame_shape)))
 
     def prior(self, state: Plane) -> Prior:
-        """Return the steps of the walks from each node to the next, their drifts, and the coupling."""
+        """Return the steps of the walks from each node to the next, and the coupling."""
         if not (parts := self._components(state)):
             return super().prior(state)
         stds = np.repeat(np.sqrt(self.variances), [len(part.residuals) for part in parts])
@@ -277,22 +230,22 @@ class PlanarAdjustment(Adjustment[Plane]):
             self.variances = assumed**2 / self._durations
             return bool(changed.any())
         before, problem = self.variances, self._around(state, weights)
-        # The variances of the drifts and the coupling are exact; others are those of draws.
-        shared, last = np.eye(problem.right.shape[0])[:, -self._n_shared :], np.zeros(len(before))
+        # The variance of the last shared unknown, the coupling, is exact; others are those of draws.
+        alone = np.zeros((problem.right.shape[0], 1))
+        alone[-1], last = self._n_shared, np.zeros(len(before))
         for _ in range(_ROUNDS):
             scales = np.ones((len(before), _DRAWS + 1)) / np.sqrt(self.variances)[:, None]
             scales[:, 0] **= 2
             given = problem.right + sum(side * scale for side, scale in zip(problem.sides, scales, strict=True))
-            changes = problem.factors(self.variances).solve(np.column_stack([given, shared]))
-            covariances = changes[-self._n_shared :, -self._n_shared :]
+            changes = problem.factors(self.variances).solve(np.column_stack([given, alone]))
             found = np.empty(len(before))
             for index, (part, variance) in enumerate(zip(problem.parts, self.variances, strict=True)):
-                moves, number = part.slopes @ changes[:, : 1 + _DRAWS], len(part.residuals)
-                left, place = part.residuals - moves[:, 0], index - self._n_walks
-                unsure = (moves[:, 1:] ** 2).sum() / _DRAWS if place < 0 else covariances[place, place]
+                moves, number = part.slopes @ changes, len(part.residuals)
+                left = part.residuals - moves[:, 0]
+                unsure = (moves[:, 1:-1] ** 2).sum() / _DRAWS if index < self._n_walks else changes[-1, -1]
                 found[index] = (left @ left) / max(number - unsure / variance, 1e-3 * number)
             # Steps that go on in one direction, as those to zero, are doubled.
-            self._of_coupling = float(covariances[-1, -1])
+            self._of_coupling = float(changes[-1, -1])
             step = np.log(np.maximum(found / self.variances, np.exp(-_MOST)))
             step, last = np.clip(np.where(step * last > 0, 2 * step, step), -_MOST, _MOST), step
             step = np.maximum(step, np.log(_NONE**2 / self._durations / self.variances))
@@ -300,7 +253,7 @@ class PlanarAdjustment(Adjustment[Plane]):
             if np.abs(step).max() < _SETTLED:
                 break
         least = problem.deviance(self.variances)
-        for index in range(3 * self._n_walks):  # none by which errors become larger
+        for index in range(self._n_walks):  # none by which errors become larger
             without = self.variances.copy()
             without[index] = _NONE**2 / self._durations[index]
             if without[index] < self.variances[index] and (other := problem.deviance(without)) < least + _WORTH:
@@ -325,7 +278,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         As many of the drawn errors as it is likely that perspective follows the shift (weights of Akaike) are those with it.
         """
         own = self.assess(state, norms, kept)
-        if self._couples:
+        if self._n_shared:
             return own
         bent = PlanarAdjustment(self._problem, self._model, bends=True)
         bent._noise_norm, bent.variances = self._noise_norm, np.append(self.variances, 1.0)
@@ -345,19 +298,15 @@ class PlanarAdjustment(Adjustment[Plane]):
         """Return the derivatives of the corners that each edge maps by the coupling, which the path follows."""
         if not self._bends:
             return super().shared_slopes(state)
-        there = self.mapped_corners(state._replace(homographies=self._bent(state))) - self.mapped_corners(state)
-        return self._by_coupling(there / _BEND)
+        there = self.mapped_corners(Plane(self._bent(state))) - self.mapped_corners(state)
+        return np.asarray(there.reshape(-1, 8, 1) / _BEND)
 
     def shared_errors(self, state: Plane) -> FloatArray:
         """Return the derivatives of the corners of each node's frame by the coupling."""
         if not self._bends:
             return super().shared_errors(state)
         there = transform_points(inverse(state.homographies) @ self._bent(state), self._corners) - self._corners
-        return self._by_coupling(there / _BEND)
-
-    def _by_coupling(self, corners: FloatArray) -> FloatArray:
-        """Return (N, 4, 2) derivatives by the coupling as those by all that is shared: (N, 8, s)."""
-        return np.pad(corners.reshape(-1, 8, 1), ((0, 0), (0, 0), (2 * self._n_walks, 0)))
+        return np.asarray(there.reshape(-1, 8, 1) / _BEND)
 
     def _bent(self, state: Plane) -> Homography:
         """Return the homographies of a path of the same shifts and rolls, along which perspective follows the shift."""
@@ -368,54 +317,55 @@ class PlanarAdjustment(Adjustment[Plane]):
 
     def narrowed(self, state: Plane) -> tuple[PlanarAdjustment, Plane]:
         """Return the problem without walks that are none, and the nearest state that it holds."""
-        most = int(np.flatnonzero(self._there).max(initial=-1)) + 1
+        there = self.variances > _NONE**2 / self._durations
+        most = int(np.flatnonzero(there).max(initial=-1)) + 1
         model = next(name for name in PLANAR_NAMES[1:] if len(_MOVED[name]) - _FREE >= min(most, len(_WALKS)))
         if len(_MOVED[model]) >= self._n_node:
             return self, state
-        narrow, w = PlanarAdjustment(self._problem, model), self._n_walks
-        n = narrow._n_walks
-        narrow.variances = np.concatenate([self.variances[:n], self.variances[w : w + 2 * n]])
-        narrow._noise_norm = self._noise_norm
-        return narrow, Plane(nearest(model, state.homographies, self._frame_shape), state.drifts[:n])
+        narrow = PlanarAdjustment(self._problem, model)
+        narrow.variances, narrow._noise_norm = self.variances[: narrow._n_walks], self._noise_norm
+        return narrow, Plane(nearest(model, state.homographies, self._frame_shape))
 
     @property
     def is_coupled(self) -> bool:
         """Whether perspective follows the shift (Schwarz 1978), as that of a camera that turns, or has a lens."""
-        return bool(self._couples and self.variances[-1] > self._of_coupling * self.price)
+        return bool(self._n_shared and self.variances[-1] > self._of_coupling * self.price)
 
     def turning_px(self, state: Plane) -> float | None:
         """Return the focal length of a camera that turns; None unless perspective follows the shift."""
         return self._half / float(np.sqrt(-state.coupling)) if self.is_coupled and state.coupling < 0 else None
 
     def _components(self, state: Plane) -> list[Prior]:
-        """Return the steps of each walk beyond what follows the shift, over the roots of their times; drifts; the coupling."""
+        """Return the steps of each walk beyond the coupling, over the roots of their times; and the coupling."""
         n_steps, k, w = len(self._times), self._n_node, self._n_walks
-        if not self._n_shared:
+        if not w and not self._n_shared:
             return []
-        shared = np.append(state.drifts, [state.coupling] * self._couples)
-        relative, motions = self._steps(state)
-        of_nodes, shifts = self._of_nodes(relative, motions) @ self._basis, motions[:, _SHIFT]
+        perspective = self._model == "homography"
+        relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
+        motions = logarithms(relative, self._frame_shape)
         back = np.linalg.pinv(self._basis)[_FREE:]  # from p1..p8 to the walks
-        follows, by_shared = state.drifts.copy(), np.zeros((w, n_steps, self._n_shared))
-        for walk in range(w):
-            by_shared[walk, :, 2 * walk : 2 * walk + 2] = -shifts
-        if self._model == "homography":
-            by_shared[_PERSPECTIVE, :, -1] = -shifts.T
-            follows[_PERSPECTIVE] += state.coupling * np.eye(2)
-        by_nodes = np.moveaxis(back @ of_nodes - follows @ of_nodes[:, :, _SHIFT], 1, 2)
+        moves = generators(self._frame_shape)
+        earlier = _coordinates(inverse(relative)[:, None] @ moves @ relative[:, None], self._frame_shape)
+        by_nodes = np.stack([-back @ np.swapaxes(earlier, 1, 2), np.broadcast_to(back, (n_steps, w, 8))], axis=2) @ self._basis
         steps, roots = motions @ back.T, 1 / np.sqrt(self._times)
+        by_coupling = np.zeros((n_steps, w))
+        if perspective:
+            by_coupling[:, _PERSPECTIVE] = -motions[:, 4:6]
+            steps += state.coupling * by_coupling
+            shifts = np.eye(8)[4:6]
+            of_shift = np.stack([-shifts @ np.swapaxes(earlier, 1, 2), np.broadcast_to(shifts, (n_steps, 2, 8))], axis=2)
+            by_nodes[:, _PERSPECTIVE] -= state.coupling * (of_shift @ self._basis)
         rows = np.repeat(np.arange(n_steps), 2 * k)
         columns = (k * np.arange(n_steps)[:, None] + np.arange(2 * k)).ravel()
         parts = []
         for walk in range(w):
             entries = (by_nodes[:, walk].reshape(n_steps, 2 * k) * roots[:, None]).ravel()
-            by_node = sparse.csr_array((entries, (rows, columns)), shape=(n_steps, k * self._n_nodes))
-            of_shared = sparse.csr_array(by_shared[walk] * roots[:, None])
-            beyond = steps[:, walk] + by_shared[walk] @ shared
-            parts.append(Prior(beyond * roots, sparse.csr_array(sparse.hstack([by_node, of_shared]))))
-        parts += [
-            Prior(np.array([value]), self._of_shared(row[None])) for value, row in zip(shared, np.eye(len(shared)), strict=True)
-        ]
+            slopes = sparse.csr_array((entries, (rows, columns)), shape=(n_steps, k * self._n_nodes))
+            if self._n_shared:
+                slopes = sparse.csr_array(sparse.hstack([slopes, sparse.csr_array(by_coupling[:, [walk]] * roots[:, None])]))
+            parts.append(Prior(steps[:, walk] * roots, slopes))
+        if self._n_shared:
+            parts.append(Prior(np.array([state.coupling]), self._of_shared(np.ones((1, 1)))))
         return parts
 
     def information(self, state: Plane, blocks: FloatArray) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -90,12 +89,12 @@ class RotationAdjustment(Adjustment[Rotations]):
         between = np.swapaxes(state.rotations[self._fixed], -1, -2) @ state.rotations[self._moving]
         return state.camera.homographies(between)
 
-    def changed(self, state: Rotations, nodes: FloatArray, shared: FloatArray) -> Iterator[Rotations]:
+    def changed(self, state: Rotations, nodes: FloatArray, shared: FloatArray) -> Rotations:
         """Rotate each node, and change the camera."""
         rotated = Rotations(state.rotations @ rotation_matrices(nodes * (self._half / state.camera.focal_px)), state.camera)
         for index, step in zip(self._unknown, shared * self._units(state.camera), strict=True):
             rotated = self._changed(rotated, index, float(step))
-        yield rotated
+        return rotated
 
     def mapped_corners(self, state: Rotations) -> FloatArray:
         """Return where the corners are seen: (E, 4, 2) px.

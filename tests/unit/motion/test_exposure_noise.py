@@ -9,7 +9,7 @@ from photonpano import FrameSpan, Group
 from photonpano.geometry import corners, transform_points
 from photonpano.motion.adjustment import Problem
 from photonpano.motion.exposure_noise import ExposureNoise
-from photonpano.motion.planar import PlanarAdjustment
+from photonpano.motion.planar import PlanarAdjustment, Plane
 from photonpano.values import FloatArray
 
 from .measured_graphs import SHAPE, edge, groups_of, noise_of, pairs, true_motion
@@ -61,8 +61,8 @@ def drawn(groups: Sequence[Group], skips: Sequence[int], n_draws: int) -> tuple[
     motions = [edge(true, *pair).motion for pair in ends]
     instants, spans = np.array([group.reference for group in groups]), [group.span for group in groups]
     adjustment = PlanarAdjustment(Problem(np.array(ends), 0, motions, SHAPE, instants, spans), "homography")
-    expected = adjustment._noise.errors(*adjustment._body_slopes(adjustment.starting(true)), n_draws, rng)
-    exact, found = adjustment.mapped_corners(adjustment.starting(true)), []
+    expected = adjustment._noise.errors(*adjustment._body_slopes(Plane(true)), n_draws, rng)
+    exact, found = adjustment.mapped_corners(Plane(true)), []
     for _ in range(n_draws):
         noise = noise_of(groups, rng)
         seen = transform_points(np.array([edge(true, *pair, noise).motion.homography for pair in ends]), corners(SHAPE))
