@@ -144,7 +144,7 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
             spec["corrections"] = plan.document["corrections"]
         found = CaptureInfo(
             source=plan.source.contribution.name,
-            reason=next((decision.reason for decision in plan.decisions if decision.what == "source"), None),
+            reason=None if plan.recognised is None else plan.recognised.reason,
             n_frames=stream.n_frames,
             height=stream.height,
             width=stream.width,
@@ -179,10 +179,10 @@ def _group_size(plan: Plan, source: Source, summary: CaptureSummary, catalog: Ca
     source_section = {"use": plan.source.contribution.name, "with": plan.source.config.model_dump(by_alias=True)}
     spec = {"version": 1, "source": source_section, "resample": {"use": "midpoint"}, "levels": 1}
     try:
-        decisions = foreseen_decisions(parse_spec(spec, catalog=catalog), source, summary)
+        (chosen,) = foreseen_decisions(parse_spec(spec, catalog=catalog), source, summary)
     except InputError as error:
         return None, str(error)
-    return next((int(each.value), each.reason) for each in decisions if each.what == "group_size")
+    return int(chosen.value), chosen.reason
 
 
 def _warnings(source: Source, found: CaptureInfo, hot_left: float) -> Iterator[str]:

@@ -70,8 +70,7 @@ def build_source(plan: Plan, look: bool = True) -> Capture:
                 _require_frames(plan, whole, f"corrections.{index}.mask.frames", each.frames)
         capture = _part(plan, whole)
     except InputError as error:
-        found = next((decision for decision in plan.decisions if decision.what == "source"), None)
-        if found is None:
+        if (found := plan.recognised) is None:
             raise
         # The spec says `auto`, so the message explains how this source was chosen.
         raise InputError(f"{error} (source {found.value}: {found.reason})") from error

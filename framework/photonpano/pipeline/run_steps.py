@@ -119,7 +119,7 @@ def first_decisions(plan: Plan, source: Source) -> list[Decision]:
     """Return what was decided while the capture was opened; warn if its pixels seem to be in another order."""
     if warning := order_warning(source):
         logger.warning(warning)
-    return [*plan.decisions, *capture_of(source).decisions]
+    return [*filter(None, [plan.recognised]), *capture_of(source).decisions]
 
 
 def failure_path(directory: Path) -> Path:
