@@ -146,7 +146,7 @@ def ghosts(cube: Path, bare: Path, folder: Path) -> dict[str, float]:
     with opened_run(folder) as run, open_source(parse_spec(packed(bare, corrections=[]))) as other:
         alone = replace(capture_of(run.source), steps=capture_of(run.capture).steps, source=capture_of(other).source)
         vignette = estimate_vignette(before(alone, None), motion)
-        shown, _ = showing(alone if vignette is None else divided_by(alone, vignette), motion, found.camera, "hide")
+        shown, *_ = showing(alone if vignette is None else divided_by(alone, vignette), motion, found.camera, "hide")
         oracle, seen = rendered(shown, motion, canvas), rendered(run.source, motion, canvas).weight >= FEWEST_FRAMES
     around = truth.turn if truth.around else None
     alignment = evaluate(folder, truth_path(cube), oracle=False).trajectory.alignment

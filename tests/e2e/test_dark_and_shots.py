@@ -17,7 +17,6 @@ from photonpano.pipeline.obstacles import timeline_of
 from photonpano.pipeline.shots import run_others
 from photonpano.specs import parse_spec
 from photonpano.specs.plan import Plan
-from photonpano.text import listed
 from photonpano.values import FrameSpan
 
 pytestmark = pytest.mark.usefixtures("without_report")
@@ -175,7 +174,7 @@ def test_other_shots_are_numbered_by_their_length_and_those_that_fail_are_left_o
 ) -> None:
     spans = [FrameSpan(0, 10), FrameSpan(10, 40), FrameSpan(40, 60), FrameSpan(60, 100)]
     record: Any = {
-        "decisions": [{"what": "shots", "value": listed(map(str, spans))}],
+        "findings": {"shots": [{"start": each.start, "stop": each.stop} for each in spans]},
         "source": {"frame_rate_hz": 100.0},
     }
 

@@ -137,7 +137,6 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
         with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as other:
             hot = read.valid & ~other.valid
         still = read.valid & ~marked.valid
-        decided = {each.what: each for each in marked.decisions}
         keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
         spec: dict[str, Any] = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
         if not plan.corrects_itself:
@@ -158,8 +157,8 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
             unused_share=1 - float(read.valid.mean()),
             hot_share=float(hot[read.valid].mean()),
             still_share=float(still[read.valid].mean()),
-            standing_share=float(decided["standing_share"].value) if "standing_share" in decided else 0.0,
-            still_how=decided["still_pixels"].reason if "still_pixels" in decided else "not measured",
+            standing_share=marked.still.share,
+            still_how=marked.still.how,
             saturated_share=saturated_share(source),
             group_size=size,
             group_size_reason=reason,

@@ -197,7 +197,7 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
             f"{byte_size(memory)} of run.memory; lower render.scale, or choose a part with render.extent"
         )
     tolerance_px = plan.render.tolerance_px
-    still, _ = showing(opened.source, motion.trajectory, motion.camera, plan.render.movers)
+    still, *_ = showing(opened.source, motion.trajectory, motion.camera, plan.render.movers)
     brighter = plan.render.exposure_stops - opened.record["spec"]["render"]["exposure_stops"]
     return Film(
         source,

@@ -30,7 +30,7 @@ from photonpano.plugins.registry import KINDS
 from photonpano.specs.checks import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
-from photonpano.values import CaptureSummary, Decision, FrameSpan, Group
+from photonpano.values import CaptureSummary, FrameSpan, Group, Journal
 
 HALVED_LEVELS = 2  # with `scale: auto`, the first two levels are located at half size
 LARGE_FRAME_PX = 192  # minimum shorter side of frames located at half size: the pyramids of locators need pixels
@@ -106,7 +106,7 @@ def _require_frames(plan: Plan, capture: Capture, where: str, frames: tuple[int,
         raise SpecError([plan.place(where).problem(message)])
 
 
-def build_levels(plan: Plan, source: Source, decisions: list[Decision], shortened: int = 1) -> tuple[Level, ...]:
+def build_levels(plan: Plan, source: Source, decisions: Journal, shortened: int = 1) -> tuple[Level, ...]:
     """Build the components of all levels; those with the same config are shared. `decisions` receives their choices.
 
     Groups whose size is chosen from the capture are `shortened` that many times.
@@ -147,7 +147,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision], shortene
     )
 
 
-def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) -> PoseEstimator:
+def build_pose_estimator(plan: Plan, source: Source, decisions: Journal) -> PoseEstimator:
     """Build the pose estimator of a plan that has one; `decisions` receives its choices."""
     from photonpano.pipeline.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
@@ -183,9 +183,9 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
     return foreseen
 
 
-def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> list[Decision]:
+def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> Journal:
     """Return the decisions of the first level's resampler, such as its group size, for a capture with this summary."""
-    decisions: list[Decision] = []
+    decisions: Journal = []
     context = stage_context(plan, source, Recorder(decisions), lambda: capture)
     resampler: Resampler = built(plan.levels[0].resample, context, "level 1")
     resampler.groups(source.info.n_frames, 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -22,7 +22,7 @@ from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking.spans import DARK
 from photonpano.reading import other_order, sampled_spans
 from photonpano.robust import robust_std
-from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, true_spans
+from photonpano.values import BoolArray, FloatArray, FrameSpan, true_spans
 
 _PLACES, _FRAMES = 5, 256  # spans all over the capture, and most frames of each
 _ALIKE = 0.7  # an image repeats if another shift fits at least this well, as a share of the best one
@@ -60,31 +60,22 @@ def order_warning(source: Source) -> str | None:
 
 
 @contextmanager
-def naming_obstacles(source: Source, decisions: Sequence[Decision]) -> Iterator[None]:
+def naming_obstacles(source: Source) -> Iterator[None]:
     """Append the sentences of `obstacles` to the `LocationError` of a block."""
     try:
         yield
     except LocationError as error:
-        found = obstacles(source, decisions)
-        error.args = ("\n".join([str(error), *found]),)
+        error.args = ("\n".join([str(error), *obstacles(source)]),)
         raise
 
 
-def obstacles(source: Source, decisions: Sequence[Decision]) -> list[str]:
-    """Return sentences about what makes a capture hard to locate; `decisions` hold the share of the frame that stands still."""
-    return [*_standing(decisions), *_repeating(source)]
-
-
-def _standing(decisions: Sequence[Decision]) -> Iterator[str]:
-    share = next((float(each.value) for each in decisions if each.what == "standing_share"), 0.0)
-    if share >= _STANDING:
+def obstacles(source: Source) -> Iterator[str]:
+    """Yield sentences about what makes a capture hard to locate."""
+    if (share := capture_of(source).still.share) >= _STANDING:
         yield (
             f"{share:.0%} of the frame stands still while the rest moves, as a window or dirt in front of the sensor does: "
             "mask it under corrections, or cut it off."
         )
-
-
-def _repeating(source: Source) -> Iterator[str]:
     spans = source.info.spread(_PLACES, min(_FRAMES, max(2, source.info.n_frames // _PLACES - 1)))
     found = [each for span in spans if (each := _repetition_within(source, span)) is not None]
     period = float(np.median(found)) if found else 0.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,7 +13,6 @@ from photonpano.capture import before, capture_of, leaving_out
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
 from photonpano.corrections.lighting import (
-    LIGHT_DECISION,
     corrected_light,
     decision_of,
     find_light,
@@ -28,16 +26,17 @@ from photonpano.geometry import Camera, lenses_apart_px
 from photonpano.motion.diagnosis import UntiedError
 from photonpano.motion.loop import TOO_NARROW, converges
 from photonpano.motion.model import SAME_LENS_PX
-from photonpano.motion.timeline import UNCUT_JUMP, Cut
+from photonpano.motion.timeline import Cut
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.shots import ApartError, shots_of
 from photonpano.pipeline.state import State, within
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.residuals.causes import changing_places
 from photonpano.residuals.cuts import SMALLEST_PX, find_cuts
+from photonpano.residuals.findings import Doubt
 from photonpano.residuals.refinement import MotionFit
 from photonpano.specs.plan import Plan
-from photonpano.values import Background, Decision, Light
+from photonpano.values import Background, Light
 
 logger = logging.getLogger(__name__)
 
@@ -123,8 +122,7 @@ def without_shading(state: State) -> Proposal | None:
         return without_movers(state)
 
     def divided(by: Vignette) -> State:
-        corrected = state.corrected(divided_by(state.source, by), by, by.decision)
-        return tried(replace(corrected, vignette=by), without_movers).state
+        return tried(state.corrected(divided_by(state.source, by), by), without_movers).state
 
     def make() -> State:
         first = divided(found)
@@ -169,7 +167,7 @@ def in_changing_light(state: State) -> Proposal | None:
         return None
 
     def lit(light: Light) -> State:
-        return state.corrected(in_light(source, light), light, decision_of(light, source.info.frame_rate_hz))
+        return state.corrected(in_light(source, light), light)
 
     def make() -> State | None:
         first = lit(light).located(levels, state.trajectory)
@@ -195,7 +193,7 @@ def worse_in_light(proposed: MotionFit, before: MotionFit) -> str:
     return "" if proposed.reduced_chi2 < _EXPLAINED * before.reduced_chi2 else proposed.worse_than(before)
 
 
-def later_levels(state: State, journal: list[Decision]) -> Proposal:
+def later_levels(state: State) -> Proposal:
     """Run the levels that are left; a single one again, if the capture was corrected since.
 
     In light that flickers, group sizes that are chosen from the capture are chosen anew: whole periods of the light. What hides
@@ -203,8 +201,7 @@ def later_levels(state: State, journal: list[Decision]) -> Proposal:
     """
     levels, light = state.levels, light_of(state.source)
     if light is not None and light.frequency:
-        journal[:] = [each for each in journal if each.what != "group_size"]
-        levels = build_levels(state.plan, state.source, journal, state.shortened)
+        levels = build_levels(state.plan, state.source, state.findings.started, state.shortened)
     left = levels if state.outdated and len(levels) == 1 else levels[1:]
 
     def make() -> State:
@@ -281,7 +278,7 @@ def _in_lamps(state: State) -> State:
     found = measure_light(_in_steady_light(state.view.source), state.trajectory, state.context)
     if not found.has_lamps:
         return state
-    return state.corrected(in_light(state.source, found), found, decision_of(found, state.source.info.frame_rate_hz))
+    return state.corrected(in_light(state.source, found), found)
 
 
 def cut_at_jumps(state: State) -> Proposal | None:
@@ -296,7 +293,7 @@ def cut_at_jumps(state: State) -> Proposal | None:
         return None
 
     def make(cuts: Sequence[Cut] = cuts) -> State | None:
-        levels = build_levels(state.plan, state.source, [], state.shortened)
+        levels = build_levels(state.plan, state.source, state.findings.started, state.shortened)
         try:
             cut = _located_anew(replace(state, timeline=state.timeline.cut_at(cuts), levels=levels))
         except UntiedError as error:
@@ -316,8 +313,8 @@ def cut_at_jumps(state: State) -> Proposal | None:
 
     def refused(state: State) -> State:
         largest = max(cuts, key=lambda each: each.size_px)
-        found = Decision(UNCUT_JUMP, largest.size_px, f"px before frame {largest.frame}; cut there, the motion explains less")
-        return replace(state, decisions=(*state.decisions, found))
+        found = Doubt(largest.size_px, f"px before frame {largest.frame}; cut there, the motion explains less")
+        return replace(state, findings=replace(state.findings, uncut_jump=found))
 
     worse = (lambda *_: "") if dark else MotionFit.worse_than
     return Proposal(make, worse, refused=refused, rejection=rejection, severity=logging.WARNING)
@@ -325,14 +322,12 @@ def cut_at_jumps(state: State) -> Proposal | None:
 
 def _located_anew(state: State) -> State:
     """Locate all levels; light, and what hides the background, are found anew, since that was done along another motion."""
-    decisions = tuple(each for each in state.decisions if each.what != LIGHT_DECISION)
-    changing = len(decisions) < len(state.decisions)
-    if capture_of(state.source).background is None and not changing:
+    if capture_of(state.source).background is None and state.light is None:
         return state.located(state.levels, state.start)
-    anew = replace(state, source=before(_in_steady_light(state.source), None), decisions=decisions, watched=False)
+    anew = replace(state, source=before(_in_steady_light(state.source), None), light=None, watched=False)
     anew = anew.located(state.levels[:1], state.start)
-    light = [in_changing_light] if changing else []
-    again: tuple[Pass, ...] = (without_movers, *light, partial(later_levels, journal=[]), again_without_movers)
+    light = [] if state.light is None else [in_changing_light]
+    again: tuple[Pass, ...] = (without_movers, *light, later_levels, again_without_movers)
     for each in again:
         anew = tried(anew, each).state
     return anew

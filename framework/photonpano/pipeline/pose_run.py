@@ -31,7 +31,7 @@ _SHOWN_LOST = 3  # spans of lost frames that a warning names
 def find_poses(run: BegunRun) -> None:
     """Estimate the poses, write their files, and end the run."""
     plan, source, start = run.plan, run.source, time.perf_counter()
-    with naming_obstacles(source, run.journal):
+    with naming_obstacles(source):
         estimate = _estimated(run)
     run.observers.stage_finished(None, "pose", time.perf_counter() - start, counts_of(estimate))
     files = write_pose_files(run.folder.staging, estimate, source.info, plan.output.exposures)

@@ -19,7 +19,7 @@ from photonpano.pipeline.passes import Proposal, tried, without_what_changes
 from photonpano.pipeline.state import State
 from photonpano.residuals.refinement import Explained, NamedRefiner, Refinement
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, FloatArray, Refined
+from photonpano.values import FloatArray, Journal, Refined
 
 MAX_ROUNDS = 6  # maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against
 # A later correction that moves frames by less than this on average needs no new panorama: residuals change in proportion to it.
@@ -28,14 +28,16 @@ _NOT_RELOCATED = "the motion of the last level along the refined one is not used
 _BLURRED_PX = 1.0  # mean correction by which the exposures were blurred so that it pays to locate them again
 
 
-def build_refiners(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[NamedRefiner, ...]:
+def build_refiners(plan: Plan, source: Source, decisions: Journal) -> tuple[NamedRefiner, ...]:
     """Build the refiners of a plan, in order; `decisions` receives their choices."""
     context = stage_context(plan, source, Recorder(decisions))
     return tuple(NamedRefiner(choice.contribution.name, built(choice, context, "the refinement")) for choice in plan.refine)
 
 
-def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Explained]:
+def refine(state: State, refiners: Sequence[NamedRefiner], decisions: Journal | None = None) -> tuple[State, Explained]:
     """Correct the motion by refiners, each until it finds nothing, and measure what is left. For errors, see `run`.
+
+    `decisions` receives those of the refiners.
 
     Where the first correction moves frames by more than a pixel, that motion had blurred the exposures of the last level, which
     then runs again along the corrected motion.
@@ -44,7 +46,7 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Expla
     for place, refiner in enumerate(refiners):
         before, rounds, kept_out = state.motion, list[str](), ""
         while len(rounds) < MAX_ROUNDS and not state.context.time_limit.leaves_out("refinements"):
-            each = partial(_corrected, refiner=refiner, place=place, number=len(rounds) + 1)
+            each = partial(_corrected, refiner=refiner, place=place, number=len(rounds) + 1, decisions=decisions)
             state, accepted, summary, worse = tried(state, each)
             if not accepted:
                 kept_out = " ".join(worse.split())
@@ -58,10 +60,10 @@ def refine(state: State, refiners: Sequence[NamedRefiner]) -> tuple[State, Expla
     return state, state.fit.explained(refinements)
 
 
-def _corrected(state: State, refiner: NamedRefiner, place: int, number: int) -> Proposal | None:
+def _corrected(state: State, refiner: NamedRefiner, place: int, number: int, decisions: Journal | None) -> Proposal | None:
     """Propose the motion that a refiner finds at a round, from 1; `place` is its own among those of the run."""
     given = place, number, state.motion.homographies, state.motion.noise_px
-    found = state.view.context.checkpoints.once("refined", partial(_refined, refiner, state), *given)
+    found = state.view.context.checkpoints.once("refined", partial(_refined, refiner, state), *given, decisions=decisions)
     if found is None:
         return None
     remaining_px = REMAINING_SHARE * _moved_px(state.motion, found.homographies)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -23,11 +24,12 @@ from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_folder import write_exposures
 from photonpano.pipeline.run_steps import BegunRun, begun_run
 from photonpano.pipeline.shots import run_others
+from photonpano.pipeline.state import State
 from photonpano.record.run_json import record_of
-from photonpano.record.run_warnings import TIME_LIMIT
 from photonpano.record.schema import RunRecord
 from photonpano.report import OpenCapture, render_report
 from photonpano.report.notebook import ShownReport, run_html
+from photonpano.residuals.findings import Findings
 from photonpano.residuals.verdict import judge
 from photonpano.specs.plan import Plan
 from photonpano.text import listed
@@ -128,22 +130,30 @@ def make_panorama(run: BegunRun) -> None:
     plan, folder, journal = run.plan, run.folder, run.journal
     with executor_of(plan, run.source) as executor:
         context = replace(run.context, threads=executor.under_way, executor=executor)
-        with naming_obstacles(run.source, journal):
+        with naming_obstacles(run.source):
             state = estimate(plan, run.source, journal, context)
-        state, explained = refine(state, build_refiners(plan, state.view.source, journal))
-        if left_out := context.time_limit.left_out:
-            journal.append(Decision(TIME_LIMIT, listed(left_out), f"left out, since {plan.run.time_limit:g} s were over"))
-        if (background := capture_of(state.source).background) is not None:
-            journal.append(decision_of(background))
-        explained, others = beside_alternatives(state, explained, journal)
-        journal += others
+        state, explained = refine(state, build_refiners(plan, state.view.source, journal), journal)
+        explained, findings = beside_alternatives(state, explained)
+        journal += _last_decisions(state, findings)
         source, context = state.view
         panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context)
-        verdict = judge(explained, state.results, [*journal, *chosen])
+        findings = replace(findings, never_seen_share=panorama.never_seen_share)
+        verdict = judge(explained, state.results, findings)
         run.observers.rendered(panorama.canvas, panorama.seconds)
         if plan.output.keep == "exposures":
             with folder.writing():
                 write_exposures(folder.staging, state.results, panorama.white_flux, context)
-    record = record_of(run.started_record(), plan, state.results, explained, verdict, panorama, chosen)
+    record = record_of(run.started_record(), plan, state.results, explained, verdict, panorama, chosen, findings)
     light, capture = light_of(source), OpenCapture(source, state.results)
     run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)
+
+
+def _last_decisions(state: State, findings: Findings) -> Iterator[Decision]:
+    """Yield the decisions on what is left out, and on a rival motion."""
+    if findings.left_out:
+        over = f"left out, since {state.plan.run.time_limit:g} s were over"
+        yield Decision("time_limit", listed(findings.left_out), over)
+    if (background := capture_of(state.source).background) is not None:
+        yield decision_of(background)
+    if (rival := findings.rival_motion) is not None:
+        yield Decision("rival_motion", rival.px, rival.where)

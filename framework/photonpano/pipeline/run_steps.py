@@ -31,7 +31,7 @@ from photonpano.record.run_json import level_record, peak_memory_bytes, started_
 from photonpano.record.schema import CaptureRecord, RunRecord
 from photonpano.report import render_failure
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, Verdict
+from photonpano.values import Journal, Verdict
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ class BegunRun:
     observers: Observers
     progress: Progress
     start: float  # when the capture was open, in seconds of `time.perf_counter`
-    journal: list[Decision] = field(default_factory=list)  # the decisions so far, in the order in which they were taken
+    journal: Journal = field(default_factory=list)  # the decisions so far, in the order in which they were taken
     # the levels so far; one that was located again is there more than once
     levels: list[LevelResult] = field(default_factory=list)
     work: Work | None = None
@@ -115,7 +115,7 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
         finished(run.record)
 
 
-def first_decisions(plan: Plan, source: Source) -> list[Decision]:
+def first_decisions(plan: Plan, source: Source) -> Journal:
     """Return what was decided while the capture was opened; warn if its pixels seem to be in another order."""
     if warning := order_warning(source):
         logger.warning(warning)
@@ -135,7 +135,7 @@ def _work(run: BegunRun, how: Continuation) -> AbstractContextManager[Work | Non
             run.progress.note("a run with `pose` keeps no work: it begins anew")
         return nullcontext()
     depends_on = run_fingerprint(plan, run.capture, run.source.info.frame_shape)
-    return work_folder(plan.output.directory, depends_on, run.journal, how, run.progress)
+    return work_folder(plan.output.directory, depends_on, how, run.progress)
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import TypeVar
@@ -18,8 +17,8 @@ from photonpano.geometry import corners, inverse, transform_points
 from photonpano.merging import binned_mean
 from photonpano.motion.graph import components
 from photonpano.motion.locate import LocatedLevel
-from photonpano.motion.timeline import SHOTS
 from photonpano.plugins.contributions import PartOfCapture
+from photonpano.record.run_json import findings_of
 from photonpano.record.run_warnings import other_shots
 from photonpano.record.schema import RunRecord
 from photonpano.robust import robust_std
@@ -113,9 +112,7 @@ def _first_after_change(source: Source, span: FrameSpan) -> int | None:
 
 def run_others(plan: Plan, record: RunRecord, run: Callable[[Plan], ResultT], progress: Progress) -> Iterator[ResultT]:
     """Run each shot that a finished run has left out, into a folder beside its own. One that fails is a warning."""
-    found = next((str(each["value"]) for each in record["decisions"] if each["what"] == SHOTS), "")
-    shots = [FrameSpan(int(first), int(last) + 1) for first, last in re.findall(r"(\d+) to (\d+)", found)]
-    for folder, shot in other_shots(shots, plan.output.directory).items():
+    for folder, shot in other_shots(findings_of(record).shots, plan.output.directory).items():
         progress.note(f"{plan.output.directory} is finished; {shot}, another shot, are run into {folder}")
         try:
             narrowed = _narrowed(plan, shot, record["source"]["frame_rate_hz"])

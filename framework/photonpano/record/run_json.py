@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from photonpano.errors import InputError
 from photonpano.merging.panorama import RenderedPanorama
@@ -45,10 +46,13 @@ from photonpano.record.schema import (
     RunRecord,
     VerdictRecord,
 )
+from photonpano.residuals.findings import Findings
 from photonpano.residuals.halves import Agreements
 from photonpano.residuals.refinement import Explained, Refinement
 from photonpano.specs.plan import Choice, Plan
 from photonpano.values import Decision, Edge, FloatArray, Group, Located, NotLocated, Reason, StreamInfo, Verdict
+
+_FINDINGS = TypeAdapter(Findings)
 
 
 def record_of(
@@ -59,6 +63,7 @@ def record_of(
     verdict: Verdict,
     panorama: RenderedPanorama,
     rendered: Sequence[Decision],
+    findings: Findings,
 ) -> RunRecord:
     """Return the record of a finished run; `rendered` are the decisions of renderer and exporters."""
     motion, timeline = explained.motion, levels[-1].exposures.timeline
@@ -66,6 +71,7 @@ def record_of(
     return {
         **started,
         "decisions": [*started["decisions"], *decision_records(decisions)],
+        "findings": _FINDINGS.dump_python(findings, mode="json"),
         "levels": [level_record(result) for result in levels],
         "panorama": panorama_record(plan, panorama, rendered),
         "motion": _motion_record(motion.std_px),
@@ -74,7 +80,7 @@ def record_of(
         "stretches": _agreement_records(explained.halves.stretches),
         "verdict": verdict_record(verdict),
         "warnings": [
-            *time_warnings(started["decisions"]),
+            *time_warnings(findings.left_out, plan.run.time_limit),
             *timeline_warnings(timeline, plan.output.directory),
             *level_warnings(levels),
             *motion_warnings(motion, timeline),
@@ -203,6 +209,11 @@ def _camera_record(result: LevelResult) -> CameraRecord | None:
 def decision_records(decisions: Sequence[Decision]) -> list[DecisionRecord]:
     """Describe what was chosen from the capture."""
     return [_fields(each) for each in decisions]
+
+
+def findings_of(record: RunRecord) -> Findings:
+    """Return the findings that a record describes."""
+    return _FINDINGS.validate_python(record.get("findings", {}))
 
 
 def panorama_record(plan: Plan, panorama: RenderedPanorama, rendered: Sequence[Decision]) -> PanoramaRecord:

@@ -10,7 +10,6 @@ import numpy as np
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.timeline import Timeline
-from photonpano.record.schema import DecisionRecord
 from photonpano.residuals.refinement import Refinement
 from photonpano.text import listed
 from photonpano.values import FrameSpan, true_spans
@@ -19,7 +18,6 @@ from photonpano.values import FrameSpan, true_spans
 UNCERTAIN_PX = 0.5
 SHOWN_SPANS = 4  # spans of uncertain frames that a warning names, the worst first
 
-TIME_LIMIT = "time_limit"  # name of the decision on what was left out
 _MANY_COPIES = 0.25  # share of the frames from which a warning names them
 
 
@@ -53,10 +51,10 @@ def level_warnings(results: Sequence[LevelResult]) -> list[str]:
     return warnings
 
 
-def time_warnings(decisions: Sequence[DecisionRecord]) -> list[str]:
+def time_warnings(left_out: Sequence[str], limit_s: float | None) -> list[str]:
     """Warn of what was left out of a run whose time was over."""
-    found = [each for each in decisions if each["what"] == TIME_LIMIT]
-    return [f"{each['value']} are {each['reason']} (run.time_limit): the motion may not have converged" for each in found]
+    over = f"since {limit_s or 0:g} s were over (run.time_limit): the motion may not have converged"
+    return [f"{listed(left_out)} are left out, {over}"] if left_out else []
 
 
 def other_shots(shots: Sequence[FrameSpan], directory: Path) -> dict[Path, FrameSpan]:

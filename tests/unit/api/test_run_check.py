@@ -77,9 +77,8 @@ def test_check_run_opens_a_capture_that_was_moved(finished: Path) -> None:
 def test_check_run_keeps_what_only_the_run_can_find(finished: Path) -> None:
     repeats = {"what": REPEATS, "figure": 0.2, "threshold": 0.05, "where": "4 of 20 pairs", "what_to_do": "look"}
     other = repeats | {"what": "the light changes over time"}
-    standing = {"what": "standing_share", "value": 0.7, "reason": "measured"}
     change(finished, lambda record: record["verdict"].update(reasons=[repeats, other]))
-    change(finished, lambda record: record["decisions"].append(standing))
+    change(finished, lambda record: record["findings"].update(standing_share=0.7))
     found = [reason.what for reason in check_run(finished).verdict.reasons]
     assert found[-2:] == ["more than half of the frame stands still while the rest moves", REPEATS]
     assert other["what"] not in found

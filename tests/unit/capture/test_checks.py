@@ -34,7 +34,7 @@ from photonpano.reading import FrameFile, FrameLayout, PackedFileSource
 from photonpano.record.contents import changes, fingerprint
 from photonpano.record.schema import CaptureRecord
 from photonpano.testing import MemorySource
-from photonpano.values import Decision
+from photonpano.values import Still
 from photonpano_simulator.travel.truth import sharp_view, truth_of
 
 DARK = (
@@ -182,8 +182,8 @@ def test_texture_and_flat_frames_do_not_repeat(rate: np.ndarray) -> None:
 
 def test_error_names_what_stands_still_and_what_repeats() -> None:
     frames = np.random.default_rng(0).random((64, *SHAPE)) < 4 * tiles(20)
-    decisions = [Decision("standing_share", 0.38, "")]
-    with pytest.raises(LocationError) as raised, MemorySource(frames) as source, naming_obstacles(source, decisions):
+    capture = replace(capture_of(MemorySource(frames)), still=Still(0.38))
+    with pytest.raises(LocationError) as raised, naming_obstacles(capture):
         raise LocationError("none of the pairs could be located")
     assert str(raised.value).splitlines() == [
         "none of the pairs could be located",
@@ -197,7 +197,7 @@ def test_error_names_what_stands_still_and_what_repeats() -> None:
 def test_error_stays_as_it_is_where_nothing_is_found() -> None:
     frames = np.random.default_rng(0).random((64, *SHAPE)) < texture(0)
     with MemorySource(frames) as source:
-        assert obstacles(source, []) == []
+        assert [*obstacles(source)] == []
 
 
 def part(path: Path, start: int, stop: int) -> dict[str, Any]:

@@ -54,7 +54,7 @@ def crossed(speed_px: float) -> tuple[MemorySource, KnownMotion]:
 def merged(movers: str | int, speed_px: float = 0.0) -> tuple[np.ndarray, str]:
     """Return the panorama of the first view, and the reason of the last decision."""
     source, motion = crossed(speed_px)
-    shown, decisions = showing(source, motion, None, movers)
+    shown, decisions, _ = showing(source, motion, None, movers)
     panorama = MergeRenderer(partial(in_order, threads=1)).render(shown, motion, FrameSpan(0, N), CANVAS, 0.125, lambda _: None)
     return panorama.flux, decisions[-1].reason if decisions else ""
 
@@ -103,7 +103,7 @@ def test_an_action_shot_shows_a_mover_several_times_apart_from_itself() -> None:
 def test_nothing_is_said_where_nothing_moves() -> None:
     source, motion = crossed(0.0)
     plain = before(source, None)
-    found, decisions = showing(plain, motion, None, "action")
+    found, decisions, _ = showing(plain, motion, None, "action")
     assert capture_of(found).background is None
     assert not decisions
 
@@ -115,6 +115,6 @@ def test_the_share_whose_background_was_never_seen_is_told(movers: Literal["hide
     shown = np.ones((len(INSTANTS), 12, 16), bool)
     shown[:, 4:8, 4:12] = False
     never = before(source, Background(INSTANTS, shown, np.ones_like(shown), SHAPE))
-    _, (said,) = showing(never, motion, None, movers)
-    assert said.what == "background_never_seen"
-    assert float(said.value) == pytest.approx(32 / 192, abs=0.02)
+    _, (said,), share = showing(never, motion, None, movers)
+    assert (said.what, said.value) == ("background_never_seen", share)
+    assert share == pytest.approx(32 / 192, abs=0.02)

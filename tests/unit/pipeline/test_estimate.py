@@ -14,7 +14,6 @@ from photonpano.motion.diagnosis import UntiedError
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.shots import ApartError
-from photonpano.values import Decision
 
 SPEC = {
     "version": 1,
@@ -60,7 +59,6 @@ def test_what_was_tried_in_vain_is_told(signal_to_noise: float, shortened: list[
 
     def along(*given: Any) -> None:
         attempts.append(given[-1])
-        given[3].append(Decision("group_size", 100, ""))
         raise UntiedError(f"attempt {len(attempts)} fails", 1, (), (), np.zeros(0, int), signal_to_noise, None)
 
     monkeypatch.setattr("photonpano.pipeline.estimate._along", along)

@@ -4,7 +4,6 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -97,10 +96,7 @@ def test_single_level_is_located_again_if_the_capture_was_corrected_since(
     levels = tuple(make_level(number=number) for number in range(1, n_levels + 1))
     first = SimpleNamespace(trajectory=pan(0.3))
     source: Any = MemorySource(np.zeros((9, 8, 16)))
-    tried(
-        replace(BEFORE, source=source, levels=levels, results=(first,), outdated=outdated, watched=True),
-        partial(later_levels, journal=[]),
-    )
+    tried(replace(BEFORE, source=source, levels=levels, results=(first,), outdated=outdated, watched=True), later_levels)
     assert ran == [(located, first.trajectory)]
 
 

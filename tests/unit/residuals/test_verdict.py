@@ -14,23 +14,26 @@ from photonpano.geometry import Camera
 from photonpano.motion.graph import Freed, Rival
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.model import SAME_LENS_PX, MotionModel
-from photonpano.motion.timeline import DARK_JUMP, UNCUT_JUMP
-from photonpano.residuals import tested_run
+from photonpano.residuals import causes
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
+from photonpano.residuals.findings import Doubt, Findings, Jump
 from photonpano.residuals.halves import Agreements, Halves
 from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained, residual_ratio
 from photonpano.residuals.shaking import Shaking
-from photonpano.residuals.tested_run import RIVAL
 from photonpano.residuals.verdict import NARROW, judge, second_place_px
-from photonpano.values import Ambiguity, Decision, Edge, Located, Reason
+from photonpano.values import Ambiguity, Edge, Located, Reason
 
 SHAPE, N_SPANS, SPAN = (128, 192), 200, 10
 N_FRAMES = N_SPANS * SPAN
 
 
 Made = dict[str, Any]
+
+
+def jump(start: int, stop: int) -> Jump:
+    return Jump(start, 7.0, 20.0, FrameSpan(start, stop))
 
 
 def squares(residuals: Residuals, **values: float) -> Made:
@@ -321,7 +324,7 @@ def test_halves_that_do_not_agree_for_half_of_the_time_are_doubtful(explained: E
 
 def test_things_that_pass_the_background_tell_how_far_the_camera_travels(explained: Explained) -> None:
     levels = [level_with(parallax=parallax) for parallax in (0.0412, 0.003)]
-    [reason] = judge(explained, levels, [Decision("movers", 0.6, "")]).reasons
+    [reason] = judge(explained, levels, Findings(hidden_share=0.6)).reasons
     assert reason.where.endswith("if what is near stands still, the camera travelled by about 0.04 of its distance")
 
 
@@ -363,7 +366,7 @@ def test_motion_along_an_edge_is_doubtful(
 @pytest.mark.parametrize(("n_pairs", "where"), [(2, []), (3, ["px to the second place; 3 of 30 pairs of level 1"])])
 def test_level_is_ambiguous_from_three_pairs_on(explained: Explained, n_pairs: int, where: list[str]) -> None:
     levels = [level_with(n_ambiguous=n_pairs)]
-    assert second_place_px(tested_run.TestedRun(explained, levels, ())) == 40 * len(where)
+    assert second_place_px(causes.TestedRun(explained, levels, Findings())) == 40 * len(where)
     uncertain = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + 40 * len(where)))
     assert [reason.where for reason in judge(uncertain, levels).reasons] == where
 
@@ -381,41 +384,39 @@ def test_error_of_motion_that_has_not_converged_is_not_for_want_of_light(
 
 
 @pytest.mark.parametrize(
-    ("decisions", "figure", "where"),
+    ("findings", "figure", "where"),
     [
-        ([Decision("standing_share", 0.6, "")], 0.6, "share of the parts that show motion or rest"),
-        (
-            [Decision(DARK_JUMP, "frames 3 to 5", ""), Decision(DARK_JUMP, "frames 9 to 12", "")],
-            2,
-            "frames 3 to 5, frames 9 to 12",
-        ),
+        (Findings(standing_share=0.6), 0.6, "share of the parts that show motion or rest"),
+        (Findings(cuts=(jump(3, 6), jump(9, 13))), 2, "frames 3 to 5, frames 9 to 12"),
     ],
 )
-def test_decisions_are_doubtful(explained: Explained, decisions: list[Decision], figure: float, where: str) -> None:
-    [reason] = judge(explained, (), decisions).reasons
+def test_findings_are_doubtful(explained: Explained, findings: Findings, figure: float, where: str) -> None:
+    [reason] = judge(explained, (), findings).reasons
     assert (reason.figure, reason.where) == (figure, where)
-    assert not judge(explained, (), [Decision("standing_share", 0.4, "")]).reasons
+    assert not judge(explained, (), Findings(standing_share=0.4)).reasons
 
 
-@pytest.mark.parametrize("decision", [Decision(RIVAL, 40.0, "px between both"), Decision(UNCUT_JUMP, 5.0, "px before frame 3")])
-def test_why_the_motion_is_not_known_is_named(explained: Explained, decision: Decision) -> None:
+@pytest.mark.parametrize(
+    ("name", "doubt"), [("rival_motion", Doubt(40.0, "px between both")), ("uncut_jump", Doubt(5.0, "px before frame 3"))]
+)
+def test_why_the_motion_is_not_known_is_named(explained: Explained, name: str, doubt: Doubt) -> None:
     """Their distances are in the expected errors."""
-    assert not judge(explained, (), [replace(decision, value=0.5)]).reasons
-    uncertain = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + float(decision.value)))
-    [reason] = judge(uncertain, (), [decision]).reasons
-    assert (reason.figure, reason.where) == (decision.value, decision.reason)
+    assert not judge(explained, (), Findings(**{name: replace(doubt, px=0.5)})).reasons
+    uncertain = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + doubt.px))
+    [reason] = judge(uncertain, (), Findings(**{name: doubt})).reasons
+    assert (reason.figure, reason.where) == (doubt.px, doubt.where)
     assert reason.what != "the expected error of the motion is large"
 
 
 def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained) -> None:
     """A thing that fills the middle of all frames passes for the scene, and what is seen beside it for what hides that."""
-    found = [judge(explained, (), [Decision("movers", share, "")]).reasons for share in (0.48, 0.52)]
+    found = [judge(explained, (), Findings(hidden_share=share)).reasons for share in (0.48, 0.52)]
     assert [[reason.figure for reason in reasons] for reasons in found] == [[], [0.52]]
 
 
 def test_a_third_that_is_left_out_may_be_the_scene_if_as_much_of_the_rest_changes(explained: Explained) -> None:
     changing = replace(explained.residuals, cell_chi2=np.full_like(explained.residuals.cell_chi2, 9))
-    verdicts = [judge(each, (), [Decision("movers", 0.33, "")]) for each in (explained, replace(explained, residuals=changing))]
+    verdicts = [judge(each, (), Findings(hidden_share=0.33)) for each in (explained, replace(explained, residuals=changing))]
     named = [[reason.what.startswith("much of what the frames show") for reason in verdict.reasons] for verdict in verdicts]
     assert named == [[], [True, False]]
 

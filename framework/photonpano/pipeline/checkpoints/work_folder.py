@@ -25,7 +25,7 @@ from photonpano.execution.context import Checkpoints, KeepNothing, Progress
 from photonpano.files.atomic import atomic_path
 from photonpano.pipeline.checkpoints.fingerprint import Fingerprint, differences
 from photonpano.text import byte_size, counted
-from photonpano.values import Decision
+from photonpano.values import Decision, Journal
 
 logger = logging.getLogger(__name__)
 
@@ -55,10 +55,10 @@ class Continuation:
 class Work:
     """The work of a run; its `checkpoints` keep what the run finds."""
 
-    def __init__(self, folder: Path | None, now: Fingerprint, decisions: list[Decision], keep: bool) -> None:
+    def __init__(self, folder: Path | None, now: Fingerprint, keep: bool) -> None:
         self._folder, self._now, self._keep = folder, now, keep
         self._store = None if folder is None else Store(folder)
-        self._kept = None if self._store is None else Kept(self._store, decisions)
+        self._kept = None if self._store is None else Kept(self._store)
         self.checkpoints: Checkpoints = self._kept or KeepNothing()
         self._finished = False
 
@@ -94,9 +94,7 @@ def path_of(run_folder: Path) -> Path:
 
 
 @contextmanager
-def work_folder(
-    run_folder: Path, now: Fingerprint, decisions: list[Decision], how: Continuation, progress: Progress
-) -> Iterator[Work]:
+def work_folder(run_folder: Path, now: Fingerprint, how: Continuation, progress: Progress) -> Iterator[Work]:
     """Open the work folder of a run, whose lock is held; `InputError` if levels before `how.from_level` cannot be taken.
 
     What it holds stays after an interruption or an error. Where nothing can be kept, a warning says so, and the run goes on.
@@ -105,13 +103,13 @@ def work_folder(
     _require_levels(folder, now, how.from_level)
     try:
         _prepare(folder, now, how, progress)
-        work = Work(folder, now, decisions, how.keep or how.from_level is not None)
+        work = Work(folder, now, how.keep or how.from_level is not None)
     except (OutputError, OSError) as error:
         reason = error.strerror or error if isinstance(error, OSError) else error
         logger.warning(
             "%s: what the run finds cannot be kept (%s); if it is interrupted, all of it is computed again", folder, reason
         )
-        work = Work(None, now, decisions, keep=False)
+        work = Work(None, now, keep=False)
     try:
         yield work
     except BaseException as error:
@@ -288,38 +286,36 @@ class Store:
 class Kept:
     """Checkpoints in a store: see `photonpano.execution.context.Checkpoints`.
 
-    Decisions that components take while they work are kept with the results, and taken again when these are found.
+    Decisions of components are kept with the results that they were taken for, and taken again when these are found.
     """
 
-    def __init__(
-        self, store: Store, decisions: list[Decision], given: tuple[Any, ...] = (), logs: list[KeptLog] | None = None
-    ) -> None:
+    def __init__(self, store: Store, given: tuple[Any, ...] = (), logs: list[KeptLog] | None = None) -> None:
         """Open the checkpoints of a run; all results depend on `given`, beside what the whole store is for."""
-        self._store, self._decisions, self._given = store, decisions, given
+        self._store, self._given = store, given
         self._logs: list[KeptLog] = [] if logs is None else logs
 
-    def once(self, step: str, compute: Callable[[], ResultT], *given: Any) -> ResultT:
+    def once(self, step: str, compute: Callable[[], ResultT], *given: Any, decisions: Journal | None = None) -> ResultT:
         """See `photonpano.execution.context.Checkpoints`."""
-        name = self._name(step, given)
+        name, decisions = self._name(step, given), [] if decisions is None else decisions
         if (found := self._store.load(name)) is not None:
             kept: ResultT
-            kept, decisions = found
-            self._decisions += decisions
+            kept, taken = found
+            decisions += taken
             return kept
-        before = len(self._decisions)
+        before = len(decisions)
         result = compute()
-        self._store.save(name, (result, self._decisions[before:]))
+        self._store.save(name, (result, decisions[before:]))
         return result
 
-    def log(self, step: str, *given: Any) -> KeptLog:
+    def log(self, step: str, *given: Any, decisions: Journal | None = None) -> KeptLog:
         """See `photonpano.execution.context.Checkpoints`."""
-        log = KeptLog(self._store, self._name(step, given), self._decisions)
+        log = KeptLog(self._store, self._name(step, given), [] if decisions is None else decisions)
         self._logs.append(log)
         return log
 
     def within(self, *given: Any) -> Kept:
         """See `photonpano.execution.context.Checkpoints`."""
-        return Kept(self._store, self._decisions, (*self._given, *given), self._logs)
+        return Kept(self._store, (*self._given, *given), self._logs)
 
     def flush(self) -> None:
         """Write what the logs have not written yet."""
@@ -333,7 +329,7 @@ class Kept:
 class KeptLog:
     """Results of a step with many of them, in files of what was found within some seconds: see `context.Log`."""
 
-    def __init__(self, store: Store, name: str, decisions: list[Decision]) -> None:
+    def __init__(self, store: Store, name: str, decisions: Journal) -> None:
         self._store, self._name, self._decisions = store, name, decisions
         self._restored: list[Decision] = []
         self._first_decision = len(decisions)

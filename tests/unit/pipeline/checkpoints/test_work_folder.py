@@ -72,7 +72,7 @@ def place(tmp_path: Path) -> Path:
 def working(
     place: Path, now: dict[str, Any] | None = None, how: Continuation | None = None, notes: Notes | None = None
 ) -> Iterator[Work]:
-    with work_folder(place, now or fingerprint(), [], how or Continuation(), notes or Notes()) as work:
+    with work_folder(place, now or fingerprint(), how or Continuation(), notes or Notes()) as work:
         yield work
 
 
@@ -382,10 +382,10 @@ def test_once_computes_a_result_once_and_repeats_its_decisions(store: Store) -> 
         decisions.append(Decision("chunks", 3, "short"))
         return VALUE
 
-    kept = Kept(store, decisions)
+    kept = Kept(store)
     given = np.eye(3), "x"
     for _ in range(2):
-        assert kept.once("step", compute, *given).residual_px == VALUE.residual_px
+        assert kept.once("step", compute, *given, decisions=decisions).residual_px == VALUE.residual_px
     assert len(calls) == 1
     assert decisions == 2 * [Decision("chunks", 3, "short")]
     kept.once("step", compute, np.eye(3), "y")
@@ -403,41 +403,41 @@ def written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_log_goes_on_after_the_last_result_that_was_written(store: Store, written_at_once: None) -> None:
-    log = Kept(store, []).log("level-1", "given")
+    log = Kept(store).log("level-1", "given")
     for number in range(5):
         log.add(number)
-    again = Kept(store, []).log("level-1", "given")
+    again = Kept(store).log("level-1", "given")
     assert again.found == [0, 1, 2, 3, 4]
     again.add(5)
-    assert Kept(store, []).log("level-1", "given").found == [0, 1, 2, 3, 4, 5]
-    assert Kept(store, []).log("level-1", "other").found == []
-    assert Kept(store, []).log("level-1-revisits", "given").found == []
+    assert Kept(store).log("level-1", "given").found == [0, 1, 2, 3, 4, 5]
+    assert Kept(store).log("level-1", "other").found == []
+    assert Kept(store).log("level-1-revisits", "given").found == []
     assert not finished(store, "level-1")
     again.finish()
     assert finished(store, "level-1")
 
 
 def test_log_ends_before_a_damaged_file(store: Store, written_at_once: None, caplog: pytest.LogCaptureFixture) -> None:
-    log = Kept(store, []).log("level-1")
+    log = Kept(store).log("level-1")
     for number in range(4):
         log.add(number)
     (store.folder / f"{store.names('level-1')[2]}.pickle").write_bytes(b"nonsense")
-    log = Kept(store, []).log("level-1")
+    log = Kept(store).log("level-1")
     assert log.found == [0, 1]
     assert "is damaged" in caplog.text
     log.add(2)
     # What comes after it was found from the same results, and is still right.
-    assert Kept(store, []).log("level-1").found == [0, 1, 2, 3]
+    assert Kept(store).log("level-1").found == [0, 1, 2, 3]
 
 
 def test_log_repeats_decisions_unless_they_are_taken_again(store: Store, written_at_once: None) -> None:
     first, second = Decision("chunk_frames", 3, "short"), Decision("other", 1, "why")
     decisions: list[Decision] = []
-    log = Kept(store, decisions).log("level-1")
+    log = Kept(store).log("level-1", decisions=decisions)
     decisions += [first, second]
     log.add(0)
     later: list[Decision] = [Decision("source", "npy", "suffix")]
-    log = Kept(store, later).log("level-1")
+    log = Kept(store).log("level-1", decisions=later)
     later.append(first)
     log.finish()
     assert later[1:] == [first, second]
