@@ -13,8 +13,7 @@ import pytest
 from photonpano import LocationError, open_source
 from photonpano import run as run_plan
 from photonpano.execution.context import Context, Quiet
-from photonpano.pipeline.obstacles import timeline_of
-from photonpano.pipeline.shots import run_others
+from photonpano.pipeline.obstacles import run_others, timeline_of
 from photonpano.specs import parse_spec
 from photonpano.specs.plan import Plan
 from photonpano.values import FrameSpan

@@ -21,8 +21,7 @@ from photonpano.motion.tracking.rates_fit import fit_rates
 from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels, foreseen_groups
-from photonpano.pipeline.obstacles import timeline_of
-from photonpano.pipeline.shots import ApartError, parts_of, shots_of
+from photonpano.pipeline.obstacles import ApartError, parts_of, shots_of, timeline_of
 from photonpano.pipeline.state import State, model_of, within
 from photonpano.residuals.findings import Findings
 from photonpano.specs.plan import Plan

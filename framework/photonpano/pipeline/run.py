@@ -17,13 +17,12 @@ from photonpano.pipeline.checkpoints.work_folder import Continuation
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
 from photonpano.pipeline.follow import followed
-from photonpano.pipeline.obstacles import naming_obstacles
+from photonpano.pipeline.obstacles import naming_obstacles, run_others
+from photonpano.pipeline.passes import build_refiners, refine
 from photonpano.pipeline.pose_run import find_poses
-from photonpano.pipeline.refiners import build_refiners, refine
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_folder import write_exposures
 from photonpano.pipeline.run_steps import BegunRun, begun_run
-from photonpano.pipeline.shots import run_others
 from photonpano.pipeline.state import State
 from photonpano.record.run_json import record_of
 from photonpano.record.schema import RunRecord

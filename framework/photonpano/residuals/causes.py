@@ -11,8 +11,8 @@ import numpy as np
 from photonpano.motion.loop import LevelResult
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.findings import Findings
-from photonpano.residuals.lens import LensDistortion, deformation_px, lens_distortion
 from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
+from photonpano.residuals.patterns import LensDistortion, deformation_px, lens_distortion
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
 from photonpano.values import BoolArray
 from photonpano.values.verdict import Found, Test

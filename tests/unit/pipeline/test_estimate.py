@@ -13,7 +13,7 @@ from photonpano.execution.context import Context
 from photonpano.motion.diagnosis import UntiedError
 from photonpano.pipeline.components import build_source
 from photonpano.pipeline.estimate import estimate
-from photonpano.pipeline.shots import ApartError
+from photonpano.pipeline.obstacles import ApartError
 
 SPEC = {
     "version": 1,

@@ -18,11 +18,9 @@ from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, corner_displacements, inverse, likely_rotations, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Cut, Timeline
-from photonpano.pipeline.passes import Pass, Proposal, cut_at_jumps, later_levels, tried, worse_in_light
-from photonpano.pipeline.refiners import refine
+from photonpano.pipeline.passes import Pass, Proposal, cut_at_jumps, later_levels, refine, tried, worse_in_light
 from photonpano.pipeline.state import State
-from photonpano.record.run_json import refinement_record
-from photonpano.record.run_warnings import refinement_warnings
+from photonpano.record.run_json import refinement_record, refinement_warnings
 from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.refinement import Explained, MotionFit, NamedRefiner
 from photonpano.specs import parse_spec

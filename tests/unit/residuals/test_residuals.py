@@ -13,8 +13,8 @@ from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging.panorama import View, plan_canvas, render
 from photonpano.photometry import IntensityResponse
-from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import Residuals, measure
+from photonpano.residuals.patterns import lens_distortion
 from photonpano.residuals.prediction import Prediction, Predictions
 from photonpano.residuals.refinement import bounded_std_px, residual_ratio, unexplained_px
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, recorded

@@ -18,10 +18,9 @@ from photonpano.residuals import causes
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
 from photonpano.residuals.findings import Doubt, Findings, Jump
 from photonpano.residuals.halves import Agreements, Halves
-from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals
+from photonpano.residuals.patterns import LensDistortion, Shaking
 from photonpano.residuals.refinement import Explained, residual_ratio
-from photonpano.residuals.shaking import Shaking
 from photonpano.residuals.verdict import NARROW, judge, second_place_px
 from photonpano.values import Ambiguity, Edge, Located, Reason
 
