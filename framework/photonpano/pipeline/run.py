@@ -111,17 +111,12 @@ def run(
         so_far = partial(run, progress=Quiet(), overwrite=True)
         with followed(plan, so_far, usual(progress), overwrite=overwrite, end_after=end_after) as complete:
             return run(complete, progress, overwrite=overwrite, keep_work=keep_work)
-    result = _run_one(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite)
-    again = partial(run, progress=progress, overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work)
-    return replace(result, others=tuple(run_others(plan, result.record, again, usual(progress))))
-
-
-def _run_one(plan: Plan, progress: Progress, how: Continuation, overwrite: bool) -> RunResult:
-    """Run a plan, of whose shots the longest is located."""
-    with begun_run(plan, progress, how, overwrite=overwrite) as begun:
+    with begun_run(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite=overwrite) as begun:
         if not begun.was_finished:
             (make_panorama if plan.pose is None else find_poses)(begun)
-        return RunResult(plan.output.directory, begun.record, begun.verdict, begun.was_finished)
+    result = RunResult(plan.output.directory, begun.record, begun.verdict, begun.was_finished)
+    again = partial(run, progress=progress, overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work)
+    return replace(result, others=tuple(run_others(plan, result.record, again, usual(progress))))
 
 
 def make_panorama(run: BegunRun) -> None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 
-from photonpano.capture import capture_of
 from photonpano.compiling import notify_on_first_compile
 from photonpano.contracts.protocols import Source
 from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError, PhotonpanoError, PluginError
@@ -19,8 +18,7 @@ from photonpano.execution.context import Context, Progress, TimeLimit
 from photonpano.execution.threads import one_thread_inside
 from photonpano.files.atomic import atomic_path
 from photonpano.motion.loop import LevelResult
-from photonpano.pipeline.checkpoints.fingerprint import finished_run, run_fingerprint
-from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, work_folder
+from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, finished_run, run_fingerprint, work_folder
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.obstacles import order_warning
@@ -109,17 +107,12 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
             run.verdict = None if done["verdict"] is None else verdict_of(done["verdict"])
             yield run
         else:
-            run.journal += first_decisions(plan, source)
+            if warning := order_warning(source):
+                logger.warning(warning)
+            run.journal += [*filter(None, [plan.recognised]), *source.decisions]
             with _work(run, how) as run.work, _reporting_failure(run):
                 yield run
         finished(run.record)
-
-
-def first_decisions(plan: Plan, source: Source) -> Journal:
-    """Return what was decided while the capture was opened; warn if its pixels seem to be in another order."""
-    if warning := order_warning(source):
-        logger.warning(warning)
-    return [*filter(None, [plan.recognised]), *capture_of(source).decisions]
 
 
 def failure_path(directory: Path) -> Path:

@@ -19,7 +19,7 @@ from photonpano.geometry import (
 )
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.film import Film, outline_on
-from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
+from photonpano.record.picture_files import photo_sphere, with_xmp
 from photonpano.testing import MemorySource
 from photonpano.testing.scenes import detected
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from photonpano import Group, Located, LocationError, NotLocated, PluginError, Trajectory
-from photonpano.contracts.information import why_undetermined
-from photonpano.contracts.requirements import BrokenContract, require_motion, require_near_knots
+from photonpano.contracts.requirements import BrokenContract, require_motion, require_near_knots, why_undetermined
 from photonpano.geometry import jacobian, rescaled, translation
 from photonpano.motion.registration import BRIDGE
 from photonpano.specs.settings import GraphSettings

@@ -13,15 +13,16 @@ import pytest
 
 from photonpano import FrameSpan, Group, InputError, Located, NotLocated, parse_spec
 from photonpano.execution.context import Quiet
-from photonpano.pipeline.checkpoints.fingerprint import differences, run_fingerprint
 from photonpano.pipeline.checkpoints.work_folder import (
     Continuation,
     Kept,
     Store,
     Work,
+    differences,
     digest,
     finished,
     path_of,
+    run_fingerprint,
     work_folder,
 )
 from photonpano.record.schema import CaptureRecord
