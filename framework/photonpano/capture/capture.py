@@ -261,7 +261,7 @@ def seen_through(source: Source, camera: Camera) -> Capture:
     return replace(capture_of(source), camera=camera)
 
 
-def before(source: Source, background: Background | None) -> Capture:
+def with_background(source: Source, background: Background | None) -> Capture:
     """Return a capture in which what hides the background is left out; None for nothing. Counts stay as they are."""
     return replace(capture_of(source), background=background)
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter, uniform_filter1d
 
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of, with_background
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.corrections.lighting.finding import speed_px
 from photonpano.corrections.lighting.gains import least_weight, scene_canvas
@@ -330,4 +330,4 @@ def before_background_of(source: Source, folder: Path) -> Source:
     expected = len(instants), *(-(-side // CELL_PX) for side in shape)
     if not shown.shape == filled.shape == expected:
         raise InputError(f"{path} has cells of the shape {shown.shape}, not {expected} as the capture; run again")
-    return before(source, Background(instants, shown, filled, shape))
+    return with_background(source, Background(instants, shown, filled, shape))

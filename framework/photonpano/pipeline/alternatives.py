@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from photonpano.capture import before
+from photonpano.capture import with_background
 from photonpano.geometry import corners, inverse, transform_points
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.tracking import starting_motion
@@ -58,8 +58,8 @@ def _beside_rival(state: State, explained: Explained) -> tuple[Explained, Doubt 
     counts, too, where these show a single one.
     """
     share = float((np.nan_to_num(explained.residuals.block_chi2) > _MISFIT).mean())
-    start = starting_motion(before(state.source, None), state.results[0].groups, state.context) if share > _LEAST else None
-    if start is None:
+    source = with_background(state.source, None)
+    if share <= _LEAST or (start := starting_motion(source, state.results[0].groups, state.context)) is None:
         return explained, None
     known = np.isfinite(start.rivals).all(axis=1)
     shows = bool(known.mean() >= _KNOWN)

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from photonpano.capture import before, capture_of, leaving_out
+from photonpano.capture import capture_of, leaving_out, with_background
 from photonpano.contracts.attribution import label_of
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
@@ -104,7 +104,7 @@ def tried(state: State, propose: Pass) -> Trial:
     try:
         if (proposed := proposal.make()) is None:
             return Trial(state)
-        worse = "" if proposal.worse is None else proposal.worse(proposed.fit, state.fit)
+        worse = "" if proposal.worse is None else proposal.worse(proposed.fit(), state.fit())
     except (LocationError, CanvasTooLargeError) as error:
         if proposal.worse is None:
             raise
@@ -149,7 +149,7 @@ def without_shading(state: State) -> Proposal | None:
         first = divided(found)
         if asked or (background := capture_of(first.source).background) is None:
             return first
-        again = vignette_of(plan, before(source, background), state.trajectory)
+        again = vignette_of(plan, with_background(source, background), state.trajectory)
         return first if again is None else divided(again)
 
     return Proposal(make, worse=None)
@@ -196,7 +196,7 @@ def in_changing_light(state: State) -> Proposal | None:
         return None if again is None else lit(again).located(levels, first.trajectory)
 
     def settle(proposed: State) -> State:
-        found, residuals = light_of(proposed.source), proposed.fit.residuals
+        found, residuals = light_of(proposed.source), proposed.fit().residuals
         assert found is not None
         corrected = corrected_light(found, residuals.spans, *residuals.gains())
         return replace(lit(corrected), results=proposed.results, outdated=False)
@@ -242,7 +242,7 @@ def without_movers(state: State) -> Proposal | None:
     """Leave out what hides the background by the motion known so far: pairs that show both follow something in between."""
     if _uncertain(state):
         return None
-    last, source = state.results[-1], before(state.view.source, None)
+    last, source = state.results[-1], with_background(state.view.source, None)
     # The motion after a single level is as rough as that after the first of several.
     exact = len(state.levels) > 1 and last.level.number == state.levels[-1].number
     found = find_background(
@@ -262,10 +262,10 @@ def without_movers(state: State) -> Proposal | None:
 
 def without_what_changes(state: State) -> Proposal | None:
     """Leave out what hides the background by the refined motion, too, if parts of the panorama change over time."""
-    share, _ = changing_places(state.fit.residuals)
+    share, _ = changing_places(state.fit().residuals)
     if share < _CHANGING or _uncertain(state):
         return None
-    source, known = before(state.view.source, None), capture_of(state.source).background
+    source, known = with_background(state.view.source, None), capture_of(state.source).background
     found = find_background(source, state.motion.trajectory, state.motion.camera, state.motion.span, state.context, exact=True)
     if found is None:
         return None
@@ -274,7 +274,7 @@ def without_what_changes(state: State) -> Proposal | None:
 
 
 def _with_background(state: State, found: Background) -> State:
-    return replace(state, source=before(state.source, found), context=within(state.context, found), outdated=True)
+    return replace(state, source=with_background(state.source, found), context=within(state.context, found), outdated=True)
 
 
 def _uncertain(state: State) -> bool:
@@ -308,8 +308,8 @@ def cut_at_jumps(state: State) -> Proposal | None:
     Where the pieces then meet to less than 1 px, there was no jump. Raise `ApartError` where no pair ties them together.
     """
     # Where a motion is wrong, much looks as if it moved by itself: what is left of the photons may not show the jump.
-    every = state if capture_of(state.source).background is None else replace(state, source=before(state.source, None))
-    cuts = find_cuts(every.source, every.fit, state.context)
+    every = state if capture_of(state.source).background is None else replace(state, source=with_background(state.source, None))
+    cuts = find_cuts(every.source, every.fit(), state.context)
     if not cuts:
         return None
 
@@ -345,7 +345,7 @@ def _located_anew(state: State) -> State:
     """Locate all levels; light, and what hides the background, are found anew, since that was done along another motion."""
     if capture_of(state.source).background is None and state.light is None:
         return state.located(state.levels, state.start)
-    anew = replace(state, source=before(_in_steady_light(state.source), None), light=None, watched=False)
+    anew = replace(state, source=with_background(_in_steady_light(state.source), None), light=None, watched=False)
     anew = anew.located(state.levels[:1], state.start)
     light = [] if state.light is None else [in_changing_light]
     again: tuple[Pass, ...] = (without_movers, *light, later_levels, again_without_movers)
@@ -389,7 +389,7 @@ def refine(state: State, refiners: Sequence[NamedRefiner], decisions: Journal | 
                 state = tried(state, lambda known: Proposal(known.relocated, rejection=_NOT_RELOCATED)).state
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(before, state.motion), kept_out))
     state = tried(state, without_what_changes).state
-    return state, state.fit.explained(refinements)
+    return state, state.fit().explained(refinements)
 
 
 def _corrected(state: State, refiner: NamedRefiner, place: int, number: int, decisions: Journal | None) -> Proposal | None:
@@ -403,14 +403,16 @@ def _corrected(state: State, refiner: NamedRefiner, place: int, number: int, dec
     trajectory, homographies = FrameTrajectory(found.homographies), found.homographies
     motion = replace(state.motion, trajectory=trajectory, homographies=homographies, std_px=std_px, remaining_px=remaining_px)
     if number > 1 and _change_px(state.motion, motion) < _LINEAR_PX:
-        return Proposal(lambda: replace(state, refined=motion, known_fit=state.fit.moved(motion)), None, summary=found.summary)
+        return Proposal(
+            lambda: replace(state, refined=motion, known_fit=state.fit().moved(motion)), None, summary=found.summary
+        )
     rejection = f"a correction of {label_of(refiner.component)} is not used"
     return Proposal(lambda: replace(state, refined=motion, known_fit=None), rejection=rejection, summary=found.summary)
 
 
 def _refined(refiner: NamedRefiner, state: State) -> Refined | None:
     """Call a refiner, and make the homography of the reference frame the identity."""
-    motion, fit = state.motion, state.fit
+    motion, fit = state.motion, state.fit()
     given = state.view.source, motion.trajectory, motion.noise_px, fit.residuals.steps(), fit.predictions
     found = refiner.component.refine(*given)
     if found is None:

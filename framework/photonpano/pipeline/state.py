@@ -128,10 +128,13 @@ class State:
         """The motion of every frame."""
         return self.refined or motion_of_frames(self.results, self.source.info, self.reference)
 
-    @cached_property
     def fit(self) -> MotionFit:
-        """How well the motion explains the photons; `CanvasTooLargeError` or `LocationError` if the panorama has no canvas."""
-        return self.known_fit or MotionFit(self.view.source, self.motion, int(self.plan.run.memory), self.view.context)
+        """Return how well the motion explains the photons; `CanvasTooLargeError` or `LocationError` if that has no canvas."""
+        return self.known_fit or self._fit
+
+    @cached_property
+    def _fit(self) -> MotionFit:
+        return MotionFit(self.view.source, self.motion, int(self.plan.run.memory), self.view.context)
 
 
 def model_of(plan: Plan) -> MotionModel:

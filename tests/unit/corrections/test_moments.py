@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of, with_background
 from photonpano.corrections.moments import showing
 from photonpano.execution.threads import in_order
 from photonpano.geometry import Canvas, translation
@@ -48,7 +48,7 @@ def crossed(speed_px: float) -> tuple[MemorySource, KnownMotion]:
         reaching = np.pad(hidden, 4)
         cells.append(~np.array([[reaching[y : y + 16, x : x + 16].any() for x in range(0, 128, 8)] for y in range(0, 96, 8)]))
     shown = np.array(cells)
-    return before(MemorySource(frames), Background(INSTANTS, shown, shown, SHAPE)), motion
+    return with_background(MemorySource(frames), Background(INSTANTS, shown, shown, SHAPE)), motion
 
 
 def merged(movers: str | int, speed_px: float = 0.0) -> tuple[np.ndarray, str]:
@@ -102,7 +102,7 @@ def test_an_action_shot_shows_a_mover_several_times_apart_from_itself() -> None:
 
 def test_nothing_is_said_where_nothing_moves() -> None:
     source, motion = crossed(0.0)
-    plain = before(source, None)
+    plain = with_background(source, None)
     found, decisions, _ = showing(plain, motion, None, "action")
     assert capture_of(found).background is None
     assert not decisions
@@ -114,7 +114,7 @@ def test_the_share_whose_background_was_never_seen_is_told(movers: Literal["hide
     source, motion = crossed(0.0)
     shown = np.ones((len(INSTANTS), 12, 16), bool)
     shown[:, 4:8, 4:12] = False
-    never = before(source, Background(INSTANTS, shown, np.ones_like(shown), SHAPE))
+    never = with_background(source, Background(INSTANTS, shown, np.ones_like(shown), SHAPE))
     _, (said,), share = showing(never, motion, None, movers)
     assert (said.what, said.value) == ("background_never_seen", share)
     assert share == pytest.approx(32 / 192, abs=0.02)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, Source, parse_spec
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of, with_background
 from photonpano.corrections import estimate_vignette
 from photonpano.corrections.movers import (
     before_background_of,
@@ -142,7 +142,9 @@ def test_the_merged_background_is_that_without_the_walker() -> None:
         return np.where(photons.weight > 100, photons.counts / np.maximum(photons.weight, 1), np.nan)
 
     true = flux(panned(with_mover=False))
-    ghost, clean = (flux(source) - true for source in (panned(with_mover=True), before(panned(with_mover=True), found)))
+    ghost, clean = (
+        flux(source) - true for source in (panned(with_mover=True), with_background(panned(with_mover=True), found))
+    )
     assert np.nanmax(np.abs(ghost)) > 0.2
     assert np.sqrt(np.nanmean(clean**2)) < 0.25 * np.sqrt(np.nanmean(ghost**2))
 
@@ -159,7 +161,12 @@ def test_exposures_of_mergers_show_the_background_alone(merger: str) -> None:
         return VirtualExposures(level, source, [group], MOTION, Stopwatch(1)).merged(0).flux
 
     ghost, clean, background = map(
-        flux, (panned(with_mover=True), before(panned(with_mover=True), found), before(panned(with_mover=False), found))
+        flux,
+        (
+            panned(with_mover=True),
+            with_background(panned(with_mover=True), found),
+            with_background(panned(with_mover=False), found),
+        ),
     )
     assert np.isfinite(clean).mean() > 0.7
     assert np.nanmax(np.abs(ghost - background)) > 0.2
@@ -180,7 +187,7 @@ def test_the_vignette_is_that_of_the_background_without_the_walker() -> None:
         return float(vignette.gain[0, 0])
 
     assert abs(corner(walked) - corner(plain)) > 0.1
-    assert abs(corner(before(walked, found)) - corner(plain)) < 0.03
+    assert abs(corner(with_background(walked, found)) - corner(plain)) < 0.03
 
 
 def test_every_place_that_was_seen_is_in_the_panorama() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, LocationError, Refined
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of, with_background
 from photonpano.contracts.attribution import attributed
 from photonpano.errors import CanvasTooLargeError
 from photonpano.execution.context import Context
@@ -66,7 +66,7 @@ def propose(proposal: Any, worse: str = "", compared: bool = True) -> Callable[[
 def test_proposal_is_accepted_if_not_worse(
     step: Pass, accepted: bool, worse: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(State, "fit", None)
+    monkeypatch.setattr(State, "fit", lambda _: None)
     trial = tried(BEFORE, step)
     assert (trial.accepted, trial.worse) == (accepted, worse)
     assert trial.state.reference == (5 if accepted else 0)
@@ -111,7 +111,7 @@ def test_cut_among_dark_frames_is_not_compared(dark: FrameSpan | None, worse: st
     cut = Cut(4, np.array([3.0, 0.0]), 9.0, dark)
     monkeypatch.setattr("photonpano.pipeline.passes.find_cuts", lambda *_: (cut,))
     monkeypatch.setattr(MotionFit, "worse_than", lambda *_: "the scatter grew")
-    monkeypatch.setattr(State, "fit", None)
+    monkeypatch.setattr(State, "fit", lambda _: None)
     proposal = cut_at_jumps(BEFORE)
     assert proposal.worse(None, None) == worse
     assert proposal.rejection == "the image seems to jump before frame 4, but the motion is not cut there"
@@ -121,10 +121,11 @@ def test_jumps_are_looked_for_in_all_photons(monkeypatch: pytest.MonkeyPatch) ->
     """Along a motion that misses a jump, most of the frames around it look as if something hid the background there."""
     searched = []
     monkeypatch.setattr("photonpano.pipeline.passes.find_cuts", lambda source, *_: searched.append(source) or ())
-    monkeypatch.setattr(State, "fit", None)
+    monkeypatch.setattr(State, "fit", lambda _: None)
     cells = np.zeros((1, 1, 2), bool)
     assert (
-        cut_at_jumps(replace(BEFORE, source=before(BEFORE.source, Background(np.array([4.0]), cells, cells, (8, 16))))) is None
+        cut_at_jumps(replace(BEFORE, source=with_background(BEFORE.source, Background(np.array([4.0]), cells, cells, (8, 16)))))
+        is None
     )
     assert [capture_of(each).background for each in searched] == [None]
 
@@ -139,7 +140,7 @@ def test_motion_is_not_cut_where_pieces_meet(
     monkeypatch.setattr("photonpano.pipeline.passes.build_levels", lambda *_: ())
     monkeypatch.setattr(Cut, "along", lambda cut, *_: found[cut.frame])
     monkeypatch.setattr(State, "motion", SimpleNamespace(trajectory=None, frame_shape=None))
-    monkeypatch.setattr(State, "fit", None)
+    monkeypatch.setattr(State, "fit", lambda _: None)
     state = cut_at_jumps(BEFORE).make()
     assert (state and [cut.frame for cut in state.timeline.cuts]) == kept
 

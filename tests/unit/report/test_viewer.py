@@ -12,7 +12,7 @@ import pytest
 
 import photonpano.report
 from photonpano import FrameSpan, Group, Panorama, StreamInfo, VirtualExposure
-from photonpano.capture import before, in_light
+from photonpano.capture import in_light, with_background
 from photonpano.geometry import Canvas, rescaling, translation
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.panorama import RenderedPanorama
@@ -155,7 +155,7 @@ def capture_of_a_person(hidden_cells: int) -> OpenCapture:
     located = SimpleNamespace(instants=np.array([instant]), solution=solution)
     exposures = SimpleNamespace(merged=lambda _: exposure)
     level: Any = SimpleNamespace(level=SimpleNamespace(number=1), located=located, exposures=exposures)
-    return OpenCapture(before(source, found), [level])
+    return OpenCapture(with_background(source, found), [level])
 
 
 def test_pictures_of_frames_have_all_photons():
