@@ -120,9 +120,10 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
     if previous is not None:
         pairs = alike(pairs, previous.at(instants_of(groups)), shape)
     known = None if previous is None else previous.at(np.arange(exposures.source.info.n_frames))
-    given = groups, pairs, known, exposures.timeline, camera_of(exposures.source)
-    decisions = level.recorder.decisions
-    log = context.checkpoints.log(f"level-{level.number}", *given, decisions=decisions)
+    camera, decisions = camera_of(exposures.source), level.recorder.decisions
+    log = context.checkpoints.log(
+        f"level-{level.number}", groups, pairs, known, exposures.timeline, camera, decisions=decisions
+    )
     with thread_pool(context.threads) as pool:
         registrar = Registrar(exposures, log, context, start, excluded)
         title = f"level {level.number}: merge and locate"

@@ -394,8 +394,9 @@ def refine(state: State, refiners: Sequence[NamedRefiner], decisions: Journal | 
 
 def _corrected(state: State, refiner: NamedRefiner, place: int, number: int, decisions: Journal | None) -> Proposal | None:
     """Propose the motion that a refiner finds at a round, from 1; `place` is its own among those of the run."""
-    given = place, number, state.motion.homographies, state.motion.noise_px
-    found = state.view.context.checkpoints.once("refined", partial(_refined, refiner, state), *given, decisions=decisions)
+    once, known = state.view.context.checkpoints.once, state.motion
+    refined = partial(_refined, refiner, state)
+    found = once("refined", refined, place, number, known.homographies, known.noise_px, decisions=decisions)
     if found is None:
         return None
     remaining_px = REMAINING_SHARE * _moved_px(state.motion, found.homographies)
@@ -413,8 +414,8 @@ def _corrected(state: State, refiner: NamedRefiner, place: int, number: int, dec
 def _refined(refiner: NamedRefiner, state: State) -> Refined | None:
     """Call a refiner, and make the homography of the reference frame the identity."""
     motion, fit = state.motion, state.fit()
-    given = state.view.source, motion.trajectory, motion.noise_px, fit.residuals.steps(), fit.predictions
-    found = refiner.component.refine(*given)
+    source, residuals = state.view.source, fit.residuals.steps()
+    found = refiner.component.refine(source, motion.trajectory, motion.noise_px, residuals, fit.predictions)
     if found is None:
         return None
     homographies = inverse(found.homographies[motion.reference]) @ found.homographies
