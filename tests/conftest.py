@@ -338,8 +338,8 @@ def plugins_found_once() -> Iterator[None]:
 def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write an empty report in runs of this process: drawing it takes longer than a small run."""
     monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
-    monkeypatch.setattr("photonpano.pipeline.pose_run.render_pose_report", lambda *_: "<html></html>")
-    monkeypatch.setattr("photonpano.pipeline.run_steps.render_failure", lambda *_: "<html></html>")
+    monkeypatch.setattr("photonpano.pipeline.run.render_pose_report", lambda *_: "<html></html>")
+    monkeypatch.setattr("photonpano.pipeline.run.render_failure", lambda *_: "<html></html>")
 
 
 def pytest_collection_finish() -> None:

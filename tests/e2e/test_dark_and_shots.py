@@ -13,11 +13,9 @@ import pytest
 from photonpano import LocationError, open_source
 from photonpano import run as run_plan
 from photonpano.execution.context import Context, Quiet
-from photonpano.pipeline.obstacles import timeline_of
-from photonpano.pipeline.shots import run_others
+from photonpano.pipeline.obstacles import run_others, timeline_of
 from photonpano.specs import parse_spec
 from photonpano.specs.plan import Plan
-from photonpano.text import listed
 from photonpano.values import FrameSpan
 
 pytestmark = pytest.mark.usefixtures("without_report")
@@ -148,7 +146,7 @@ def test_other_shots_are_numbered_by_their_length_and_those_that_fail_are_left_o
 ) -> None:
     spans = [FrameSpan(0, 10), FrameSpan(10, 40), FrameSpan(40, 60), FrameSpan(60, 100)]
     record: Any = {
-        "decisions": [{"what": "shots", "value": listed(map(str, spans))}],
+        "findings": {"shots": [{"start": each.start, "stop": each.stop} for each in spans]},
         "source": {"frame_rate_hz": 100.0},
     }
 

@@ -130,7 +130,7 @@ def test_failure_of_the_report_does_not_hide_that_of_the_run(
     def fail(*_: object) -> None:
         raise OutputError("the disk is full")
 
-    monkeypatch.setattr(f"photonpano.pipeline.run_steps.{obstacle}", fail)
+    monkeypatch.setattr(f"photonpano.pipeline.run.{obstacle}", fail)
     np.save(tmp_path / "cube.npy", np.random.default_rng(0).integers(0, 256, (80, 48, 8), dtype=np.uint8))
     with pytest.raises(LocationError) as caught:
         run_plan(

@@ -23,7 +23,7 @@ def _check(spec: Path, changes: Sequence[str] = ()) -> Iterator[str]:
         what = f"poses by {plan.pose.contribution.name}" if plan.pose else counted(len(plan.levels), "level")
         up_to = "up to " if plan.until_converged else ""
         yield f"{spec}: ok, {up_to}{what} on {plan.source.contribution.name}: {source.info}"
-        for decision in plan.decisions:
-            yield f"{decision.what} is {decision.value}: {decision.reason}"
+        if (found := plan.recognised) is not None:
+            yield f"{found.what} is {found.value}: {found.reason}"
         for reason in dict.fromkeys(groups for groups in foreseen_groups(plan, source) if isinstance(groups, str)):
             yield f"groups are {reason}"

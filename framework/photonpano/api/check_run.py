@@ -11,12 +11,12 @@ from photonpano.api.opened_run import opened_run
 from photonpano.capture import capture_of
 from photonpano.execution.context import Context, Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
-from photonpano.motion.timeline import REPEATED
 from photonpano.pipeline.obstacles import timeline_of
 from photonpano.plugins.registry import Catalog
+from photonpano.record.run_json import findings_of
 from photonpano.residuals.refinement import MotionFit
 from photonpano.residuals.verdict import NARROW, REPEATS, judge
-from photonpano.values import Decision, Reason, Verdict
+from photonpano.values import Reason, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +63,12 @@ def check_run(
     with opened_run(Path(run_folder), catalog, moved=capture) as opened, one_thread_inside():
         record, plan = opened.record, opened.plan
         context = Context(thread_count(plan.run.threads), usual(progress))
-        copied = any(each["what"] == REPEATED for each in record.get("decisions", ()))
-        copies = timeline_of(opened.source, context).copies if copied else None
+        findings = findings_of(record)
+        copies = timeline_of(opened.source, context).copies if findings.repeated else None
         source = replace(capture_of(opened.source), copies=copies)
         fit = MotionFit(source, opened.motion, int(plan.run.memory), context)
         explained = fit.explained()
-    verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
+    verdict = judge(explained, (), findings)
     reasons = list(verdict.reasons)
     recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
     reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NARROW)]

@@ -160,8 +160,8 @@ class _Writer:
         if key != "use" or not kinds:
             return ""
         entry = self._catalog.find(kinds[0], value)
-        reasons = [decision.reason for decision in self._plan.decisions if decision.what == path.removesuffix(".use")]
-        return ", ".join([f"{entry.origin.plugin} {entry.origin.version}", *reasons])
+        chosen = self._plan.recognised if section == "source" else None
+        return f"{entry.origin.plugin} {entry.origin.version}" + (f", {chosen.reason}" if chosen else "")
 
     def _origin(self, path: str) -> str:
         """Return "default" or "--set" for a value that does not stand in the file."""

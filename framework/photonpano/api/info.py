@@ -137,14 +137,13 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
         with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as other:
             hot = read.valid & ~other.valid
         still = read.valid & ~marked.valid
-        decided = {each.what: each for each in marked.decisions}
         keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
         spec: dict[str, Any] = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
         if not plan.corrects_itself:
             spec["corrections"] = plan.document["corrections"]
         found = CaptureInfo(
             source=plan.source.contribution.name,
-            reason=next((decision.reason for decision in plan.decisions if decision.what == "source"), None),
+            reason=None if plan.recognised is None else plan.recognised.reason,
             n_frames=stream.n_frames,
             height=stream.height,
             width=stream.width,
@@ -158,8 +157,8 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
             unused_share=1 - float(read.valid.mean()),
             hot_share=float(hot[read.valid].mean()),
             still_share=float(still[read.valid].mean()),
-            standing_share=float(decided["standing_share"].value) if "standing_share" in decided else 0.0,
-            still_how=decided["still_pixels"].reason if "still_pixels" in decided else "not measured",
+            standing_share=marked.still.share,
+            still_how=marked.still.how,
             saturated_share=saturated_share(source),
             group_size=size,
             group_size_reason=reason,
@@ -179,10 +178,10 @@ def _group_size(plan: Plan, source: Source, summary: CaptureSummary, catalog: Ca
     source_section = {"use": plan.source.contribution.name, "with": plan.source.config.model_dump(by_alias=True)}
     spec = {"version": 1, "source": source_section, "resample": {"use": "midpoint"}, "levels": 1}
     try:
-        decisions = foreseen_decisions(parse_spec(spec, catalog=catalog), source, summary)
+        (chosen,) = foreseen_decisions(parse_spec(spec, catalog=catalog), source, summary)
     except InputError as error:
         return None, str(error)
-    return next((int(each.value), each.reason) for each in decisions if each.what == "group_size")
+    return int(chosen.value), chosen.reason
 
 
 def _warnings(source: Source, found: CaptureInfo, hot_left: float) -> Iterator[str]:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from photonpano.api.opened_run import OpenedRun, opened_run
-from photonpano.capture import before
+from photonpano.capture import with_background
 from photonpano.errors import InputError
 from photonpano.evaluation import load_run_poses
 from photonpano.execution.threads import thread_count
@@ -109,7 +109,7 @@ def _film(opened: OpenedRun, box: tuple[int, int, int, int]) -> Film:
     settings, recorded = opened.plan.render, opened.record["panorama"]
     if recorded is None:
         raise InputError(f"{opened.folder}: the run made no panorama, and the pictures are as bright as that")
-    source, canvas = before(opened.source, None), canvas_of_box(box, 1.0)  # what moves is shown, wherever it is
+    source, canvas = with_background(opened.source, None), canvas_of_box(box, 1.0)  # what moves is shown, wherever it is
     # A path that is smoothed over no frames is that of the camera.
     view = (opened.motion, canvas, settings.tolerance_px, 0.0, recorded["white_flux"], settings.white_balance)
     return Film(source, *view)

@@ -137,8 +137,9 @@ def require_same_plane(opened: OpenedRun) -> None:
 def _record(opened: OpenedRun, panorama: RenderedPanorama, chosen: Sequence[Decision], seconds: float) -> RunRecord:
     """Return the record of the run, with what was rendered again."""
     plan, old = opened.plan, opened.record
+    # The last decisions are those of renderer and exporters.
     before = [] if old["panorama"] is None else old["panorama"].get("decisions", [])
-    kept = [each for each in old["decisions"] if each["what"] not in before]
+    kept = old["decisions"][: len(old["decisions"]) - len(before)]
     return {
         **old,
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -146,6 +147,7 @@ def _record(opened: OpenedRun, panorama: RenderedPanorama, chosen: Sequence[Deci
         "plugins": plugin_records(plan),
         "libraries": library_versions(plan),
         "decisions": [*kept, *decision_records(chosen)],
+        "findings": {**old.get("findings", {}), "never_seen_share": panorama.never_seen_share},
         "panorama": panorama_record(plan, panorama, chosen),
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_memory_bytes(),

@@ -14,7 +14,7 @@ import typer
 from photonpano.api.command import command
 from photonpano.api.opened_run import OpenedRun, opened_run
 from photonpano.api.render import require_harmless, require_same_plane
-from photonpano.capture import before
+from photonpano.capture import with_background
 from photonpano.corrections.moments import showing
 from photonpano.errors import InputError
 from photonpano.execution.context import Progress, usual
@@ -179,7 +179,7 @@ def _frames(exposure: str, rate: float | None) -> int:
 def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> Film:
     plan, motion, recorded = opened.plan, opened.motion, opened.record["panorama"]
     memory = int(plan.run.memory)
-    source = before(opened.source, None)  # what moves is shown, wherever it is
+    source = with_background(opened.source, None)  # what moves is shown, wherever it is
     if recorded is None:
         raise InputError(f"{opened.folder}: the run made no panorama, and a video is as bright as that")
     if view == "panorama":
@@ -197,7 +197,7 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
             f"{byte_size(memory)} of run.memory; lower render.scale, or choose a part with render.extent"
         )
     tolerance_px = plan.render.tolerance_px
-    still, _ = showing(opened.source, motion.trajectory, motion.camera, plan.render.movers)
+    still, *_ = showing(opened.source, motion.trajectory, motion.camera, plan.render.movers)
     brighter = plan.render.exposure_stops - opened.record["spec"]["render"]["exposure_stops"]
     return Film(
         source,

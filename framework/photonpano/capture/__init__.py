@@ -1,6 +1,15 @@
 """One record of a capture as a run sees it: what its source gives, and what was found about it."""
 
-from photonpano.capture.capture import Capture, Colours, before, capture_of, in_light, leaving_out, part_of, seen_through
+from photonpano.capture.capture import (
+    Capture,
+    Colours,
+    capture_of,
+    in_light,
+    leaving_out,
+    part_of,
+    seen_through,
+    with_background,
+)
 from photonpano.capture.pixels import MISSING, Gather, Index, LinearCorrection, MaskedSpan, numbered
 from photonpano.capture.plugin_source import PluginSource
 
@@ -13,11 +22,11 @@ __all__ = [
     "LinearCorrection",
     "MaskedSpan",
     "PluginSource",
-    "before",
     "capture_of",
     "in_light",
     "leaving_out",
     "numbered",
     "part_of",
     "seen_through",
+    "with_background",
 ]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of, with_background
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.corrections.lighting.gains import scene_canvas
 from photonpano.corrections.movers import places_of_cells
@@ -75,8 +75,8 @@ class _Scene:
 
 def showing(
     source: Source, trajectory: Trajectory, camera: Camera | None, movers: Literal["hide", "show", "action"] | int
-) -> tuple[Source, list[Decision]]:
-    """Return a capture with what of its movers a panorama shows, and what there is to say of that.
+) -> tuple[Source, list[Decision], float]:
+    """Return a capture with the movers that a panorama shows, decisions on them, and the share whose background was never seen.
 
     Args:
         source: the capture, without what hides its background; as it is, if nothing does.
@@ -86,7 +86,7 @@ def showing(
     """
     background = capture_of(source).background
     if background is None:
-        return before(source, None), []
+        return with_background(source, None), [], 0.0
     motions = trajectory.at(background.instants)
     frames = scene_canvas(camera, motions, source.info.frame_shape, 2 / CELL_PX)
     margin = max(background.shown.shape[1:])  # half a frame, for lenses
@@ -99,7 +99,7 @@ def showing(
         said = f"the background of {share:.1%} of the panorama was never seen{instead}"
         decisions.append(Decision("background_never_seen", share, said))
     if movers == "show":
-        return before(source, None), decisions
+        return with_background(source, None), decisions, share
     hidden, moments = ~background.filled, list[tuple[int, BoolArray]]()
     if movers != "hide":
         nearest = 0 if movers == "action" else int(np.abs(background.instants - movers).argmin())
@@ -108,7 +108,7 @@ def showing(
     if movers != "hide":
         at = ", ".join(f"{background.instants[each]:.0f}" for each in times) or "none"
         decisions.append(Decision("shown_movers", len(times), f"what moves is shown as it was around frames: {at}"))
-    return before(source, shown), decisions
+    return with_background(source, shown), decisions, share
 
 
 def _whole_movers(hidden: BoolArray) -> list[tuple[int, BoolArray]]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter, uniform_filter1d
 
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of, with_background
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.corrections.lighting.finding import speed_px
 from photonpano.corrections.lighting.gains import least_weight, scene_canvas
@@ -27,7 +27,6 @@ from photonpano.reading import reading
 from photonpano.robust import cauchy_weights, robust_std
 from photonpano.values import CELL_PX, Background, BoolArray, Decision, FloatArray, FluxImage, FrameSpan, Homography
 
-MOVERS = "movers"  # name of the decision
 LAYERS_FILE = "layers.npz"
 _ARRAYS = ("instants", "shown", "filled")
 _INSTANTS = 400  # at which frames are compared with the background
@@ -167,7 +166,8 @@ def decision_of(background: Background) -> Decision:
     hidden = 1 - background.shown.mean(axis=(1, 2))
     most = round(float(background.instants[int(np.argmax(hidden))]))
     reason = f"do not show the background, which moves as the camera does, most at frame {most} ({hidden.max():.0%})"
-    return Decision(MOVERS, round(float(hidden.mean()), 4), f"{hidden.mean():.1%} of the frames {reason}; they are left out")
+    share = background.hidden_share
+    return Decision("movers", round(share, 4), f"{share:.1%} of the frames {reason}; they are left out")
 
 
 def _seen(source: Source, trajectory: Trajectory, camera: Camera | None, span: FrameSpan, context: Context) -> _Seen | None:
@@ -330,4 +330,4 @@ def before_background_of(source: Source, folder: Path) -> Source:
     expected = len(instants), *(-(-side // CELL_PX) for side in shape)
     if not shown.shape == filled.shape == expected:
         raise InputError(f"{path} has cells of the shape {shown.shape}, not {expected} as the capture; run again")
-    return before(source, Background(instants, shown, filled, shape))
+    return with_background(source, Background(instants, shown, filled, shape))

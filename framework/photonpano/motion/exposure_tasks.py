@@ -8,8 +8,7 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from photonpano.contracts.attribution import blaming
-from photonpano.contracts.information import why_undetermined
-from photonpano.contracts.requirements import require_no_standstill
+from photonpano.contracts.requirements import require_no_standstill, why_undetermined
 from photonpano.execution.threads import Guard, Stopwatch
 from photonpano.geometry import why_implausible
 from photonpano.motion.closures import exposure_similarity

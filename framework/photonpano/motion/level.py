@@ -31,7 +31,7 @@ class Recorder:
 
     def __init__(self, decisions: list[Decision] | None = None) -> None:
         """Take the list of a run that receives decisions; None in another process."""
-        self._decisions, self._waiting = decisions, list[Decision]()
+        self.decisions, self._waiting = decisions, list[Decision]()
 
     def __call__(self, what: str, value: DecisionValue, reason: str) -> None:
         """Record a decision; a `TypeError` if its value is no plain one."""
@@ -41,7 +41,7 @@ class Recorder:
 
     def add(self, decision: Decision) -> None:
         """Record a decision that was taken elsewhere."""
-        (self._waiting if self._decisions is None else self._decisions).append(decision)
+        (self._waiting if self.decisions is None else self.decisions).append(decision)
 
     def taken(self) -> tuple[Decision, ...]:
         """Return the decisions that another process has collected, once; in that of the run, there are none."""

@@ -11,12 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from photonpano.contracts.protocols import Trajectory
 from photonpano.geometry import corners, inverse, transform_points
-from photonpano.text import listed
-from photonpano.values import BoolArray, Decision, FloatArray, FrameSpan, Group
+from photonpano.values import BoolArray, FloatArray, FrameSpan, Group
 
-# Names of decisions in a record.
-CUT, DARK_FRAMES, DARK_JUMP, REPEATED = "cut", "dark_frames", "jump_in_the_dark", "repeated_frames"
-SHOTS, UNCUT_JUMP = "shots", "uncut_jump"
 # Frames of the shortest part of a group that is kept beside a cut.
 _SHORTEST_PART = 4
 
@@ -42,16 +38,6 @@ class Cut:
     def size_px(self) -> float:
         """Length of the shift, in px."""
         return float(np.linalg.norm(self.shift_px))
-
-    @property
-    def decision(self) -> Decision:
-        """What was found, for the record."""
-        jump = f"the image jumps by {self.size_px:.2g} px ({self.sigmas:.0f} standard deviations)"
-        if self.dark is not None:
-            reason = f"{jump} while they show nothing; the interpolation is cut in the middle, at frame {self.frame}"
-            return Decision(DARK_JUMP, str(self.dark), reason)
-        reason = f"{jump} from the frame before to this one, as where frames are missing or doubled"
-        return Decision(CUT, self.frame, f"{reason}; the interpolation is cut there")
 
     @property
     def bounds(self) -> tuple[int, ...]:
@@ -99,16 +85,9 @@ class Timeline:
         return max(self.shots, key=len, default=FrameSpan(0, len(self.taken)))
 
     @property
-    def decisions(self) -> list[Decision]:
-        """What is known of missing, repeated and dark frames, for the record."""
-        repeated = int(len(self.taken) - 1 - self.taken[-1])
-        found = [Decision(REPEATED, repeated, "copies of the frame before; the motion stands still there")]
-        dark = [
-            Decision(DARK_FRAMES, str(span), "no light reaches the sensor; these frames are left out") for span in self.dark
-        ]
-        apart = f"no motion ties them together; {self.shot} are located, since they are the most"
-        shots = [Decision(SHOTS, listed(map(str, self.shots)), apart)] if self.shots else []
-        return (found if repeated else []) + shots + dark + [cut.decision for cut in self.cuts]
+    def n_repeated(self) -> int:
+        """How many frames are copies of the one before."""
+        return int(len(self.taken) - 1 - self.taken[-1])
 
     def cut_at(self, cuts: Sequence[Cut]) -> Timeline:
         """Return this timeline with other cuts."""

@@ -39,7 +39,7 @@ class Spec:
     directory: Path = Path()  # what relative paths count from
     arriving: bool = False  # whether the capture is still being written, so that its files are not checked
     problems: list[Problem] = field(default_factory=list)
-    decisions: list[Decision] = field(default_factory=list)  # choices that the spec leaves open and that reading it made
+    recognised: Decision | None = None  # the source that recognised the capture, where the spec leaves it open
     remark: str = ""  # added to the message of every problem
 
     def wrong(self, value: Written, message: str) -> None:

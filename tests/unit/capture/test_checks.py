@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from photonpano import (
     parse_spec,
     simulate,
 )
+from photonpano.capture import capture_of
 from photonpano.capture.writing import truth_path
 from photonpano.errors import LocationError
 from photonpano.execution.context import Context
@@ -28,7 +30,7 @@ from photonpano.reading import FrameFile, FrameLayout, PackedFileSource
 from photonpano.record.contents import changes, fingerprint
 from photonpano.record.schema import CaptureRecord
 from photonpano.testing import MemorySource
-from photonpano.values import Decision
+from photonpano.values import Still
 
 DARK = (
     "no pixel is lit in any of {} frames sampled all over the capture; "
@@ -124,8 +126,8 @@ def tiles(period: int) -> np.ndarray:
 
 def test_error_names_what_stands_still_and_what_repeats() -> None:
     frames = np.random.default_rng(0).random((64, *SHAPE)) < 4 * tiles(20)
-    decisions = [Decision("standing_share", 0.38, "")]
-    with pytest.raises(LocationError) as raised, MemorySource(frames) as source, naming_obstacles(source, decisions):
+    capture = replace(capture_of(MemorySource(frames)), still=Still(0.38))
+    with pytest.raises(LocationError) as raised, naming_obstacles(capture):
         raise LocationError("none of the pairs could be located")
     assert str(raised.value).splitlines() == [
         "none of the pairs could be located",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.capture import before
+from photonpano.capture import with_background
 from photonpano.corrections.moments import showing
 from photonpano.execution.threads import in_order
 from photonpano.geometry import Canvas, translation
@@ -48,13 +48,13 @@ def crossed(speed_px: float) -> tuple[MemorySource, KnownMotion]:
         reaching = np.pad(hidden, 4)
         cells.append(~np.array([[reaching[y : y + 16, x : x + 16].any() for x in range(0, 128, 8)] for y in range(0, 96, 8)]))
     shown = np.array(cells)
-    return before(MemorySource(frames), Background(INSTANTS, shown, shown, SHAPE)), motion
+    return with_background(MemorySource(frames), Background(INSTANTS, shown, shown, SHAPE)), motion
 
 
 def merged(movers: str | int, speed_px: float = 0.0) -> tuple[np.ndarray, str]:
     """Return the panorama of the first view, and the reason of the last decision."""
     source, motion = crossed(speed_px)
-    shown, decisions = showing(source, motion, None, movers)
+    shown, decisions, _ = showing(source, motion, None, movers)
     panorama = MergeRenderer(partial(in_order, threads=1)).render(shown, motion, FrameSpan(0, N), CANVAS, 0.125, lambda _: None)
     return panorama.flux, decisions[-1].reason if decisions else ""
 
@@ -92,7 +92,7 @@ def test_the_share_whose_background_was_never_seen_is_told(movers: Literal["hide
     source, motion = crossed(0.0)
     shown = np.ones((len(INSTANTS), 12, 16), bool)
     shown[:, 4:8, 4:12] = False
-    never = before(source, Background(INSTANTS, shown, np.ones_like(shown), SHAPE))
-    _, (said,) = showing(never, motion, None, movers)
-    assert said.what == "background_never_seen"
-    assert float(said.value) == pytest.approx(32 / 192, abs=0.02)
+    never = with_background(source, Background(INSTANTS, shown, np.ones_like(shown), SHAPE))
+    _, (said,), share = showing(never, motion, None, movers)
+    assert (said.what, said.value) == ("background_never_seen", share)
+    assert share == pytest.approx(32 / 192, abs=0.02)

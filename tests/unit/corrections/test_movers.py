@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, Source, parse_spec
-from photonpano.capture import before
+from photonpano.capture import with_background
 from photonpano.corrections.movers import (
     decision_of,
     find_background,
@@ -117,7 +117,9 @@ def test_the_merged_background_is_that_without_the_walker() -> None:
         return np.where(photons.weight > 100, photons.counts / np.maximum(photons.weight, 1), np.nan)
 
     true = flux(panned(with_mover=False))
-    ghost, clean = (flux(source) - true for source in (panned(with_mover=True), before(panned(with_mover=True), found)))
+    ghost, clean = (
+        flux(source) - true for source in (panned(with_mover=True), with_background(panned(with_mover=True), found))
+    )
     assert np.nanmax(np.abs(ghost)) > 0.2
     assert np.sqrt(np.nanmean(clean**2)) < 0.25 * np.sqrt(np.nanmean(ghost**2))
 
@@ -134,7 +136,12 @@ def test_exposures_of_mergers_show_the_background_alone(merger: str) -> None:
         return VirtualExposures(level, source, [group], MOTION, Stopwatch(1)).merged(0).flux
 
     ghost, clean, background = map(
-        flux, (panned(with_mover=True), before(panned(with_mover=True), found), before(panned(with_mover=False), found))
+        flux,
+        (
+            panned(with_mover=True),
+            with_background(panned(with_mover=True), found),
+            with_background(panned(with_mover=False), found),
+        ),
     )
     assert np.isfinite(clean).mean() > 0.7
     assert np.nanmax(np.abs(ghost - background)) > 0.2

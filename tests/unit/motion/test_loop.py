@@ -16,6 +16,7 @@ from photonpano.motion.level import Level
 from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import LevelResult, converges, estimate_motion
 from photonpano.motion.timeline import Cut, Timeline
+from photonpano.residuals.findings import Findings
 from photonpano.specs.settings import GraphSettings
 
 N_FRAMES = 120
@@ -224,7 +225,7 @@ def test_pieces_end_in_long_darkness_and_other_shots_are_not_shown() -> None:
     timeline = replace(REGULAR, dark=(FrameSpan(0, 10), FrameSpan(40, 61))).in_shots([FrameSpan(0, 90), FrameSpan(90, 120)])
     np.testing.assert_array_equal(timeline.piece_of([5, 50, 51, 100]), [0, 1, 1, 1])
     np.testing.assert_array_equal(np.flatnonzero(timeline.shown), [*range(10, 40), *range(61, 90)])
-    assert [(each.what, each.value) for each in timeline.decisions] == [
+    assert [(each.what, each.value) for each in Findings().along(timeline).of_frames] == [
         ("shots", "frames 0 to 89 and frames 90 to 119"),
         ("dark_frames", "frames 0 to 9"),
         ("dark_frames", "frames 40 to 60"),

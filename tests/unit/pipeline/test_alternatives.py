@@ -10,7 +10,6 @@ import pytest
 from photonpano import parse_spec, run, simulate
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import corner_errors, load_truth
-from photonpano.residuals.tested_run import RIVAL
 
 SMALL, LARGE = ((96, 144), 600, 100), ((128, 192), 1000, 150)  # frame shape, frames, length of the pan in px
 MOVES_PX = (0.02, 0.006)
@@ -49,7 +48,7 @@ def test_motion_of_a_thing_that_fills_half_of_the_frame_has_a_rival(run_with: Ca
     result, errors_px, std_px = run_with([thing], LARGE, levels=2)
     assert result.verdict is not None
     assert result.verdict.reasons[0].what == "parts of the frame follow another motion than the one that was found"
-    assert [each["what"] for each in result.record["decisions"]].count(RIVAL) == 1
+    assert [each["what"] for each in result.record["decisions"]].count("rival_motion") == 1
     assert (errors_px <= 3 * std_px).mean() > 0.9
 
 

@@ -18,7 +18,7 @@ from photonpano.geometry import (
 )
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.film import Film
-from photonpano.pipeline.photo_sphere import photo_sphere
+from photonpano.record.picture_files import photo_sphere
 from photonpano.testing import MemorySource
 from photonpano.testing.scenes import detected
 

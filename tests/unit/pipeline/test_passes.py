@@ -13,10 +13,9 @@ from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, likely_rotations, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.timeline import Timeline
-from photonpano.pipeline.refiners import refine
+from photonpano.pipeline.passes import refine
 from photonpano.pipeline.state import State
-from photonpano.record.run_json import refinement_record
-from photonpano.record.run_warnings import refinement_warnings
+from photonpano.record.run_json import refinement_record, refinement_warnings
 from photonpano.residuals.refinement import Explained, NamedRefiner
 from photonpano.specs import parse_spec
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonpano import Group, VirtualExposure
-from photonpano.capture import before
+from photonpano.capture import with_background
 from photonpano.report import OpenCapture, viewer
 from photonpano.testing import MemorySource
 from photonpano.values import CELL_PX, Background
@@ -80,7 +80,7 @@ def capture_of_a_person(hidden_cells: int) -> OpenCapture:
     located = SimpleNamespace(instants=np.array([instant]), solution=solution)
     exposures = SimpleNamespace(merged=lambda _: exposure)
     level: Any = SimpleNamespace(level=SimpleNamespace(number=1), located=located, exposures=exposures)
-    return OpenCapture(before(source, found), [level])
+    return OpenCapture(with_background(source, found), [level])
 
 
 def test_pictures_of_frames_have_all_photons():

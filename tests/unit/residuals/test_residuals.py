@@ -12,8 +12,8 @@ from photonpano.capture import capture_of, seen_through
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging.panorama import View, plan_canvas, render
-from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import Residuals, measure
+from photonpano.residuals.patterns import lens_distortion
 from photonpano.residuals.prediction import Predictions
 from photonpano.residuals.refinement import bounded_std_px, residual_ratio, unexplained_px
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, recorded

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from photonpano.residuals.shaking import find_shaking, scatter_px
+from photonpano.residuals.patterns import find_shaking, scatter_px
 
 WINDOWS, FRAMES, SPAN = 16, 36, 12
 NOISE_PX = 0.1

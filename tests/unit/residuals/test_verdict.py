@@ -14,20 +14,23 @@ from photonpano.geometry import Camera
 from photonpano.motion.graph import Freed, Rival
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.model import SAME_LENS_PX, MotionModel
-from photonpano.motion.timeline import DARK_JUMP
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
+from photonpano.residuals.findings import Findings, Jump
 from photonpano.residuals.halves import Agreements, Halves
-from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals
+from photonpano.residuals.patterns import LensDistortion, Shaking
 from photonpano.residuals.refinement import Explained, residual_ratio
-from photonpano.residuals.shaking import Shaking
 from photonpano.residuals.verdict import NARROW, judge
-from photonpano.values import Ambiguity, Decision, Edge, Located
+from photonpano.values import Ambiguity, Edge, Located
 
 SHAPE, N_SPANS, SPAN = (128, 192), 200, 10
 
 
 Made = dict[str, Any]
+
+
+def jump(start: int, stop: int) -> Jump:
+    return Jump(start, 7.0, 20.0, FrameSpan(start, stop))
 
 
 def squares(residuals: Residuals, **values: float) -> Made:
@@ -312,25 +315,21 @@ def test_camera_that_pairs_contradict_by_ten_expected_errors_is_doubtful(
 
 
 @pytest.mark.parametrize(
-    ("decisions", "figure", "where"),
+    ("findings", "figure", "where"),
     [
-        ([Decision("standing_share", 0.6, "")], 0.6, "share of the parts that show motion or rest"),
-        (
-            [Decision(DARK_JUMP, "frames 3 to 5", ""), Decision(DARK_JUMP, "frames 9 to 12", "")],
-            2,
-            "frames 3 to 5, frames 9 to 12",
-        ),
+        (Findings(standing_share=0.6), 0.6, "share of the parts that show motion or rest"),
+        (Findings(cuts=(jump(3, 6), jump(9, 13))), 2, "frames 3 to 5, frames 9 to 12"),
     ],
 )
-def test_decisions_are_doubtful(explained: Explained, decisions: list[Decision], figure: float, where: str) -> None:
-    [reason] = judge(explained, (), decisions).reasons
+def test_findings_are_doubtful(explained: Explained, findings: Findings, figure: float, where: str) -> None:
+    [reason] = judge(explained, (), findings).reasons
     assert (reason.figure, reason.where) == (figure, where)
-    assert not judge(explained, (), [Decision("standing_share", 0.4, "")]).reasons
+    assert not judge(explained, (), Findings(standing_share=0.4)).reasons
 
 
 def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained) -> None:
     """A thing that fills the middle of all frames passes for the scene, and what is seen beside it for what hides that."""
-    found = [judge(explained, (), [Decision("movers", share, "")]).reasons for share in (0.48, 0.52)]
+    found = [judge(explained, (), Findings(hidden_share=share)).reasons for share in (0.48, 0.52)]
     assert [[reason.figure for reason in reasons] for reasons in found] == [[], [0.52]]
 
 

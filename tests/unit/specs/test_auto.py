@@ -54,7 +54,7 @@ def test_auto_is_the_source_that_recognises_the_path(folder, catalog):
     plan = parsed(folder, catalog, path="cube.npy", frame_rate_hz=96800)
     named = {"use": "packed-npy", "with": {"path": str(folder / "cube.npy"), "frame_rate_hz": 96800}}
     assert plan.document == parse_spec({"version": 1, "source": named}, directory=folder, catalog=catalog).document
-    assert plan.decisions == (Decision("source", "packed-npy", "cube.npy was recognised: its name ends in .npy"),)
+    assert plan.recognised == Decision("source", "packed-npy", "cube.npy was recognised: its name ends in .npy")
 
 
 def test_written_keys_override_recognised_keys(folder, catalog):

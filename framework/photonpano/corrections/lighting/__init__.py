@@ -2,7 +2,6 @@
 
 from photonpano.capture import in_light
 from photonpano.corrections.lighting.finding import (
-    LIGHT_DECISION,
     corrected_light,
     decision_of,
     find_light,
@@ -13,7 +12,6 @@ from photonpano.corrections.lighting.finding import (
 from photonpano.corrections.lighting.flat_field import PixelGain, measure_pixel_gain
 
 __all__ = [
-    "LIGHT_DECISION",
     "PixelGain",
     "corrected_light",
     "decision_of",

@@ -20,7 +20,6 @@ from photonpano.geometry import corner_displacements, inverse
 from photonpano.reading import reading
 from photonpano.values import Decision, FloatArray, FrameSpan, Light
 
-LIGHT_DECISION = "light"  # what a record names the decision to divide by the gain of the light
 # Least root mean square of changes of the light, between instants that see the same places, that are divided out.
 LEAST_CHANGE = 0.03
 _LEAST_SIGMAS = 3.0  # least ratio of these changes to their noise
@@ -111,7 +110,7 @@ def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:
     if light.frequency:
         period = f"with a period of {1 / light.frequency:.4g} frames"
         where += f", {period}" if frame_rate_hz is None else f", at {light.frequency * frame_rate_hz:.2f} Hz"
-    return Decision(LIGHT_DECISION, round(depth, 3), where)
+    return Decision("light", round(depth, 3), where)
 
 
 def _gains(source: Source, trajectory: Trajectory, spans: list[FrameSpan], context: Context) -> Gains:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from photonpano import Group, Located, LocationError, NotLocated, PluginError, Trajectory
-from photonpano.contracts.information import why_undetermined
-from photonpano.contracts.requirements import BrokenContract, require_near_knots
+from photonpano.contracts.requirements import BrokenContract, require_near_knots, why_undetermined
 from photonpano.geometry import translation
 from photonpano.specs.settings import GraphSettings
 

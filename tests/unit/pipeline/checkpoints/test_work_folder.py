@@ -13,13 +13,14 @@ import pytest
 
 from photonpano import FrameSpan, Group, InputError, Located, parse_spec
 from photonpano.execution.context import Quiet
-from photonpano.pipeline.checkpoints.fingerprint import differences, run_fingerprint
 from photonpano.pipeline.checkpoints.work_folder import (
     Continuation,
     Store,
     Work,
+    differences,
     digest,
     path_of,
+    run_fingerprint,
     work_folder,
 )
 from photonpano.record.schema import CaptureRecord
@@ -69,7 +70,7 @@ def place(tmp_path: Path) -> Path:
 def working(
     place: Path, now: dict[str, Any] | None = None, how: Continuation | None = None, notes: Notes | None = None
 ) -> Iterator[Work]:
-    with work_folder(place, now or fingerprint(), [], how or Continuation(), notes or Notes()) as work:
+    with work_folder(place, now or fingerprint(), how or Continuation(), notes or Notes()) as work:
         yield work
 
 
