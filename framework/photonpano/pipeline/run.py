@@ -113,8 +113,8 @@ def run(
 
     Raises:
         InputError: the capture cannot be used or followed, shows nothing, or does not suit the plan.
-        LocationError: the motion could not be estimated; `report` is a page with the exposures that did not match, beside the
-            run folder. So it is for the next two.
+        LocationError: the motion could not be estimated. `report` of this error and of the next two is a page beside the run
+            folder, with the exposures that did not match.
         CanvasTooLargeError: the panorama would exceed the memory of the spec.
         PluginError: a component failed in its own way, or broke its contract.
         OutputError: the run folder cannot be written, or another process writes it; it is as it was.
