@@ -22,8 +22,8 @@ from photonpano import discover
 from photonpano.api.cli.app import app, commands
 from photonpano.api.cli.verbosity import PARAMETERS
 from photonpano.corrections import CORRECTIONS
-from photonpano.plugins.registry import KINDS
-from photonpano.plugins.registry.description import config_rows
+from photonpano.plugins.contributions import KINDS
+from photonpano.plugins.description import config_rows
 from photonpano.specs.resolution import SETTINGS
 from photonpano.specs.settings import LevelSettings
 

@@ -22,7 +22,7 @@ from photonpano.geometry import from_parameters, normalised, translation
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run import RunResult
 from photonpano.plugins import registry
-from photonpano.plugins.registry.catalog import DISABLE
+from photonpano.plugins.registry import DISABLE
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_simulator import scenes
 

@@ -12,7 +12,7 @@ from harness import Study, packed
 from numpy.typing import NDArray
 
 from photonpano.photometry import BinaryResponse, picture_of
-from photonpano.testing.scenes import detected, seen_along
+from photonpano.testing.captures import detected, seen_along
 from photonpano_simulator.config import StreetScene
 from photonpano_simulator.scenes import scene_flux
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from photonpano.geometry import translation
-from photonpano.testing.scenes import detected, seen_along, textured
+from photonpano.testing.captures import detected, seen_along, textured
 from photonpano.values import FloatArray
 
 SHAPE, N_FRAMES, HAND, WINDOW_PX = (96, 144), 650, (300, 350), 40

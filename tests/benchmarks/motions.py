@@ -45,7 +45,7 @@ from photonpano import InputError, open_source, parse_spec
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import corner_errors, load_run_trajectory, load_truth
 from photonpano.geometry import Camera
-from photonpano.testing.scenes import textured
+from photonpano.testing.captures import textured
 
 PATHS = ("smooth", "trembling")
 ENDS = 0.03  # share of the frames, half of them at each end

@@ -31,11 +31,11 @@ from trust import scored
 from trust_scores import is_honest, reasons, status
 
 from photonpano import evaluate, load_panorama, open_source, parse_spec
-from photonpano.api.opened_run import opened_run
+from photonpano.api.run_folders import opened_run
 from photonpano.capture import capture_of, with_background
 from photonpano.capture.writing import truth_path
 from photonpano.corrections import divided_by, estimate_vignette
-from photonpano.corrections.moments import showing
+from photonpano.corrections.movers import showing
 from photonpano.evaluation import image_score, load_run_trajectory, load_truth, true_panorama, white_flux
 from photonpano.geometry import FrameTrajectory
 

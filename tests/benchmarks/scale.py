@@ -35,7 +35,7 @@ from photonpano import ExecutorContext, FrameSpan, Source, discover, parse_spec,
 from photonpano.capture import capture_of
 from photonpano.execution import CaptureElsewhere, LocalExecutor
 from photonpano.execution.context import Quiet
-from photonpano.execution.remote import packed as packed_for_worker
+from photonpano.execution.executor import packed as packed_for_worker
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging import chunks_of
 from photonpano_dask.configs import DaskConfig

@@ -13,8 +13,7 @@ import pytest
 
 from photonpano import FrameSpan, Group, run
 from photonpano.plugins import hookspecs, registry
-from photonpano.plugins.registry import discover
-from photonpano.plugins.registry.plugins import OBSERVATION_HOOKS, contributions_of, observation_of
+from photonpano.plugins.registry import OBSERVATION_HOOKS, contributions_of, discover, observation_of
 from photonpano.specs import parse_spec
 from photonpano.testing import ExporterConformance, RefinerConformance, RendererConformance, ResamplerConformance
 from photonpano.testing.conformance import Conformance

@@ -16,7 +16,7 @@ from packaging.utils import canonicalize_name
 from ruamel.yaml import YAML
 
 import photonpano
-from photonpano.reading.remote import LIBRARIES
+from photonpano.reading.files import LIBRARIES
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

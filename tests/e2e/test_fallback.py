@@ -11,8 +11,7 @@ import pytest
 from pydantic import Field
 
 from photonpano import Config, Located, LocatorContribution, NotLocated, StageContext, VirtualExposure
-from photonpano.plugins.registry import Catalog, Origin, discover
-from photonpano.plugins.registry.catalog import make_entry
+from photonpano.plugins.registry import Catalog, Origin, discover, make_entry
 from photonpano.specs import parse_spec
 from photonpano.values import Homography
 

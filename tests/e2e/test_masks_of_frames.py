@@ -13,7 +13,7 @@ from photonpano import SpecError, parse_spec, run
 from photonpano.geometry import corners, inverse, transform_points, translation
 from photonpano.pipeline.components import build_source
 from photonpano.record.contents import fingerprint
-from photonpano.testing.scenes import detected, seen_along, textured
+from photonpano.testing.captures import detected, seen_along, textured
 from photonpano.values import FloatArray, FrameSpan
 
 pytestmark = pytest.mark.usefixtures("without_report")

@@ -12,7 +12,7 @@ import pytest
 
 from photonpano import LocationError, load_trajectory, parse_spec, run
 from photonpano.geometry import corners, inverse, transform_points, translation
-from photonpano.testing.scenes import detected, seen_along, textured
+from photonpano.testing.captures import detected, seen_along, textured
 from photonpano.values import FloatArray
 
 SHAPE, N_FRAMES, WALL = (96, 144), 1600, (500, 1100)

@@ -13,7 +13,7 @@ import pytest
 from photonpano import parse_spec
 from photonpano.evaluation import corner_errors, load_run_trajectory
 from photonpano.geometry import corner_displacements
-from photonpano.testing.scenes import detected, seen_along, textured
+from photonpano.testing.captures import detected, seen_along, textured
 
 SHAPE, SCENE_SHAPE, N_FRAMES, FLUX = (96, 128), (400, 520), 600, 0.3
 FEW_ROWS = (8, 512)

@@ -27,7 +27,7 @@ main()
 HANGING = """\
 import time
 from pathlib import Path
-from photonpano.api.batching.sweeps import SpecText
+from photonpano.api.batch_jobs import SpecText
 from photonpano.files.folders import staging_of
 
 class Hanging(SpecText):

@@ -19,8 +19,7 @@ from photonpano.execution.context import Context
 from photonpano.geometry import Canvas
 from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.merging.panorama import render
-from photonpano.testing.captures import KnownMotion
-from photonpano.testing.scenes import detected, seen_along, textured
+from photonpano.testing.captures import KnownMotion, detected, seen_along, textured
 
 FLUX, FRAMES, SHAPE = (0.6, 0.3, 0.12), 300, (64, 92)
 PACK: dict[str, Callable[[np.ndarray], np.ndarray]] = {

@@ -11,25 +11,24 @@ from typing import Any
 
 import typer
 
-from photonpano.api.batching.captures import find_captures
-from photonpano.api.batching.processes import rows_of
-from photonpano.api.batching.summary import PAGE, require_own, write_summary
-from photonpano.api.batching.sweeps import (
+from photonpano.api.batch_jobs import (
     CAPTURE_KEY,
     Job,
     SpecText,
     capture_override,
     combinations,
+    find_captures,
     folder_name,
     is_of_capture,
     override,
     read_changes,
 )
+from photonpano.api.batch_running import PAGE, require_own, rows_of, write_summary
 from photonpano.api.command import SPEC, DoubtfulError, WrongArgumentError, command
 from photonpano.errors import InputError, OutputError, PhotonpanoError, Problem, SpecError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import thread_count
-from photonpano.files.atomic import locked
+from photonpano.files.folders import locked
 from photonpano.files.paths import Location
 from photonpano.notebooks import facts, from_here, table
 from photonpano.plugins.registry import discover

@@ -1,7 +1,7 @@
 """Declare commands of the program: a function, the lines that it prints, and how its parameters are given.
 
-A module of `api` that uses `command` is a command of its name; the first line of the module is its line in `photonpano --help`.
-The signature and the docstring of the function give the rest: see `photonpano.api.cli.signatures`.
+`photonpano.api.cli.app` lists the modules of `api` that declare them. The signature and the docstring of the function give
+options and help: see `photonpano.api.cli.signatures`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 logger = logging.getLogger("photonpano")
+SPEC = typer.Argument(metavar="SPEC", help="The spec: a YAML file.")
+CHANGES = typer.Option(
+    "--set", metavar="KEY=VALUE", help="Change a value of the spec, such as run.seed=1 or levels.0.scale=0.5."
+)
+COMMANDS: dict[str, Command] = {}  # the commands whose modules are imported, by name
 
 
 class WrongArgumentError(PhotonpanoError):
@@ -48,19 +53,13 @@ class Command:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-SPEC = typer.Argument(metavar="SPEC", help="The spec: a YAML file.")
-CHANGES = typer.Option(
-    "--set", metavar="KEY=VALUE", help="Change a value of the spec, such as run.seed=1 or levels.0.scale=0.5."
-)
-COMMANDS: dict[str, Command] = {}  # the commands whose modules are imported, by module
-
-
 def command(example: str, prints: Callable[..., Iterable[str]], **declared: Any) -> Callable[[FunctionT], FunctionT]:
-    """Make a function a command; attributes that `Command` does not have are items of its `options`."""
+    """Make a function the command of its name; attributes that `Command` does not have are items of its `options`."""
     own = {name: declared.pop(name) for name in ("plan", "settings", "notes", "calls") if name in declared}
 
     def declare(function: FunctionT) -> FunctionT:
-        COMMANDS[function.__module__] = Command(function, prints, example, options=declared, **own)
+        name = function.__name__.lstrip("_").replace("_", "-")
+        COMMANDS[name] = Command(function, prints, example, options=declared, **own)
         return function
 
     return declare

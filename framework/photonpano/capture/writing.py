@@ -16,8 +16,7 @@ from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, OutputError, PluginError
 from photonpano.execution.threads import in_order
-from photonpano.files.atomic import atomic_path, require_space, resumable_path
-from photonpano.files.folders import atomic_folder
+from photonpano.files.folders import atomic_folder, atomic_path, require_space, resumable_path
 from photonpano.values import FrameSpan, StreamInfo
 
 FolderWriter = Callable[[Path, StreamInfo, Iterable[NDArray[np.uint8]]], None]

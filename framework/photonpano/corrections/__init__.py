@@ -2,19 +2,27 @@
 
 from photonpano.corrections.applying import corrected_source
 from photonpano.corrections.colour_filter import ColourFilter
-from photonpano.corrections.dark import DarkCounts, DarkFrames, measure_dark, read_dark, write_dark
+from photonpano.corrections.dark import (
+    DarkCounts,
+    DarkFrames,
+    HotPixels,
+    Mask,
+    hot_in_the_dark,
+    measure_dark,
+    read_dark,
+    write_dark,
+)
 from photonpano.corrections.flat_field import FlatField, Vignette, divided_by, estimate_vignette, read_vignette, write_vignette
 from photonpano.corrections.geometry import (
     TURNS,
     ColourSwissSpad2,
+    Correction,
     Crop,
     GreySwissSpad2Full,
     GreySwissSpad2Half,
     MissingRow,
     SwapColumns,
 )
-from photonpano.corrections.hot_pixels import HotPixels, Mask, hot_in_the_dark
-from photonpano.corrections.pixels import Correction
 from photonpano.corrections.still_pixels import StillPixels, without_still_pixels
 
 _ALL: tuple[type[Correction], ...] = (

@@ -11,7 +11,7 @@ from photonpano.capture import MISSING, Capture, Gather, Index, LinearCorrection
 from photonpano.contracts.protocols import Source
 from photonpano.corrections.colour_filter import ColourFilter, with_colours
 from photonpano.corrections.dark import DarkCounts
-from photonpano.corrections.pixels import Correction, Decide, Pixels
+from photonpano.corrections.geometry import Correction, Decide, Pixels
 from photonpano.errors import InputError
 from photonpano.values import BoolArray, Decision, FluxImage
 

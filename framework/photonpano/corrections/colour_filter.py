@@ -10,9 +10,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from photonpano.capture import Capture, Colours, LinearCorrection, capture_of
-from photonpano.corrections.pixels import Correction
+from photonpano.corrections.geometry import Correction
 from photonpano.errors import InputError
-from photonpano.photometry.similarity import sums_of_blocks
+from photonpano.photometry.images import sums_of_blocks
 from photonpano.plugins.contributions import SpecPath
 from photonpano.reading import COLOURS, bayer_array, read_filter_array
 from photonpano.text import listed
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano.contracts.protocols import Source
-    from photonpano.corrections.pixels import Decide, Pixels
+    from photonpano.corrections.geometry import Decide, Pixels
     from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, Response
 
 Colour = Literal["red", "green", "blue", "clear"]

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from photonpano.capture import Capture, LinearCorrection, capture_of
-from photonpano.corrections.pixels import Correction
+from photonpano.corrections.geometry import Correction
 from photonpano.errors import InputError
 from photonpano.geometry import corner_displacements, inverse, transform_points
-from photonpano.photometry.similarity import sums_of_blocks
+from photonpano.photometry.images import sums_of_blocks
 from photonpano.reading import read_arrays
 from photonpano.robust import huber_weights, robust_std
 from photonpano.values import Decision, FrameSpan, Homography
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano.contracts.protocols import Source, Trajectory
-    from photonpano.corrections.pixels import Decide, Pixels
+    from photonpano.corrections.geometry import Decide, Pixels
     from photonpano.values import FloatArray, FluxImage
 
 VIGNETTE_DECISION, FLAT_FIELD_DECISION = "vignette_gain", "flat_field"  # names of the decisions in a record

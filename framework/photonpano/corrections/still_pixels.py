@@ -10,8 +10,8 @@ import numpy as np
 from photonpano.capture import Capture, capture_of
 from photonpano.corrections.applying import corrected_source
 from photonpano.corrections.colour_filter import ColourFilter
-from photonpano.corrections.hot_pixels import brightest, outliers, reach_of, sorted_neighbours
-from photonpano.corrections.pixels import Correction
+from photonpano.corrections.dark import brightest, outliers, reach_of, sorted_neighbours
+from photonpano.corrections.geometry import Correction
 from photonpano.filtering import gradient_of
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from photonpano.contracts.protocols import Source
-    from photonpano.corrections.pixels import Decide, Pixels
+    from photonpano.corrections.geometry import Decide, Pixels
 from photonpano.values import BoolArray, FluxImage, Still
 
 _SPANS, _SPAN_FRAMES = 32, 128  # 32 spans of at most 128 frames are summed all over the capture

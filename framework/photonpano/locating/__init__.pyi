@@ -14,6 +14,8 @@ from .images import PRIOR_STD as PRIOR_STD
 from .images import SMALLEST_SIDE as SMALLEST_SIDE
 from .images import TRANSLATION as TRANSLATION
 from .images import Follows as Follows
+from .images import View as View
+from .images import blur_against_noise as blur_against_noise
 from .images import coarse_to_fine as coarse_to_fine
 from .images import correlation_peaks as correlation_peaks
 from .images import correlation_surface as correlation_surface
@@ -22,6 +24,9 @@ from .images import free_parameters as free_parameters
 from .images import motion_from_images as motion_from_images
 from .images import shift_between as shift_between
 from .images import shift_of_spectra as shift_of_spectra
+from .images import stabilised_8_bit as stabilised_8_bit
+from .images import view_of as view_of
+from .images import view_pyramid as view_pyramid
 from .points import MIN_NOISE_PX as MIN_NOISE_PX
 from .points import Fit as Fit
 from .points import Matches as Matches
@@ -34,8 +39,3 @@ from .points import motion_from_points as motion_from_points
 from .points import too_few_matches as too_few_matches
 from .points import turn_of as turn_of
 from .points import turn_slopes as turn_slopes
-from .viewing import View as View
-from .viewing import blur_against_noise as blur_against_noise
-from .viewing import stabilised_8_bit as stabilised_8_bit
-from .viewing import view_of as view_of
-from .viewing import view_pyramid as view_pyramid

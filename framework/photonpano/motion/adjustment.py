@@ -1,4 +1,4 @@
-"""Robust least squares of a motion graph, and the uncertainty of its solution."""
+"""Robust least squares of a motion graph with the noise that its exposures share, and the uncertainty of its solution."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from photonpano.geometry import corners, from_parameters, generators, inverse, patch_centres, slopes, transform_points
-from photonpano.motion.exposure_noise import ExposureNoise
 from photonpano.robust import cauchy_weights
 from photonpano.values import BoolArray, FloatArray, FrameSpan, Located
 
+# Least weight of a pair. Shared photons carry no new information: their noise agrees with the motion known so far.
+_LEAST_WEIGHT = 0.05
+_LEAST = 1e-9  # eigenvalue of the information of an exposure, relative to its largest
 MAX_ITERATIONS = 30
 CONVERGED_PX = 1e-3  # largest motion of a corner in the last step
 # Fall of the cost by the last step, in squares of standard deviations. The first step, with equal weights, is never the last.
@@ -28,7 +30,6 @@ NO_WORSE = 1e-6  # relative increase of the cost by rounding errors
 CAUCHY = 2.385
 OUTLIER = 8.0  # residual of an outlier, in scales of the residuals
 MEDIAN_NORM = 0.958  # the median of the root mean square of eight Gaussian numbers of unit variance
-_UNKNOWN_NORM = 1e-3 * MEDIAN_NORM  # least scale of the residuals of edges that say nothing of their errors
 # Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by.
 _DAMPING, _TINY = 1e-10, 1e-200
 SAMPLES = 64  # solutions drawn to estimate the expected error of each node, to a few per cent
@@ -36,8 +37,90 @@ _DRAWN_ROWS = 8192  # equations that are drawn at a time
 # Error of the corners that all pairs have in common: interpolation bends them so that focal lengths of 4,464 px are 1 to 5 %
 # too small.
 _COMMON_PX = 0.003
+_UNKNOWN_NORM = 1e-3 * MEDIAN_NORM  # least scale of the residuals of edges that say nothing of their errors
 
 StateT = TypeVar("StateT")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExposureNoise:
+    """How the exposures of a graph share the noise of their photons.
+
+    A pair errs by the noise of its two exposures, and by what it adds since it sees only the part of the scene that both show.
+    """
+
+    pairs: NDArray[np.integer]  # (E, 2) the moving and the fixed exposure of each pair
+    # (N, C) shares of N exposures in the noise of C spans of frames, between whose ends no exposure begins or ends; their
+    # squares add up to 1
+    shares: FloatArray
+    # (E,) weights with which pairs count the photons of each exposure once, however many of them it is in, and however many
+    # exposures hold its frames
+    weights: FloatArray
+    shown: BoolArray  # (E,) False for pairs that no exposures show: each errs by itself
+
+    @classmethod
+    def of(cls, pairs: NDArray[np.integer], spans: Sequence[FrameSpan], shown: BoolArray | None = None) -> ExposureNoise:
+        """Compute what N exposures share from the frames of each; without `shown`, exposures show all pairs."""
+        shown = np.ones(len(pairs), dtype=bool) if shown is None else shown
+        bounds = np.array([(span.start, span.stop) for span in spans], dtype=np.float64)
+        ends = np.unique(bounds)
+        inside = (bounds[:, :1] <= ends[:-1]) & (ends[1:] <= bounds[:, 1:])
+        shares = np.sqrt(inside * np.diff(ends))
+        shares /= np.linalg.norm(shares, axis=1, keepdims=True)
+        (starts, stops), (moving, fixed) = bounds.T, pairs.T
+        common = np.minimum(stops[moving], stops[fixed]) - np.maximum(starts[moving], starts[fixed])
+        shared = np.maximum(common, 0) / np.minimum((stops - starts)[moving], (stops - starts)[fixed])
+        # The correlations of each exposure with all others, at low frequencies of the motion, add up.
+        repeated = shares @ shares.sum(axis=0)
+        degrees = np.bincount(pairs[shown].ravel(), minlength=len(spans))
+        counted = (degrees[moving] + degrees[fixed]) / 4 * np.sqrt(repeated[moving] * repeated[fixed])
+        weights = np.where(shown, np.maximum(1 - shared, _LEAST_WEIGHT) / np.maximum(counted, 1), 1.0)
+        return cls(pairs, shares, weights, shown)
+
+    def errors(self, moving: FloatArray, fixed: FloatArray, n_draws: int, rng: np.random.Generator) -> FloatArray:
+        """Draw errors of pairs, in units in which their covariance is the identity if they share nothing: (E, 8, n_draws).
+
+        `moving` and `fixed` are the derivatives of the residuals of each pair, in these units, by small motions of its frames:
+        (E, 8, 8).
+        """
+        moving, fixed = (np.where(self.shown[:, None, None], slopes, 0) for slopes in (moving, fixed))
+        roots = self._roots(moving, fixed)
+        chunks = rng.normal(size=(self.shares.shape[1], 8 * n_draws))
+        noise = roots @ (self.shares @ chunks).reshape(len(roots), 8, n_draws)
+        known = [slopes @ roots[nodes] for slopes, nodes in ((moving, self.pairs[:, 0]), (fixed, self.pairs[:, 1]))]
+        beside = np.eye(8) - sum(each @ np.swapaxes(each, 1, 2) for each in known)
+        values, vectors = np.linalg.eigh(beside)
+        own = (vectors * np.sqrt(np.maximum(values, 0))[:, None]) @ rng.normal(size=(len(moving), 8, n_draws))
+        return np.asarray(moving @ noise[self.pairs[:, 0]] + fixed @ noise[self.pairs[:, 1]] + own)
+
+    def _roots(self, moving: FloatArray, fixed: FloatArray) -> FloatArray:
+        """Return roots of the covariances of the noise of the exposures: (N, 8, 8).
+
+        Half of the variance of a pair comes from each exposure. An exposure knows its motion at least as well as any of its
+        pairs shows it, in each direction.
+        """
+        nodes = np.concatenate([self.pairs[:, 0], self.pairs[:, 1]])
+        slopes = np.concatenate([moving, fixed])
+        of_pairs = 2 * np.swapaxes(slopes, 1, 2) @ slopes
+        order = np.lexsort([-np.trace(of_pairs, axis1=1, axis2=2), nodes])
+        rank = np.arange(len(nodes)) - np.searchsorted(nodes[order], nodes[order])
+        information = np.broadcast_to(np.finfo(float).tiny * np.eye(8), (len(self.shares), 8, 8)).copy()
+        information[nodes[order[rank == 0]]] = of_pairs[order[rank == 0]]
+        for number in range(1, int(rank.max(initial=0)) + 1):
+            here = order[rank == number]
+            root, back = _symmetric_roots(information[nodes[here]])
+            values, vectors = np.linalg.eigh(back @ of_pairs[here] @ back)
+            more = root @ vectors
+            information[nodes[here]] += (more * np.maximum(values - 1, 0)[:, None]) @ np.swapaxes(more, 1, 2)
+        return _symmetric_roots(information)[1]
+
+
+def _symmetric_roots(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the symmetric roots of (N, 8, 8) information, and of its inverse."""
+    values, vectors = np.linalg.eigh(information)
+    roots = np.sqrt(np.maximum(values, np.maximum(_LEAST * values[:, -1:], np.finfo(float).tiny)))
+    back = np.swapaxes(vectors, 1, 2)
+    return (vectors * roots[:, None]) @ back, (vectors / roots[:, None]) @ back
 
 
 @dataclass(frozen=True, slots=True, eq=False)

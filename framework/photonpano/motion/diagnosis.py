@@ -23,6 +23,8 @@ _NOISY, _CLEAR = 0.25, 2.0
 _NOTHING = 0.01  # signal-to-noise ratio below which there is hardly any signal
 _FAR = 1e9  # numbers of a homography from this on map a frame to infinity
 _SHOWN = 6  # most pairs, spans or parts that a message lists
+# Frames of 24x24 and 8x512 px were located, and none of 16x16, 4x256 and 1x512.
+_FEWEST_ROWS, _FEWEST_PIXELS = 8, 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +58,6 @@ class UntiedError(LocationError):
     def blurred(self) -> bool:
         """Whether motion within the exposures may be the cause, rather than darkness."""
         return self.signal_to_noise is not None and self.signal_to_noise >= _NOISY
-
-
-# Frames of 24x24 and 8x512 px were located, and none of 16x16, 4x256 and 1x512.
-_FEWEST_ROWS, _FEWEST_PIXELS = 8, 500
 
 
 def contrast_of(exposure: VirtualExposure) -> Contrast:

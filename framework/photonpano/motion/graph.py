@@ -24,11 +24,20 @@ from photonpano.geometry import (
     scaled_ahead,
 )
 from photonpano.motion.adjustment import Adjustment, Assessment, Problem
-from photonpano.motion.consensus import agreed_share, agreeing, contradicting, layers, tolerances_px, travelled
-from photonpano.motion.model import HOMOGRAPHIES, SAME_LENS_PX, MotionModel
+from photonpano.motion.models import (
+    HOMOGRAPHIES,
+    SAME_LENS_PX,
+    MotionModel,
+    agreed_share,
+    agreeing,
+    contradicting,
+    layers,
+    tolerances_px,
+    travelled,
+)
 from photonpano.motion.pairs import GYROSCOPE, TIE, adjacency, component_labels, instants_of
 from photonpano.motion.planar import PlanarAdjustment, PlanarName, Plane, nearest
-from photonpano.motion.rotation_graph import RotationAdjustment, Rotations
+from photonpano.motion.rotations import RotationAdjustment, Rotations
 from photonpano.values import BoolArray, Edge, FloatArray, FrameSpan, Group, Located
 
 # Share of the patches that contradict the motion, above which they are told from the background.
@@ -55,7 +64,7 @@ class GraphOptions(Protocol):
 
     @property
     def tie(self) -> Path | None:
-        """A file of points that are tied by hand, see `photonpano.motion.ties`; None if there are none."""
+        """A file of points that are tied by hand, see `photonpano.motion.pairs`; None if there are none."""
 
     @property
     def disconnected(self) -> Literal["error", "largest"]:

@@ -16,17 +16,13 @@ from photonpano.execution.context import Context
 from photonpano.execution.threads import thread_pool
 from photonpano.geometry import corner_displacements, corners, inverse, transform_points, translation
 from photonpano.motion.adjustment import Assessment
-from photonpano.motion.closures import MIN_SIMILARITY, closure_candidates, exposure_similarity
 from photonpano.motion.diagnosis import require_tied, solving
-from photonpano.motion.exposure_tasks import Pair
 from photonpano.motion.graph import GraphOptions, GraphSolution, Rival, components, solve
 from photonpano.motion.gyroscope import Gyroscope
-from photonpano.motion.level import FrameHomography, VirtualExposures
-from photonpano.motion.model import HOMOGRAPHIES, MotionModel
-from photonpano.motion.pairs import alike, excluded_pairs, instants_of, pairs_of
-from photonpano.motion.registration import Registrar
-from photonpano.motion.ties import TiedPair, tied_pairs, ties_of
-from photonpano.motion.timeline import Timeline
+from photonpano.motion.level import FrameHomography, Timeline, VirtualExposures
+from photonpano.motion.models import HOMOGRAPHIES, MotionModel
+from photonpano.motion.pairs import TiedPair, alike, excluded_pairs, instants_of, pairs_of, tied_pairs, ties_of
+from photonpano.motion.registration import MIN_SIMILARITY, Pair, Registrar, closure_candidates, exposure_similarity
 from photonpano.motion.tracking import StartingMotion
 from photonpano.text import listed
 from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Located, NotLocated

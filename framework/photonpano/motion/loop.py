@@ -18,15 +18,13 @@ from photonpano.filtering import smooth_share
 from photonpano.geometry import align_planes, corner_displacements, corners, inverse, moving_corners, transform_points
 from photonpano.motion.adjustment import std_of
 from photonpano.motion.diagnosis import require_in_front
-from photonpano.motion.level import Level, VirtualExposures
+from photonpano.motion.level import Level, Timeline, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
-from photonpano.motion.model import SAME_LENS_PX, MotionModel
-from photonpano.motion.refined_motion import Knots, RefinedMotion
+from photonpano.motion.models import SAME_LENS_PX, MotionModel
+from photonpano.motion.pairs import require_agreement, ties_of
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
-from photonpano.motion.ties import require_agreement, ties_of
-from photonpano.motion.timeline import Timeline
 from photonpano.motion.tracking import starting_motion
-from photonpano.motion.uncertainty import Interpolated, Uncertainty
+from photonpano.motion.trajectories import Interpolated, Knots, RefinedMotion, Uncertainty
 from photonpano.values import FloatArray, FrameSpan, Group
 
 _DRAWS = 4  # errors of knots by which it is found how much of them an interpolator leaves

@@ -1,28 +1,360 @@
-"""Registration: describe the exposures of a level, and locate pairs of them."""
+"""Registration of a level: describe its exposures, locate pairs of them, and find loop closures."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from threading import Lock
-from typing import TypeVar
+from typing import Any, TypeAlias, TypeVar
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.contracts.attribution import blaming
+from photonpano.contracts.requirements import require_no_standstill, why_undetermined
 from photonpano.execution.context import Context, Log
-from photonpano.execution.threads import batched, in_order, lagging
-from photonpano.geometry import inverse
-from photonpano.motion.closures import MIN_SIMILARITY
-from photonpano.motion.diagnosis import Contrast
-from photonpano.motion.exposure_tasks import Descriptions, ExposureTasks, Notes, Pair
-from photonpano.motion.level import FrameHomography, VirtualExposures
-from photonpano.motion.pairs import instants_of
-from photonpano.motion.tracking import Place, StartingMotion
-from photonpano.values import Decision, Edge, Located, NotLocated
+from photonpano.execution.threads import Guard, Stopwatch, batched, in_order, lagging
+from photonpano.geometry import corners, inverse, rescaled, rescaling, transform_points, translation, why_implausible
+from photonpano.motion.diagnosis import Contrast, contrast_of
+from photonpano.motion.graph import GraphOptions, GraphSolution
+from photonpano.motion.level import FrameHomography, NamedLocator, VirtualExposures
+from photonpano.motion.pairs import instants_of, lengths_of, shared_share
+from photonpano.motion.tracking import Place, StartingMotion, Track
+from photonpano.photometry import noise_free_correlation
+from photonpano.values import Decision, Edge, FloatArray, FluxImage, Group, Homography, Located, NotLocated, VirtualExposure
 
-ResultT = TypeVar("ResultT")
-
+# Least similarity of a loop closure: that of one place is 0.9 and more in enough light, that of different places below 0.5.
+MIN_SIMILARITY = 0.7
+_GRID = 8  # the overlap of two fields of view is counted on a grid of this many points along each axis
+_MIN_SKIP = 2.0  # the exposures of a loop closure are at least this many times as far apart in time as the longest skip
+# Between two visits of a place the overlap falls by at least this share, two columns of the grid; a tremor does not count.
+_PROMINENCE = 0.25
+_MAX_CLOSURES = 3  # most loop closures of an exposure with earlier ones; those of the largest overlap are taken
+# Most exposures of a level with loop closures to earlier ones, spread over the capture. Neighbours tie the others to them.
+_MAX_EXPOSURES = 64
+# Exposures are compared by averages of blocks of this side, px: these have less noise, and hide differences of motion blur.
+_BLOCK = 4
+# Most hypotheses of a pair that are used.
+MAX_HYPOTHESES = 100
 # Predecessors with which an exposure is registered if none of its own pairs is located.
 BRIDGE = 3
+ResultT = TypeVar("ResultT")
+
+
+def closure_candidates(
+    groups: Sequence[Group], solution: GraphSolution, frame_shape: tuple[int, int], graph: GraphOptions
+) -> list[tuple[int, int]]:
+    """Return pairs (moving, fixed) of exposures that overlap at different times, ordered by the moving one.
+
+    An exposure is paired with the best view of each earlier visit: a prominent maximum of the overlap, as a function of time.
+    Exposures that are denser than their length are thinned out.
+    """
+    if graph.closure_overlap is None:
+        return []
+    instants, lengths = instants_of(groups), lengths_of(groups)
+    length = float(np.quantile(lengths, 0.5, method="lower"))  # one that occurs
+    spacing = float(np.median(np.diff(instants))) if len(groups) > 1 else length
+    chosen = np.flatnonzero(solution.located & (lengths == length))[:: max(1, round(length / spacing))]
+    min_interval = _MIN_SKIP * max([1.0, *graph.skips]) * length
+    pairs: list[tuple[int, int]] = []
+    for position, moving in list(enumerate(chosen))[:: max(1, -(-len(chosen) // _MAX_EXPOSURES))]:
+        earlier = chosen[:position]
+        overlap = _overlaps(solution.homographies[moving], solution.homographies[earlier], frame_shape)
+        peaks = _visits(overlap, graph.closure_overlap)
+        peaks = peaks[instants[earlier[peaks]] <= instants[moving] - min_interval]
+        best = peaks[np.argsort(-overlap[peaks], kind="stable")[:_MAX_CLOSURES]]
+        pairs += [(int(moving), int(fixed)) for fixed in np.sort(earlier[best])]
+    return pairs
+
+
+def exposure_similarity(moving: VirtualExposure, fixed: VirtualExposure, homography: FrameHomography) -> float:
+    """Return the correlation of two exposures of one scale that they would have without photon noise, under a motion.
+
+    It is 1 for the same place and around 0 for different ones; 0 where the overlap is small, or the scene does not stand out
+    from the noise.
+    """
+    height, width = (side // _BLOCK for side in moving.flux.shape)
+    if not height * width:
+        return 0.0
+    # From block numbers to the top left pixels of the nearest blocks of the other exposure: interpolation between averages
+    # would change their noise.
+    half = (_BLOCK - 1) / 2
+    to_fixed = translation(-half, -half) @ rescaled(homography, moving.scale) @ rescaling(_BLOCK)
+    first, first_variance = (image[::_BLOCK, ::_BLOCK][:height, :width] for image in _averages(moving))
+    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    second, second_variance = (
+        cv2.warpPerspective(image, to_fixed, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
+        for image in _averages(fixed)
+    )
+    both = np.isfinite(first) & np.isfinite(second)
+    if not both.any():
+        return 0.0
+    noise = float(first_variance[both].mean()), float(second_variance[both].mean())
+    return noise_free_correlation(np.cov(first[both], second[both].astype(np.float32)), noise, float(both.sum()))
+
+
+def _averages(exposure: VirtualExposure) -> tuple[FluxImage, FluxImage]:
+    """Return the average of the block that starts at each pixel, on the scale where noise is uniform, and its variance.
+
+    Both are NaN where part of the block was not seen.
+    """
+    seen = exposure.weight > 0
+    values = np.where(seen, exposure.response.stabilised(exposure.flux, exposure.weight), np.float32(np.nan))
+    variance = np.full_like(values, np.nan)
+    variance[seen] = exposure.response.stabilised_std(exposure.weight[seen]) ** 2 / _BLOCK**2
+    kernel = np.full((_BLOCK, _BLOCK), 1 / _BLOCK**2)
+    rows, columns = (side - _BLOCK + 1 for side in values.shape)
+    mean, mean_variance = (
+        np.asarray(cv2.filter2D(image, -1, kernel, anchor=(0, 0))[:rows, :columns], np.float32) for image in (values, variance)
+    )
+    return mean, mean_variance
+
+
+def _visits(overlap: FloatArray, min_overlap: float) -> NDArray[np.integer]:
+    """Return the positions of the prominent maxima of the overlap: the best view of each earlier visit.
+
+    Equal to `scipy.signal.find_peaks`, whose import takes a second.
+    """
+    # Bounded by no overlap before the first exposure, and the full overlap of the exposure with itself.
+    profile = np.concatenate([[0.0], overlap, [1.0]])
+    peaks = []
+    inner = profile[1:-1]
+    for peak in np.flatnonzero((inner >= min_overlap) & (inner > profile[:-2]) & (inner >= profile[2:])) + 1:
+        higher_before, higher_after = (np.flatnonzero(side > profile[peak]) for side in (profile[:peak], profile[peak:]))
+        start = higher_before[-1] if higher_before.size else 0
+        stop = peak + (higher_after[0] if higher_after.size else len(profile) - peak)
+        prominence = profile[peak] - max(profile[start:peak].min(), profile[peak:stop].min())
+        if prominence >= _PROMINENCE:
+            plateau = int(np.argmax(profile[peak:] != profile[peak]))
+            peaks.append(peak - 1 + (plateau - 1) // 2)
+    return np.array(peaks, dtype=int)
+
+
+def _overlaps(moving: FloatArray, fixed: FloatArray, frame_shape: tuple[int, int]) -> FloatArray:
+    """Return the share of one field of view that each of N others sees: (N,)."""
+    low, high = corners(frame_shape)[[0, 2]]
+    # Centres of cells: points on the border would leave the field of view at the least motion.
+    x, y = (low[axis] + (high[axis] - low[axis]) * (np.arange(_GRID) + 0.5) / _GRID for axis in (0, 1))
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    between = inverse(fixed) @ moving
+    seen = transform_points(between, points)
+    ahead = points @ between[:, 2, :2, None] + between[:, 2:, 2, None] > 0
+    with np.errstate(invalid="ignore"):
+        inside = np.all((seen >= low) & (seen <= high), axis=-1) & ahead[..., 0]
+    return np.asarray(inside.mean(axis=-1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Described:
+    """An exposure as it stays in the process that has merged it."""
+
+    contrast: Contrast  # of its image
+    exposure: VirtualExposure | None = None  # the exposure itself, for loop closures
+    # what locators made of it so far, by their numbers; none of a blank exposure
+    features: dict[int, Any] = field(default_factory=dict)
+    guard: Guard = field(default_factory=Guard)  # held while a locator describes it, so that each does so once
+
+
+# Exposures by their numbers.
+Descriptions: TypeAlias = Mapping[int, Described]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """Two exposures to register."""
+
+    moving: int  # number of the later exposure
+    fixed: int  # number of the earlier one
+    expected: FrameHomography | None  # the motion known so far, if any
+    guessed: bool = False  # whether that is a guess of the first level, from which only locators that keep hypotheses start
+    # whether it is a candidate for a loop closure. The motion known so far may have drifted between its exposures, and does not
+    # predict whether the camera is back where it was.
+    closure: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Notes:
+    """What a task returns beside its result."""
+
+    seconds: dict[str, float]  # in each stage
+    decisions: tuple[Decision, ...]  # of components, where it was worked on in another process
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """Exposures of the first level that were registered with earlier ones."""
+
+    edges: dict[int, list[Edge]]  # of each exposure, by its number
+    places: dict[int, Place]  # where each lies
+    alternatives_px: dict[tuple[int, int], float]  # see `Track`
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExposureTasks:
+    """The tasks of a level. Each returns notes, too.
+
+    Exposures are given by their numbers, together with mappings in which their descriptions are.
+
+    Convention:
+        All homographies are in pixels of frames; only a locator sees pixels of exposures.
+    """
+
+    exposures: VirtualExposures  # of the level
+
+    def describe(self, indices: Sequence[int], keep: bool) -> tuple[dict[int, Described], tuple[list[Contrast], Notes]]:
+        """Merge exposures, and have the first locator describe them; a blank exposure is not described.
+
+        Return what stays in this process, by exposure, with the exposures themselves if they are to `keep`; and the contrasts.
+        """
+        clock, described = Stopwatch(1), dict[int, Described]()
+        for index in indices:
+            exposure = self.exposures.merged(index, clock)
+            with clock("locate"):
+                contrast = contrast_of(exposure)
+            described[index] = Described(contrast, exposure if keep else None)
+            if not contrast.blank:
+                described[index].features[0] = self._features_of(exposure, 0, clock)
+        return described, ([each.contrast for each in described.values()], self._notes(clock))
+
+    def register(self, pairs: Sequence[Pair], *described: Descriptions) -> tuple[list[Edge], Notes]:
+        """Pass pairs to one locator after the other, until one locates them."""
+        clock = Stopwatch(1)
+        return self._registered(pairs, _joined(described), clock), self._notes(clock)
+
+    def register_along(
+        self,
+        start: StartingMotion | None,
+        partners: Mapping[int, Sequence[int]],
+        places: Mapping[int, Place],
+        *described: Descriptions,
+    ) -> tuple[Tracked, Notes]:
+        """Register exposures of the first level with earlier ones, in order; the motion to the nearest predicts the others.
+
+        `places` are those of partners that are not among the exposures, and of exposures that were placed before.
+        """
+        clock, known = Stopwatch(1), _joined(described)
+        track = Track(start, self.exposures.groups, self.exposures.frame_shape, places)
+        edges = {moving: self._tracked(track, moving, earlier, known, clock) for moving, earlier in partners.items()}
+        new = {moving: track.places[moving] for moving in partners}
+        return Tracked(edges, new, track.alternatives_px), self._notes(clock)
+
+    def similarity(self, moving: int, fixed: int, motion: FrameHomography, *described: Descriptions) -> tuple[float, Notes]:
+        """Return the similarity of two exposures that were kept, along their motion."""
+        clock, known = Stopwatch(1), _joined(described)
+        one, other = known[moving].exposure, known[fixed].exposure
+        assert one is not None
+        assert other is not None
+        with clock("locate"):
+            similarity = exposure_similarity(one, other, motion)
+        return similarity, self._notes(clock)
+
+    def _tracked(self, track: Track, moving: int, partners: Sequence[int], known: Descriptions, clock: Stopwatch) -> list[Edge]:
+        """Register an exposure with others, and place it."""
+        place, foreseen = track.places.get(moving), None
+        found: list[Edge] = []
+        for fixed in sorted(partners, reverse=True):
+            expected = track.expected(place, moving, fixed, partial(self._hypotheses, moving, fixed, known, clock))
+            found += self._registered([Pair(moving, fixed, expected, guessed=True)], known, clock)
+            if place is None and isinstance(motion := found[-1].motion, Located):
+                place = track.placed(moving, fixed, motion.homography)
+            elif foreseen is None and expected is not None:
+                foreseen = track.placed(moving, fixed, expected)
+        track.settle(moving, place or foreseen)
+        return found[::-1]
+
+    def _hypotheses(self, moving: int, fixed: int, known: Descriptions, clock: Stopwatch) -> list[Homography]:
+        """Return what the first locator that keeps hypotheses makes of a pair; none of blank exposures."""
+        level = self.exposures.level
+        if known[moving].contrast.blank or known[fixed].contrast.blank:
+            return []
+        for number, named in enumerate(level.locators):
+            if hasattr(named.component, "hypotheses"):
+                features = [self._features(index, number, known, clock) for index in (moving, fixed)]
+                with clock("locate"):
+                    found = named.component.hypotheses(*features)[:MAX_HYPOTHESES]
+                return [level.in_frame_px(Located(each)).homography for each in found]
+        return []
+
+    def _registered(self, pairs: Sequence[Pair], known: Descriptions, clock: Stopwatch) -> list[Edge]:
+        """Pass pairs to one locator after the other, until one locates them."""
+        found: dict[Pair, Edge] = {pair: edge for pair in pairs if (edge := self._refused(pair, known))}
+        failures: dict[Pair, dict[str, NotLocated]] = {pair: {} for pair in pairs}
+        for number, locator in enumerate(self.exposures.level.locators):
+            for pair in [pair for pair in pairs if pair not in found]:
+                motion = self._located_by(number, locator, pair, known, clock)
+                if isinstance(motion, Located):
+                    found[pair] = Edge(pair.moving, pair.fixed, motion, locator.name)
+                else:
+                    failures[pair][locator.name] = motion
+        return [found.get(pair) or Edge(pair.moving, pair.fixed, _of_all(failures[pair])) for pair in pairs]
+
+    def _refused(self, pair: Pair, known: Descriptions) -> Edge | None:
+        """Return a pair that no locator needs to see, with the reason; None for any other."""
+        for index in (pair.moving, pair.fixed):
+            if blank := known[index].contrast.blank:
+                return Edge(pair.moving, pair.fixed, NotLocated(f"{self.exposures.groups[index]}: {blank}"))
+        spans = self.exposures.groups[pair.moving].span, self.exposures.groups[pair.fixed].span
+        # The noise of shared frames alone confirms any motion that both exposures were merged along.
+        if shared_share(*spans) and not all(map(self.exposures.is_foreseen, (pair.moving, pair.fixed))):
+            shares = NotLocated("the exposures share frames, and were merged along a motion that is not known there")
+            return Edge(pair.moving, pair.fixed, shares)
+        if pair.expected is not None and (reason := why_implausible(pair.expected, self.exposures.frame_shape)):
+            return Edge(pair.moving, pair.fixed, NotLocated(f"by the motion known so far, {reason}"))
+        return None
+
+    def _located_by(
+        self, number: int, named: NamedLocator, pair: Pair, known: Descriptions, clock: Stopwatch
+    ) -> Located | NotLocated:
+        """Return the motion of a pair as one locator finds it from where it is expected."""
+        level, shape = self.exposures.level, self.exposures.frame_shape
+        starts = not pair.guessed or hasattr(named.component, "hypotheses")
+        expected = pair.expected if starts else None
+        initial = None if expected is None else level.in_exposure_px(expected)
+        moving, fixed = (self._features(index, number, known, clock) for index in (pair.moving, pair.fixed))
+        with clock("locate"):
+            motion = named.component.register(moving, fixed, initial)
+            if isinstance(motion, NotLocated):
+                return motion
+            if not pair.closure:
+                with blaming(named.component):
+                    require_no_standstill(motion, expected, shape)
+            motion = level.in_frame_px(motion)
+            if reason := why_implausible(motion.homography, shape) or why_undetermined(motion, shape):
+                return NotLocated(reason, motion.evidence)
+            return motion
+
+    def _features(self, index: int, locator: int, known: Descriptions, clock: Stopwatch) -> Any:
+        """Return what a locator makes of an exposure; for a fallback, it is merged again."""
+        described = known[index]
+        with described.guard:
+            if locator not in described.features:
+                exposure = self.exposures.merged(index, clock) if described.exposure is None else described.exposure
+                described.features[locator] = self._features_of(exposure, locator, clock)
+            return described.features[locator]
+
+    def _features_of(self, exposure: VirtualExposure, locator: int, clock: Stopwatch) -> Any:
+        named = self.exposures.level.locators[locator]
+        with clock("locate"):
+            return named.component.describe(exposure)
+
+    def _notes(self, clock: Stopwatch) -> Notes:
+        return Notes(clock.seconds, self.exposures.level.recorder.taken())
+
+
+def _joined(described: Iterable[Descriptions]) -> Descriptions:
+    return {index: each for mapping in described for index, each in mapping.items()}
+
+
+def _of_all(failures: Mapping[str, NotLocated]) -> NotLocated:
+    """Join the failures of several locators, each under its name; a single one stays as it is."""
+    if len(failures) == 1:
+        return next(iter(failures.values()))
+    reason = "; ".join(f"{name}: {each.reason}" for name, each in failures.items())
+    evidence = {f"{name}.{key}": value for name, each in failures.items() for key, value in each.evidence.items()}
+    return NotLocated(reason, evidence)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,6 +19,7 @@ from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, P
 from photonpano.execution.threads import in_order, thread_count
 from photonpano.motion.level import Level, NamedLocator, Recorder
 from photonpano.plugins.contributions import (
+    KINDS,
     ExecutorContext,
     MergerContribution,
     PartOfCapture,
@@ -26,8 +27,7 @@ from photonpano.plugins.contributions import (
     StageContext,
     install_command,
 )
-from photonpano.plugins.registry import KINDS
-from photonpano.specs.checks import check_stream
+from photonpano.specs.builtin import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
 from photonpano.values import CaptureSummary, FrameSpan, Group, Journal

@@ -14,11 +14,10 @@ from photonpano.corrections.lighting import decision_of
 from photonpano.errors import InputError, LocationError
 from photonpano.execution.context import Context
 from photonpano.motion.diagnosis import UntiedError, tell_attempt
-from photonpano.motion.gyroscope import Gyroscope
+from photonpano.motion.gyroscope import Gyroscope, fit_rates
+from photonpano.motion.level import Timeline
 from photonpano.motion.loop import LevelResult
-from photonpano.motion.timeline import Timeline
-from photonpano.motion.tracking.rates_fit import fit_rates
-from photonpano.motion.tracking.velocity import ConstantVelocity, find_velocity
+from photonpano.motion.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels, foreseen_groups
 from photonpano.pipeline.obstacles import ApartError, parts_of, shots_of, timeline_of

@@ -23,7 +23,7 @@ from photonpano.contracts.attribution import attributing
 from photonpano.contracts.protocols import Arrived, Piped, Source
 from photonpano.errors import InputError, OutputError, PhotonpanoError, described
 from photonpano.execution.context import Progress
-from photonpano.files.atomic import atomic_path, locked
+from photonpano.files.folders import atomic_path, locked
 from photonpano.pipeline.run_folder import run_folder
 from photonpano.plugins.contributions import PartOfCapture, SourceContribution
 from photonpano.record.contents import capture_files

@@ -14,8 +14,8 @@ from photonpano.execution.threads import Stopwatch, one_thread_inside, thread_co
 from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import View, box_of, plan_canvas, render
+from photonpano.motion.level import Timeline
 from photonpano.motion.loop import LevelResult, resample
-from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.components import build_levels
 from photonpano.pipeline.rendering import build_renderer
 from photonpano.pipeline.state import State, model_of

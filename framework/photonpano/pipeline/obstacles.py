@@ -22,9 +22,9 @@ from photonpano.locating.images import correlation_peaks
 from photonpano.merging import binned_mean, binning_of
 from photonpano.merging.accumulate import weights_of
 from photonpano.motion.graph import components
+from photonpano.motion.level import Timeline
 from photonpano.motion.locate import LocatedLevel
-from photonpano.motion.timeline import Timeline
-from photonpano.motion.tracking.spans import DARK
+from photonpano.motion.tracking import DARK
 from photonpano.plugins.contributions import PartOfCapture
 from photonpano.reading import other_order, sampled_spans
 from photonpano.record.run_json import findings_of, other_shots

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from photonpano.capture import capture_of, leaving_out, with_background
+from photonpano.capture import capture_of, in_light, leaving_out, with_background
 from photonpano.contracts.attribution import label_of
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
@@ -21,7 +21,6 @@ from photonpano.corrections.lighting import (
     corrected_light,
     decision_of,
     find_light,
-    in_light,
     measure_light,
     measure_pixel_gain,
 )
@@ -38,11 +37,10 @@ from photonpano.geometry import (
 )
 from photonpano.motion.diagnosis import UntiedError
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.level import Recorder
+from photonpano.motion.level import Cut, Recorder
 from photonpano.motion.loop import TOO_NARROW, converges
-from photonpano.motion.model import SAME_LENS_PX
-from photonpano.motion.timeline import Cut
-from photonpano.motion.uncertainty import REMAINING_SHARE
+from photonpano.motion.models import SAME_LENS_PX
+from photonpano.motion.trajectories import REMAINING_SHARE
 from photonpano.pipeline.components import build_levels, built, stage_context
 from photonpano.pipeline.obstacles import ApartError, shots_of
 from photonpano.pipeline.state import State, within

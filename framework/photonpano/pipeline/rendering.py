@@ -19,8 +19,7 @@ from photonpano.contracts.protocols import Exporter, Renderer, Source, Trajector
 from photonpano.contracts.requirements import BrokenContract, require_files
 from photonpano.corrections import Vignette, write_vignette
 from photonpano.corrections.lighting import write_light
-from photonpano.corrections.moments import showing
-from photonpano.corrections.movers import write_background
+from photonpano.corrections.movers import showing, write_background
 from photonpano.errors import ExtentError, InputError, OutputError, ProjectionError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import InOrder

@@ -18,7 +18,7 @@ from photonpano.corrections.movers import decision_of
 from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError, PhotonpanoError, PluginError
 from photonpano.execution.context import Context, Progress, Quiet, TimeLimit, usual
 from photonpano.execution.threads import one_thread_inside
-from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_path
 from photonpano.motion.loop import LevelResult
 from photonpano.pipeline.alternatives import beside_alternatives
 from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, finished_run, run_fingerprint, work_folder

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from photonpano.errors import OutputError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import in_order
-from photonpano.files.atomic import flush
-from photonpano.files.folders import others_in, replace_folder, require_harmless, staging_of
+from photonpano.files.folders import flush, others_in, replace_folder, require_harmless, staging_of
 from photonpano.geometry import Canvas
 from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion

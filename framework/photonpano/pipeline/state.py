@@ -15,12 +15,11 @@ from photonpano.corrections import Vignette
 from photonpano.execution.context import Context
 from photonpano.motion.frame_motion import FrameMotion, motion_of_frames
 from photonpano.motion.gyroscope import Gyroscope
-from photonpano.motion.level import Level
+from photonpano.motion.level import Level, Timeline
 from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
-from photonpano.motion.model import HOMOGRAPHIES, MotionModel
+from photonpano.motion.models import HOMOGRAPHIES, MotionModel
 from photonpano.motion.rotations import RotationTrajectory
-from photonpano.motion.timeline import Timeline
 from photonpano.residuals.findings import NOTHING, Findings
 from photonpano.residuals.refinement import MotionFit
 from photonpano.specs.plan import Plan

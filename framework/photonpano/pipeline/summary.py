@@ -11,7 +11,7 @@ from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError
 from photonpano.execution.threads import in_order
 from photonpano.merging import binned_mean, binning_of
-from photonpano.motion.tracking.spans import (
+from photonpano.motion.tracking import (
     SHORTEST,
     following,
     noise_of_difference,

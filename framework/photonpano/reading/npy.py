@@ -8,24 +8,37 @@ import math
 import operator
 import os
 import zlib
+from collections.abc import Sequence
 from functools import lru_cache
 from gzip import GzipFile
 from io import BytesIO
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.files.atomic import atomic_path, require_space
+from photonpano.files.folders import atomic_path, require_space
 from photonpano.files.paths import Location, Url
-from photonpano.reading.files import is_gzip, read_start, reading, size_of
-from photonpano.reading.remote import read_range
+from photonpano.photometry import BitOrder
+from photonpano.reading.files import OpenFiles, is_gzip, read_range, read_start, reading, size_of
+from photonpano.values import FrameSpan
 
 _HEADER_BYTES = 4096  # bytes of a URL that are read for the header; that of a capture has 128
 _SHORTEST_HEADER = 128  # bytes of the shortest header that numpy writes
 _BLOCK_BYTES = 1024**2
 _CHANNELS = 3
+# Minimum score of a difference that is not chance. Scores of noise scatter by 1.2: one in 60,000 exceeds 5.
+_MIN_SCORE = 5.0
+_ROWS = 8  # rows of a unit
+_MIN_UNITS = 30  # fewest units whose scatter can be trusted
+# Frames of a sum; both are tried: short sums are sharp, long ones less noisy.
+_LENGTHS = (16, 128)
+_CLIP_QUANTILE = 0.95  # sums are clipped at this quantile: hot pixels must not outweigh the scene
+# Minimum score of the best order against each other one, and of pixels within bytes against the expected order.
+_MIN_LEAD_OF_ORDER = 3.0
+_FLOOR = 0.2  # units are weighted by their variance, plus this fraction of the mean variance
 
 
 class NpyHeader(NamedTuple):
@@ -240,3 +253,320 @@ def _next_block(path: Path, file: gzip.GzipFile) -> bytes:
 
 def _damaged(path: Path) -> InputError:
     return InputError(f"{path} is cut short or damaged: gzip cannot unpack it; copy it again")
+
+
+class PixelOrder(NamedTuple):
+    """The order of the pixels in packed frames."""
+
+    packed_along: Literal["width", "height"] = "width"  # the direction of the eight pixels of a byte
+    bit_order: BitOrder = "big"  # "big" if the first of them is the highest bit, "little" if it is the lowest
+
+
+class OtherOrder(NamedTuple):
+    """An order of the pixels that the frames show instead of another."""
+
+    order: PixelOrder
+    within: float  # correlation of adjacent bits of a byte, photon noise included
+    expected: float  # correlation across the borders of bytes in the order that was expected
+    found: float  # correlation across them in the order that was found
+
+    def __str__(self) -> str:
+        return (
+            f"pixels correlate by {self.within:.2f} within bytes, by {self.expected:.2f} across their borders, and by "
+            f"{self.found:.2f} across their borders if {_WORDS[self.order]}"
+        )
+
+
+ORDERS = (
+    PixelOrder("width", "big"),
+    PixelOrder("width", "little"),
+    PixelOrder("height", "big"),
+    PixelOrder("height", "little"),
+)
+_WORDS = {
+    PixelOrder("width", "big"): "the first pixel is the highest bit",
+    PixelOrder("width", "little"): "the first pixel is the lowest bit",
+    PixelOrder("height", "big"): "bytes are packed along the height",
+    PixelOrder("height", "little"): "bytes are packed along the height, with the first pixel in the lowest bit",
+}
+
+
+def other_order(samples: Sequence[NDArray[np.uint8]], expected: PixelOrder = ORDERS[0]) -> OtherOrder | None:
+    """Return the order of the pixels that runs of frames (n, rows, bytes of a row) show instead of the expected one.
+
+    None where that fits, or where the frames are too dark or too plain. Noise, uniform light and static columns have no order;
+    stripes and other regular patterns agree with the expected one.
+    """
+    found = [_other(_Likeness(products), ORDERS.index(expected)) for products in _products_of(samples)]
+    scored = [each for each in found if each is not None]
+    return max(scored, key=lambda each: each[0])[1] if scored else None
+
+
+class _Likeness:
+    """Products of neighbouring pixels in units of the image, over the variance there."""
+
+    def __init__(self, products: NDArray[np.float32]) -> None:
+        *sums, variance = _units_of(products)
+        seen = variance > 0
+        units = np.array(sums)[:, seen] / (variance[seen] + _FLOOR * np.sum(variance) / max(1, seen.sum()))
+        self.smooth, self.across, self.within = units[:4], units[4:8], units[8]
+
+
+def _other(likeness: _Likeness, expected: int) -> tuple[float, OtherOrder] | None:
+    """Return the order that fits if the expected one does not, and the score of their difference."""
+    smooth, across, within = likeness.smooth, likeness.across, likeness.within
+    if not len(within):
+        return None
+    best = int(np.argmax(smooth.mean(axis=1)))
+    lead = _score(smooth[best] - smooth[expected])
+    if best == expected or min(lead, _score(smooth[best])) < _MIN_SCORE:
+        return None
+    leads = [_score(smooth[best] - smooth[other]) for other in range(len(ORDERS)) if other != best]
+    if min(*leads, _score(within - across[expected])) < _MIN_LEAD_OF_ORDER:
+        return None
+    correlation, expected_correlation, found = (float(each.mean()) for each in (within, across[expected], across[best]))
+    if abs(correlation - found) > (correlation - expected_correlation) / 2:
+        return None
+    return lead, OtherOrder(ORDERS[best], correlation, expected_correlation, found)
+
+
+def _products_of(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float32]]:
+    """Return the sums of the products of neighbours in sums of 16 and 128 frames, as far as samples are that long."""
+    found: dict[int, NDArray[np.float32]] = {}
+    for frames in samples:
+        n_sums = len(frames) // _LENGTHS[0]
+        # The counts of the four pairs of pixels of a byte lie in the four bytes of a word.
+        words = _PAIRS[frames[: n_sums * _LENGTHS[0]]].reshape(n_sums, _LENGTHS[0], *frames.shape[1:])
+        summed: NDArray[np.uint32] = words.sum(axis=1, dtype=np.uint32)
+        sums = summed[..., None].view(np.uint8).astype(np.float32)
+        for length in _LENGTHS:
+            step = length // _LENGTHS[0]
+            if step > len(sums):
+                break
+            longer = sums[: len(sums) // step * step].reshape(-1, step, *sums.shape[1:]).sum(axis=1)
+            for image in longer:
+                products = _products(image)
+                found[length] = found[length] + products if length in found else products
+    return list(found.values())
+
+
+_PAIRS = np.unpackbits(np.arange(256, dtype=np.uint8)).reshape(256, 4, 2).sum(axis=2, dtype=np.uint8).view(np.uint32)[:, 0]
+
+
+def _products(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return products of neighbours in an image of pairs (rows, bytes, 4): (10, rows - 1, bytes - 1).
+
+    Across borders in each order, of an image that is smoothed at right angles to its bytes, which lowers the noise; the same of
+    the image as it is; within bytes; and the variance.
+    """
+    image = np.minimum(image, max(1.0, float(np.quantile(image, _CLIP_QUANTILE))))
+    image = image - image.mean(axis=0)  # static columns are no scene
+    over_rows, over_columns = _smoothed(image, 0), _smoothed(image, 1)
+    a, b, c, d = np.moveaxis(image[:-1, :-1], -1, 0)
+    within = (a * b + b * c + c * d) / 3
+    variance = (a * a + b * b + c * c + d * d) / 4
+    smooth = *_across(over_rows, over_rows[:-1, 1:]), *_across(over_columns, over_columns[1:, :-1])
+    sharp = *_across(image, image[:-1, 1:]), *_across(image, image[1:, :-1])
+    return np.stack([*smooth, *sharp, within, variance])
+
+
+def _across(image: NDArray[np.float32], next_byte: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the products across the borders of a byte and the next, if the first pixel is the highest bit, and the lowest."""
+    byte = image[:-1, :-1]
+    return byte[..., 3] * next_byte[..., 0], byte[..., 0] * next_byte[..., 3]
+
+
+def _smoothed(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+    """Add to each value its neighbours along an axis."""
+    values = np.moveaxis(image, axis, 0)
+    summed = values.copy()
+    summed[1:] += values[:-1]
+    summed[:-1] += values[1:]
+    return np.moveaxis(summed, 0, axis)
+
+
+def _units_of(images: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Sum images over units of eight rows and one column, which are nearly independent: (k, H, W) becomes (k, units)."""
+    bands = images.shape[1] // _ROWS
+    if bands >= 2:
+        images = images[:, : bands * _ROWS].reshape(len(images), bands, _ROWS, -1).sum(axis=2)
+    return images.reshape(len(images), -1)
+
+
+def _score(values: NDArray[np.floating]) -> float:
+    """Return the mean of the values of units in its standard errors; 0 if there are fewer than 30 units, or no scatter."""
+    if len(values) < _MIN_UNITS:
+        return 0.0
+    scatter = float(values.std(ddof=1))
+    return float(values.mean()) / scatter * float(np.sqrt(len(values))) if scatter > 0 else 0.0
+
+
+_VALUES = 3 * 1024**2  # values read, about
+_RUN = 128  # most frames of a run of consecutive frames
+_SHORTEST_RUN = 16  # frames of a run, even if only some of their columns can be read
+_MIN_BITS = 20  # fewest lit pixels by which an array of zeros and ones is recognised
+_MIN_SUMS = 200  # fewest nonzero pixels by which an array without values of 128 and more is recognised
+_BRIGHT = 0.9  # pixels above this quantile are left out: hot pixels must not outweigh the scene
+_COMPARED = 16  # frames whose bytes are compared as numbers
+# sum of the squares of the bits of each byte
+_WEIGHTS = np.unpackbits(np.arange(256, dtype=np.uint8)).reshape(256, 8) @ 4.0 ** np.arange(7, -1, -1)
+# Neighbouring numbers differ by less than their bits: 127 and 128 by 1. If a byte is eight pixels, the squared difference of
+# two is at least a third of the sum of the squares of their bits, even in a checkerboard.
+_CARRIES = 0.25
+_BLOCK = 8  # side of the blocks of frames, rows and columns that are correlated with their neighbours
+_TIMES_LONGER = 2  # the axis of the frames is more than twice as long as both of the image
+
+Eight: TypeAlias = Literal["pixels of a column", "pixels of a row", "frames"]
+_PACKED_AXES: tuple[Eight, ...] = get_args(Eight)  # the axis of an array whose last is that of the frames
+
+_MIN_LEAD = 4.0  # standard errors by which the correlation along the axis of the frames exceeds the others
+
+
+class Content(NamedTuple):
+    """What the values of an array are."""
+
+    holds: Literal["bits", "sums"]  # "bits" for a pixel to a value, of 0 and 1, or of 0 and 255; "sums" for counts
+    lowest: int  # the smallest value of the sample
+    highest: int  # the largest value of the sample
+    n_values: int  # values of the sample
+
+
+def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:
+    """Read runs of consecutive frames from all over a .npy file, or from the beginning of a .npy.gz file.
+
+    Args:
+        path: the file.
+        header: its header; the array has three dimensions or more, in C order.
+
+    Returns:
+        Arrays (n, rows, columns, ...), 3 million values together. Of large frames, only the first columns are read. An empty
+        list where the file is cut short, or the beginning of a .npy.gz file holds no whole frame.
+    """
+    n_frames, n_rows, n_columns, *_ = header.shape
+    values_of_frame = int(np.prod(header.shape[1:]))
+    if is_gzip(path):
+        start = unpacked_start(local(path), header.offset + _VALUES * header.dtype.itemsize)[header.offset :]
+        whole = min(n_frames, len(start) // (values_of_frame * header.dtype.itemsize))
+        frames = np.frombuffer(start, header.dtype, whole * values_of_frame)
+        return [frames.reshape(whole, *header.shape[1:])] if whole else []
+    if size_of(path) < header.file_bytes:
+        return []
+    columns = min(n_columns, max(1, _VALUES // (_SHORTEST_RUN * n_rows)))
+    spans = sampled_spans(n_frames, n_rows * columns)
+    if isinstance(path, Url):
+        files = OpenFiles()
+        samples = [np.empty((len(span), *header.shape[1:]), header.dtype) for span in spans]
+        for span, sample in zip(spans, samples, strict=True):
+            files.read(path, header.offset + span.start * sample[0].nbytes, sample.view(np.uint8))
+        return [sample[:, :, :columns] for sample in samples]
+    stored = np.memmap(path, header.dtype, "r", header.offset, header.shape)
+    return [np.array(stored[each.start : each.stop, :, :columns]) for each in spans]
+
+
+def sampled_spans(n_frames: int, frame_values: int) -> list[FrameSpan]:
+    """Return spans of up to 128 frames, evenly spaced over a capture, that hold about 3 million values together."""
+    most = max(1, _VALUES // frame_values)
+    length = min(_RUN, n_frames, most)
+    n_spans = max(1, min(most // length, n_frames // length))
+    starts = np.linspace(0, n_frames - length, n_spans).astype(int).tolist()
+    return [FrameSpan(start, start + length) for start in starts]
+
+
+def unpacked_content(samples: Sequence[NDArray[Any]]) -> Content | None:
+    """Return what the values of runs of frames (n, rows, columns), integers or bool, are.
+
+    None if they are bytes of eight pixels each, and where too few pixels are lit.
+    """
+    lowest, highest = (int(edge) for edge in (min(each.min() for each in samples), max(each.max() for each in samples)))
+    n_values = sum(each.size for each in samples)
+    peak = np.max([each.max(axis=0) for each in samples], axis=0)
+    n_lit = int(np.count_nonzero(peak))
+    if samples[0].dtype != np.uint8:
+        return Content("bits" if (lowest, highest) in ((0, 1), (0, 0), (1, 1)) else "sums", lowest, highest, n_values)
+    if highest == 1:
+        return Content("bits", 0, 1, n_values) if n_lit >= _MIN_BITS else None
+    if highest == 255 and not any(((each + np.uint8(1)) > 1).any() for each in samples):
+        n_varied = int(np.count_nonzero((peak > 0) & (np.min([each.min(axis=0) for each in samples], axis=0) == 0)))
+        return Content("bits", 0, 255, n_values) if n_varied >= _MIN_BITS else None
+    if (highest < 128 and n_lit >= _MIN_SUMS) or (highest >= 128 and _are_numbers(samples, peak)):
+        return Content("sums", lowest, highest, n_values)
+    return None
+
+
+def _are_numbers(samples: Sequence[NDArray[np.uint8]], peak: NDArray[np.uint8]) -> bool:
+    """Return whether neighbouring bytes are alike as numbers, and not bit by bit."""
+    usual = peak <= np.quantile(peak, _BRIGHT)
+    pairs = usual[1:] & usual[:-1]
+    excess = np.zeros(pairs.shape)
+    frames = [frame for run in samples for frame in run]
+    for frame in frames[:: -(-len(frames) // _COMPARED)]:
+        difference = np.diff(frame.astype(np.int16), axis=0)
+        flipped = _WEIGHTS[frame[1:] ^ frame[:-1]]
+        excess += _CARRIES * flipped - difference.astype(np.float64) ** 2
+    return _score(_units_of((excess * pairs)[None])[0]) > _MIN_SCORE
+
+
+def frames_are_last(samples: Sequence[NDArray[Any]], shape: Sequence[int]) -> bool:
+    """Return whether the last axis of an array is that of the frames, and the first two are those of the image.
+
+    Eight frames later a pixel is more like itself than the pixel eight rows or columns further, unless the image moves by more
+    than a pixel a frame. So the axis along which blocks of values correlate most is that of the frames, if it is the longest.
+
+    Args:
+        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, columns), a pixel to a value.
+        shape: that of the array.
+    """
+    return _last_is_longest(*shape) and _last_is_alike(samples, (_BLOCK, _BLOCK, _BLOCK))
+
+
+def packed_frames_are_last(samples: Sequence[NDArray[np.uint8]], shape: Sequence[int], a_byte_holds: Eight) -> bool:
+    """Return whether the last axis of an array of bytes is that of the frames: see `frames_are_last`.
+
+    Args:
+        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, bytes of a row).
+        shape: that of the array: (rows, bytes of a row, frames), (bytes of a column, columns, frames), or (rows, columns, bytes
+            of eight frames).
+        a_byte_holds: what the eight bits of a byte would be.
+    """
+    axis = _PACKED_AXES.index(a_byte_holds)
+    lengths, block = list(shape), [_BLOCK] * 3
+    lengths[axis], block[axis] = 8 * shape[axis], 1
+    if not _last_is_longest(*lengths):
+        return False
+    lit = [np.bitwise_count(each) for each in samples]
+    if a_byte_holds == "frames":
+        return _last_is_alike(lit, block)
+    # Bytes of eight pixels are less alike along the axis where they are packed, as they are 8 px apart there.
+    pixels = [_blocks(each, (1, 1, _BLOCK)) for each in lit]
+    if _correlation(pixels, axis) < _correlation(pixels, 1 - axis) and _last_is_alike(lit, block):
+        return True
+    # The frames may move too fast for that. Then the axis where bytes are packed is still an axis of the image.
+    other = other_order(samples if axis == 1 else [each.swapaxes(0, 1) for each in samples])
+    return other is not None and other.order.packed_along == "height"
+
+
+def _last_is_longest(first: int, second: int, last: int) -> bool:
+    return last > _TIMES_LONGER * max(first, second)
+
+
+def _last_is_alike(samples: Sequence[NDArray[Any]], block: Sequence[int]) -> bool:
+    """Return whether neighbouring blocks of values correlate most along the last axis."""
+    blocks = [_blocks(each, block) for each in samples]
+    (first, _), (second, _), (last, number) = (_correlation(blocks, axis) for axis in range(3))
+    return bool(first and second and last) and last - max(first, second) > _MIN_LEAD * math.sqrt(2 / number)
+
+
+def _blocks(frames: NDArray[Any], block: Sequence[int]) -> NDArray[np.float64]:
+    """Return the means of blocks of values: (n, rows, columns) becomes smaller by the sides of a block."""
+    shape = [length // side for length, side in zip(frames.shape, block, strict=True)]
+    cut = frames[tuple(slice(n * side) for n, side in zip(shape, block, strict=True))]
+    in_blocks = cut.reshape(shape[0], block[0], shape[1], block[1], shape[2], block[2])
+    return np.asarray(in_blocks.mean(axis=(1, 3, 5)))
+
+
+def _correlation(blocks: Sequence[NDArray[np.float64]], axis: int) -> tuple[float, int]:
+    """Return the correlation of neighbours along an axis, 0 if there are none, or no scatter; and how many there are."""
+    along = [np.moveaxis(each, axis, 0) for each in blocks]
+    x, y = (np.concatenate([each[part].ravel() for each in along]) for part in (slice(None, -1), slice(1, None)))
+    scatter = float(x.std() * y.std()) if x.size else 0.0
+    return (float(((x - x.mean()) * (y - y.mean())).mean()) / scatter if scatter > 0 else 0.0), x.size

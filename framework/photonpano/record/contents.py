@@ -22,7 +22,7 @@ from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError
 from photonpano.files.paths import Location, Url
-from photonpano.reading.remote import remote_file
+from photonpano.reading.files import remote_file
 from photonpano.record.schema import CaptureRecord, FileContent, FileRecord
 from photonpano.specs.plan import Plan
 

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import OutputError
-from photonpano.files.atomic import atomic_path
-from photonpano.files.folders import atomic_folder
+from photonpano.files.folders import atomic_folder, atomic_path
 from photonpano.geometry import Canvas
 from photonpano.plugins.contributions import Requirement, install_command
 

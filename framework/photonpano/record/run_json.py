@@ -23,8 +23,8 @@ from pydantic import TypeAdapter
 from photonpano.errors import InputError
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.level import Timeline
 from photonpano.motion.loop import LevelResult, converges
-from photonpano.motion.timeline import Timeline
 from photonpano.record.schema import (
     AgreementRecord,
     CameraRecord,

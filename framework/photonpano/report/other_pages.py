@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from photonpano.errors import PhotonpanoError
 from photonpano.motion.diagnosis import UntiedError
 from photonpano.photometry import picture_of
-from photonpano.plugins.registry.description import flow
+from photonpano.plugins.description import flow
 from photonpano.record.batch_row import FIGURES, BatchRow, written
 from photonpano.record.run_json import failure_records
 from photonpano.record.schema import FailureRecord, RunRecord

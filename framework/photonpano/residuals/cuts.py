@@ -17,8 +17,8 @@ from photonpano.filtering import gradient_of
 from photonpano.geometry import corners, inverse, steps_px, transform_points
 from photonpano.locating import shift_of_spectra
 from photonpano.merging import binned_mean, binning_of
-from photonpano.motion.timeline import Cut
-from photonpano.motion.tracking.spans import DARK, PEAK_PX, Spectrum, span_image, spectra_of
+from photonpano.motion.level import Cut
+from photonpano.motion.tracking import DARK, PEAK_PX, Spectrum, span_image, spectra_of
 from photonpano.residuals.prediction import Predictions
 from photonpano.residuals.refinement import MotionFit
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, true_spans

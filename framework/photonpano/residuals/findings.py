@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from photonpano.motion.timeline import Timeline
+from photonpano.motion.level import Timeline
 from photonpano.text import listed
 from photonpano.values import Decision, FrameSpan
 

@@ -1,4 +1,4 @@
-from .checks import check_stream as check_stream
+from .builtin import check_stream as check_stream
 from .json_schema import json_schema as json_schema
 from .loading import SPEC_SUFFIXES as SPEC_SUFFIXES
 from .loading import capture_plan as capture_plan

@@ -1,24 +1,27 @@
-"""Resolve the sections of a spec that choose components: each names one with `use`, and has its keys under `with`."""
+"""Resolve what a spec names: components by `use`, with their keys under `with`, and corrections by their names."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NoReturn
 
+from photonpano.corrections import CORRECTIONS, Correction
 from photonpano.errors import PluginError, described
 from photonpano.plugins.contributions import KINDS, ExporterContribution, Kind, LocatorContribution, SourceContribution
 from photonpano.plugins.registry import Entry
-from photonpano.specs.plan import Choice
+from photonpano.reading import missing_file
+from photonpano.specs.plan import Choice, Spec, validate
 from photonpano.specs.settings import CHOICE
-from photonpano.specs.spec import Spec, validate
-from photonpano.specs.written import Written, given
-from photonpano.text import listed
+from photonpano.specs.yaml_reader import Written, given
+from photonpano.text import listed, suggestion
 
 # The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks.
 DEFAULT_FALLBACK = "opencv-sift"
 MAX_LISTED = 16  # components in a list, such as fallbacks
 _AGAIN = "would lose the same pairs again"
+AUTO = "auto"  # the default: the run masks what stands still, and divides by a vignette
 
 
 def _unbuilt(*_: object) -> NoReturn:
@@ -215,3 +218,44 @@ class ComponentResolver:
         """Return the alias with this name, None if there is none."""
         offered = (entry.contribution for entry in self.catalog.entries(kind.name, name))
         return next((each for each in offered if isinstance(each, Alias)), None)
+
+
+def resolved_corrections(written: Written, spec: Spec) -> tuple[Correction, ...] | None:
+    """Resolve the section `corrections`: a list, or `auto`, which is the default, and for which it returns None.
+
+    Corrections with problems are left out; these are added to the spec.
+    """
+    if written.data is None or written.data == AUTO:
+        return None
+    if not isinstance(written.data, list):
+        spec.wrong(written, f"expected a list of corrections, or {AUTO}, got {given(written.data)}")
+        return ()
+    found = (_resolved(item, spec) for item in written.data)
+    return tuple(correction for correction in found if correction is not None)
+
+
+def written_corrections(corrections: Iterable[Correction]) -> list[Any]:
+    """Write corrections down as plain data, from which they can be resolved again."""
+    settings = ((each.name, each.model_dump(mode="json")) for each in corrections)
+    return [{name: keys} if keys else name for name, keys in settings]
+
+
+def _resolved(item: Written, spec: Spec) -> Correction | None:
+    if isinstance(item.data, str):
+        name, named, settings = item.data, item, Written(None, item.place.below(item.data))
+    elif isinstance(item.data, dict) and len(item.data) == 1:
+        ((name, settings),) = item.data.items()
+        named = settings
+    else:
+        got = f"a mapping of {len(item.data)}" if isinstance(item.data, dict) else given(item.data)
+        expected = "the name of a correction, or a mapping of one name to its settings such as {crop: {rows: [2, null]}}"
+        spec.wrong(item, f"expected {expected}, got {got}")
+        return None
+    if name not in CORRECTIONS:
+        spec.wrong_key(named, f"there is no correction {name!r}; {suggestion(name, CORRECTIONS)}")
+        return None
+    correction = validate(CORRECTIONS[name], settings, spec)
+    for key, file in correction or ():
+        if isinstance(file, Path) and not file.exists():
+            spec.wrong(settings.at(key), missing_file(file))
+    return correction

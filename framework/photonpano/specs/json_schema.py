@@ -10,10 +10,9 @@ from pydantic.json_schema import models_json_schema
 
 from photonpano.corrections import CORRECTIONS
 from photonpano.plugins.contributions import KINDS, Kind
+from photonpano.plugins.description import TolerantJsonSchema
 from photonpano.plugins.registry import Catalog, Entry
-from photonpano.plugins.registry.description import TolerantJsonSchema
-from photonpano.specs.components import DEFAULT_FALLBACK, LocatorAlias
-from photonpano.specs.corrections import AUTO
+from photonpano.specs.components import AUTO, DEFAULT_FALLBACK, LocatorAlias
 from photonpano.specs.settings import (
     LEVELS,
     MAX_LEVELS,

@@ -11,11 +11,9 @@ from photonpano.errors import Problem, SpecError
 from photonpano.files.paths import Location, location, refusal
 from photonpano.plugins.registry import Catalog, discover
 from photonpano.specs.builtin import ask_sources
-from photonpano.specs.plan import Plan
+from photonpano.specs.plan import Plan, Spec
 from photonpano.specs.resolution import resolve
-from photonpano.specs.spec import Spec
-from photonpano.specs.written import Place, Written, from_python, given, joined
-from photonpano.specs.yaml_reader import MAX_LENGTH, read_yaml
+from photonpano.specs.yaml_reader import MAX_LENGTH, Place, Written, from_python, given, joined, read_yaml
 
 SPEC_SUFFIXES = {".yaml", ".yml"}
 

@@ -8,10 +8,9 @@ from typing import Any
 
 from photonpano.errors import SpecError
 from photonpano.plugins.contributions import KINDS
-from photonpano.specs.checks import check_flat_field, check_settings, complaints
-from photonpano.specs.components import ComponentResolver, Stage
-from photonpano.specs.corrections import AUTO, resolved_corrections, written_corrections
-from photonpano.specs.plan import Choice, LevelPlan, Plan
+from photonpano.specs.builtin import check_flat_field, check_settings, complaints
+from photonpano.specs.components import AUTO, ComponentResolver, Stage, resolved_corrections, written_corrections
+from photonpano.specs.plan import Choice, LevelPlan, Plan, Spec, validate
 from photonpano.specs.settings import (
     CHOICE,
     LEVELS,
@@ -25,8 +24,7 @@ from photonpano.specs.settings import (
     VERSION,
     LevelSettings,
 )
-from photonpano.specs.spec import Spec, validate
-from photonpano.specs.written import Written, given
+from photonpano.specs.yaml_reader import Written, given
 
 
 def resolve(spec: Spec) -> Plan:

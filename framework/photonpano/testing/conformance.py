@@ -1,29 +1,90 @@
-"""Checks of every contribution, and of the components that are built for a capture."""
+"""Checks of every contribution, and of components built for a capture; results compared bit by bit, and in several threads."""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import importlib.util
 import json
+import pickle
 import typing
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, ClassVar, TypeAlias
+from threading import Barrier
+from typing import Any, ClassVar, TypeAlias, TypeVar
 
+import numpy as np
 import pytest
+from numpy.random.mtrand import get_bit_generator, set_bit_generator
 from pydantic import BaseModel
 
 from photonpano.contracts.requirements import BrokenContract
 from photonpano.errors import CaptureUnreadError, PluginError
 from photonpano.photometry import BinaryResponse
-from photonpano.plugins.contributions import Contribution, StageContext, StageContribution, install_command
-from photonpano.plugins.registry import KINDS
+from photonpano.plugins.contributions import KINDS, Contribution, StageContext, StageContribution, install_command
 from photonpano.values import CaptureSummary, StreamInfo
 
+T = TypeVar("T")
+
+THREADS = 4
 STREAM = StreamInfo(2000, 254, 496, frame_rate_hz=96_800.0)  # the capture for which components are built by default
 SUMMARY = CaptureSummary(flux=0.5, speed_px=0.15, how="set by the conformance kit")
 # What a component returned, described for messages; the value; and what a run requires of it.
 Answer: TypeAlias = tuple[str, Any, Callable[[Any], object]]
+
+
+def fingerprint(value: Any) -> object:
+    """Return a value that is equal for results with the same bytes; unlike `==`, also for NaN.
+
+    Arrays become hashes: pytest would compare megabytes letter by letter to explain how they differ.
+    """
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = [fingerprint(getattr(value, field.name)) for field in dataclasses.fields(value)]
+        return type(value).__name__, *fields
+    if isinstance(value, Mapping):
+        return tuple((key, fingerprint(item)) for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return tuple(fingerprint(item) for item in value)
+    return repr(value)
+
+
+@contextmanager
+def global_seed(seed: int) -> Iterator[None]:
+    """Seed numpy's global generator, on which no component may depend, within a block."""
+    before = get_bit_generator()
+    set_bit_generator(np.random.MT19937(seed))
+    try:
+        yield
+    finally:
+        set_bit_generator(before)
+
+
+def in_threads(work: Callable[[int], T]) -> list[T]:
+    """Call `work(number)` in `THREADS` threads that start together, and return all results."""
+    together = Barrier(THREADS)
+
+    def start(number: int) -> T:
+        together.wait()
+        return work(number)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(start, range(THREADS)))
+
+
+def copied(value: T, what: str) -> T:
+    """Return a copy as another process would get it; fail with a message if it cannot travel there."""
+    try:
+        copy: T = pickle.loads(pickle.dumps(value))
+    except Exception as error:
+        raise AssertionError(
+            f"{what} must survive pickling, so that other processes can use it; keep functions and classes at the top of a "
+            f"module, and drop locks and open files in __getstate__ ({type(error).__name__}: {error})"
+        ) from error
+    return copy
 
 
 @pytest.mark.usefixtures("photonpano_one_thread_inside")

@@ -1,10 +1,11 @@
-"""Checks of mergers and renderers, on binary frames of a still camera and of one that pans and rolls."""
+"""Checks of mergers and renderers, on frames of a still camera and of one that pans and rolls; and of exporters."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache, partial
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -17,12 +18,14 @@ from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.contracts.requirements import require_exposure, require_panorama
 from photonpano.errors import InputError
 from photonpano.geometry import Canvas, canvas_of, inverse, translation
-from photonpano.photometry import BinaryResponse
-from photonpano.plugins.contributions import MergerContribution, RendererContribution
-from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, read_only, recorded, rolled
-from photonpano.testing.conformance import Answer, AnswerConformance
-from photonpano.testing.sameness import copied, fingerprint, in_threads
-from photonpano.testing.scenes import Scene
+from photonpano.merging.canvas_noise import CanvasNoise
+from photonpano.photometry import BinaryResponse, flux_std
+from photonpano.pipeline.rendering import AttributedExporter, StoredPanorama
+from photonpano.plugins.contributions import ExporterContribution, MergerContribution, RendererContribution
+from photonpano.record.contents import contents_of
+from photonpano.record.schema import FileContent
+from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, Scene, read_only, recorded, rolled
+from photonpano.testing.conformance import Answer, AnswerConformance, StageConformance, copied, fingerprint, in_threads, passing
 from photonpano.values import (
     BoolArray,
     Counts,
@@ -48,6 +51,7 @@ _DARK_RATE = np.float64(0.2)  # dark counts per pixel per frame
 _MARGIN = 8  # width of the border that few frames of the moving camera see, px
 _SEEN = 20  # frames that a pixel of a panorama was seen in if it is compared with the scene
 _SHARP = 0.7  # contrast of a sharp image, as a share of that of the scene
+PANORAMA_SHAPE = (37, 53)
 
 
 class MergerConformance(AnswerConformance):
@@ -356,3 +360,48 @@ def displacement_and_contrast(exposure: VirtualExposure, known: FloatArray) -> t
     seen = np.isfinite(image)
     _, contrast, x, y = np.linalg.lstsq(system[seen], image[seen], rcond=None)[0]
     return -np.array([x, y]) / max(abs(contrast), 1e-6), float(contrast)
+
+
+def panorama(in_colour: bool = False, nothing_seen: bool = False) -> StoredPanorama:
+    """Return flux over 120 dB, with unseen and saturated pixels."""
+    shape = (*PANORAMA_SHAPE, 3) if in_colour else PANORAMA_SHAPE
+    flux = (10 ** np.random.default_rng(0).uniform(-5, 1, shape)).astype(np.float32)
+    weight = np.full(shape, 100_000, np.float32)
+    flux[:5, :7], weight[:5, :7] = np.nan, 0
+    flux[-1] = np.log(200_001)
+    if nothing_seen:
+        flux[:], weight[:] = np.nan, 0
+    response = BinaryResponse()
+    return StoredPanorama(flux, weight, flux_std(flux, weight, response), np.eye(3), 1.0, CanvasNoise(response))
+
+
+class ExporterConformance(StageConformance):
+    """Checks of an exporter."""
+
+    kind: ClassVar[str] = "exporter"
+
+    contribution: ExporterContribution
+
+    def exported(self, of: StoredPanorama, folder: Path) -> Mapping[str, FileContent]:
+        """Write a panorama as a run does, and return the hashes of its files."""
+        self.require_libraries()
+        folder.mkdir()
+        with passing("what export() does"):
+            AttributedExporter(self.built(), f"exporter {self.contribution.name!r}", self.contribution.suffix).export(
+                of, folder
+            )
+        return contents_of(folder)
+
+    @pytest.mark.parametrize("in_colour", [False, True])
+    def test_export_writes_one_file_or_folder_with_content(self, tmp_path: Path, in_colour: bool) -> None:
+        """Panoramas are grey, or have red, green and blue; some pixels were not seen."""
+        self.exported(panorama(in_colour), tmp_path / "run")
+
+    def test_export_accepts_panorama_of_which_nothing_is_known(self, tmp_path: Path) -> None:
+        """A part of the canvas may not have been seen."""
+        self.exported(panorama(nothing_seen=True), tmp_path / "run")
+
+    def test_export_is_deterministic(self, tmp_path: Path) -> None:
+        """The same panorama gives the same bytes, so that a run can be repeated."""
+        first, second = (self.exported(panorama(), tmp_path / name) for name in ("first", "second"))
+        assert first == second, "export() writes other bytes for the same panorama; leave out times and names of files"

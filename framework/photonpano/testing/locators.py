@@ -24,10 +24,8 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.plugins.contributions import LocatorContribution
-from photonpano.testing.captures import photographed, read_only, rolled
-from photonpano.testing.conformance import Answer, AnswerConformance, passing
-from photonpano.testing.sameness import copied, fingerprint, global_seed, in_threads
-from photonpano.testing.scenes import Scene
+from photonpano.testing.captures import Scene, photographed, read_only, rolled
+from photonpano.testing.conformance import Answer, AnswerConformance, copied, fingerprint, global_seed, in_threads, passing
 from photonpano.values import FloatArray, Homography, Located, NotLocated, StreamInfo, VirtualExposure
 
 SHAPE = (144, 192)

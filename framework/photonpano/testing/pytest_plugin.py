@@ -12,7 +12,7 @@ import pytest
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-for _name in ("conformance", "sources", "images", "locators", "motions", "exporters", "pose_estimators", "executors"):
+for _name in ("conformance", "sources", "images", "locators", "motions", "executors"):
     pytest.register_assert_rewrite(f"photonpano.testing.{_name}")
 
 

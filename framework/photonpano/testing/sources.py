@@ -15,8 +15,7 @@ from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Arrived, PackedSource, Source
 from photonpano.errors import InputError
 from photonpano.plugins.contributions import SourceContext, SourceContribution
-from photonpano.testing.conformance import Conformance, passing
-from photonpano.testing.sameness import fingerprint, global_seed, in_threads
+from photonpano.testing.conformance import Conformance, fingerprint, global_seed, in_threads, passing
 from photonpano.values import FrameSpan
 
 _MAX_FRAMES = 200  # frames that are checked, half of them at each end of a longer capture

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, Light, capture_of
-from photonpano.corrections.lighting import in_light
+from photonpano.capture import in_light
 from photonpano.geometry import Camera
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource

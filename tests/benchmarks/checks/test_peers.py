@@ -14,7 +14,7 @@ import pytest
 
 from photonpano.evaluation import Truth
 from photonpano.geometry import translation
-from photonpano.testing.scenes import textured
+from photonpano.testing.captures import textured
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "explanation" / "peers.md"

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from photonpano import __version__
-from photonpano.api.simulate import simulate
+from photonpano.api.simulated import simulate
 from photonpano.errors import InputError, SpecError
 from photonpano.execution.context import Progress, Quiet, usual
 from photonpano.files.folders import atomic_folder, require_new

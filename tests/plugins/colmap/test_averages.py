@@ -16,7 +16,7 @@ from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
 from photonpano.geometry import camera_matrix
 from photonpano.testing import MemorySource
-from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses
+from photonpano.testing.motions import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
 
 pytest.importorskip("pycolmap")
 
@@ -38,7 +38,7 @@ def estimated(source: MemorySource, camera: CameraGuess | None = None, **keys: A
 
 def test_points_and_views_fit_together() -> None:
     estimate, decided = estimated(capture())
-    assert len(estimate.views) == N_FRAMES // SIZE
+    assert len(estimate.views) == N_POSES // SIZE
     assert len(estimate.points.positions) > 100
     view = estimate.views[3]
     ideal = (estimate.points.positions[view.points] @ view.camera_from_world[:, :3].T + view.camera_from_world[:, 3]) @ MATRIX.T
@@ -51,13 +51,13 @@ def test_camera_that_only_turns_is_offered_rotations(monkeypatch: pytest.MonkeyP
     found = Reconstruction((), np.full(16, 300), np.full(16, 100))
     monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
     with pytest.raises(LocationError) as caught:
-        estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))))
+        estimated(MemorySource(np.zeros((N_POSES, *POSES_SHAPE))))
     assert "of 300 keypoints in an average (the median) 100 match another average" in str(caught.value)
     assert "motion: {model: rotation}" in str(caught.value)
 
 
 def test_full_disk_ends_the_run_before_colmap_reads_half_of_a_picture() -> None:
-    picture = np.random.default_rng(0).integers(0, 255, SHAPE, np.uint8)
+    picture = np.random.default_rng(0).integers(0, 255, POSES_SHAPE, np.uint8)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))  # the system cuts files short, as a full disk does
     try:
@@ -68,7 +68,7 @@ def test_full_disk_ends_the_run_before_colmap_reads_half_of_a_picture() -> None:
 
 
 def test_scene_without_texture_is_refused() -> None:
-    frames = np.random.default_rng(0).integers(0, 2, (5 * SIZE, *SHAPE))
+    frames = np.random.default_rng(0).integers(0, 2, (5 * SIZE, *POSES_SHAPE))
     with pytest.raises(LocationError, match=r"too little texture, or too much noise: of \d+ keypoints in an average"):
         estimated(MemorySource(frames))
 
@@ -93,7 +93,7 @@ def pieces(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("pieces")
 def test_pieces_are_named_or_the_largest_is_kept() -> None:
-    source = MemorySource(np.zeros((N_FRAMES, *SHAPE)))
+    source = MemorySource(np.zeros((N_POSES, *POSES_SHAPE)))
     with pytest.raises(LocationError) as caught:
         estimated(source)
     assert str(caught.value) == (
@@ -102,7 +102,7 @@ def test_pieces_are_named_or_the_largest_is_kept() -> None:
         "largest"
     )
     estimate, _ = estimated(source, disconnected="largest")
-    np.testing.assert_array_equal(estimate.located, np.arange(N_FRAMES) < 160)
+    np.testing.assert_array_equal(estimate.located, np.arange(N_POSES) < 160)
     [lost] = estimate.lost
     assert (lost.span, lost.reason) == (
         FrameSpan(160, 320),
@@ -119,7 +119,7 @@ def test_reversed_depth_is_recorded_and_an_undecided_one_is_doubted(is_unsure: b
     readings = Readings(0.8, 0.78 if is_unsure else 0.5, is_reversed=True)
     pieces = tuple(replace(piece, readings=readings) for piece in found.pieces)
     monkeypatch.setattr(averages, "reconstruct", lambda *_: replace(found, pieces=pieces))
-    estimate, [decision] = estimated(MemorySource(np.zeros((N_FRAMES, *SHAPE))), disconnected="largest")
+    estimate, [decision] = estimated(MemorySource(np.zeros((N_POSES, *POSES_SHAPE))), disconnected="largest")
     assert decision[:2] == ("depth_reversed", True)
     assert [round(doubt.figure, 3) for doubt in estimate.doubts] == ([0.975] if is_unsure else [])
     assert Readings(0.8, 0.8, differ=False).doubt is None
@@ -130,7 +130,7 @@ def test_errors_are_no_smaller_than_those_of_half_of_the_points(monkeypatch: pyt
     from photonpano_colmap import averages
 
     found = averages.reconstruct(None)
-    source, halves = MemorySource(np.zeros((N_FRAMES, *SHAPE))), Halves(0.02, 0.03)
+    source, halves = MemorySource(np.zeros((N_POSES, *POSES_SHAPE))), Halves(0.02, 0.03)
     before, _ = estimated(source, disconnected="largest")
     pieces = tuple(replace(piece, halves=halves) for piece in found.pieces)
     monkeypatch.setattr(averages, "reconstruct", lambda *_: replace(found, pieces=pieces))
@@ -144,7 +144,7 @@ def test_errors_are_no_smaller_than_those_of_half_of_the_points(monkeypatch: pyt
 def test_few_averages_are_refused() -> None:
     contribution = discover().find("pose-estimator", "colmap-averages").contribution
     config = ColmapAveragesConfig(group_size=40)
-    [problem] = contribution.check(config, StreamInfo(160, *SHAPE, None))
+    [problem] = contribution.check(config, StreamInfo(160, *POSES_SHAPE, None))
     words = "160 frames are 4 averages of 40; at least 5 are needed: choose a smaller pose.with.group_size, or record longer"
     assert problem == words
     with pytest.raises(LocationError, match=words):

@@ -20,8 +20,8 @@ from photonpano import (
 )
 from photonpano.geometry import Camera, camera_matrix, transform_points
 from photonpano.specs import parse_spec
-from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, true_poses
-from photonpano.testing.scenes import Scene
+from photonpano.testing.captures import Scene
+from photonpano.testing.motions import FOCAL_PX, N_POSES, POSES_SHAPE, true_poses
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -38,22 +38,22 @@ class Keys(Config):
 def truth(source: Any, camera: Any, progress: Any) -> PoseEstimate:
     """Return the true poses of exposures without noise of a plane at a depth of 4 m, and points of it."""
     poses, points, views = true_poses(), np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 4], (40, 3)), []
-    pixels = CAMERA.ideal(np.stack(np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0])), axis=-1))
-    for span in FrameSpan(0, N_FRAMES).blocks(GROUP):
+    pixels = CAMERA.ideal(np.stack(np.meshgrid(np.arange(POSES_SHAPE[1]), np.arange(POSES_SHAPE[0])), axis=-1))
+    for span in FrameSpan(0, N_POSES).blocks(GROUP):
         pose = poses[span.start]
         seen = (points @ pose[:, :3].T + pose[:, 3]) @ CAMERA.matrix.T
         xy = CAMERA.distorted(seen[:, :2] / seen[:, 2:])
         to_plane = np.linalg.inv(CAMERA.matrix @ (pose @ np.array([[1, 0, 0], [0, 1, 0], [0, 0, 4], [0, 0, 1]])))
         flux = SCENE.flux(FOCAL_PX / 4 * transform_points(to_plane, pixels)).astype(np.float32)
         views.append(PosedView(span, span.start, pose, np.arange(len(points)), xy, lambda flux=flux: flux))
-    ones, grey = np.ones(N_FRAMES), np.linspace(0.1, 1, len(points)).astype(np.float32)
+    ones, grey = np.ones(N_POSES), np.linspace(0.1, 1, len(points)).astype(np.float32)
     return PoseEstimate(
         *(CAMERA.matrix, CAMERA.distortion, 0.0, poses, ones > 0, 1e-4 * ones, ones, ScenePoints(points, grey)), tuple(views)
     )
 
 
 def posed(folder: Path, exposures: bool = True) -> Path:
-    bits = np.random.default_rng(0).integers(0, 256, (N_FRAMES, SHAPE[0], SHAPE[1] // 8), np.uint8)
+    bits = np.random.default_rng(0).integers(0, 256, (N_POSES, POSES_SHAPE[0], POSES_SHAPE[1] // 8), np.uint8)
     np.save(folder / "cube.npy", bits)
     estimator = SimpleNamespace(estimate=truth)
     toy = PoseEstimatorContribution(name="toy", summary="Toy", config=Keys, build=lambda *_: estimator)
@@ -67,7 +67,7 @@ def posed(folder: Path, exposures: bool = True) -> Path:
 def test_features_of_pictures_are_triangulated_with_the_poses(tmp_path: Path, undistorted: bool) -> None:
     scene = tmp_path / "scene"
     found = export(posed(tmp_path), "colmap", scene, images=True, undistorted=undistorted)
-    assert (found.n_frames, found.pictures) == (N_FRAMES // GROUP, scene / "images")
+    assert (found.n_frames, found.pictures) == (N_POSES // GROUP, scene / "images")
     model = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
     assert model.compute_mean_reprojection_error() < 1e-3
     camera, database = model.cameras[1], tmp_path / "features.db"

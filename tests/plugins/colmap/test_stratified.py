@@ -11,7 +11,7 @@ from photonpano import CameraGuess, FrameSpan, Group, StageContext
 from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
 from photonpano.geometry import Camera, positions_of, rotation_matrices
-from photonpano.testing.pose_estimators import FOCAL_PX, N_FRAMES, SHAPE, capture, true_poses
+from photonpano.testing.motions import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("gtsam")
@@ -30,12 +30,12 @@ from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Observations, adjust
 from photonpano_colmap.stratified import Merged, Scene, StratifiedEstimator, interpolate, locate, merge, resample
 
-CAMERA = Camera.of(FOCAL_PX, SHAPE)
+CAMERA = Camera.of(FOCAL_PX, POSES_SHAPE)
 MATRIX = CAMERA.matrix
 LENS = (-0.2, 0.0, 0.0, 0.0)
 LENS_CAMERA = Camera(MATRIX, np.array(LENS))
 TRUE = Path(true_poses())
-EVERYWHERE = np.ones(N_FRAMES, np.bool_)
+EVERYWHERE = np.ones(N_POSES, np.bool_)
 
 
 def points_on_planes(number: int, seed: int = 0) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_frames_merge_sharp_through_depth_and_blurred_without() -> None:
     source, group, instant = capture(), Group(FrameSpan(0, 320), 159.5), TRUE.at([159.5])[0]
     edges = {}
     for name, depth in (("true", 3.0), ("wrong", 5.0)):
-        plane = np.full(SHAPE, 1 / depth, np.float32)
+        plane = np.full(POSES_SHAPE, 1 / depth, np.float32)
         found = merge_through_depth(source, group, TRUE, plane, CAMERA)
         assert found.exposure.weight.max() == pytest.approx(320, rel=1e-3)
         np.testing.assert_array_equal(found.pose, instant)
@@ -68,8 +68,8 @@ def test_frames_merge_sharp_through_depth_and_blurred_without() -> None:
 
 
 def trembling(rms_px: float) -> tuple[Path, np.ndarray]:
-    """Return a path that misses a tremor, and the tremor: rotation vectors of the camera, (N_FRAMES, 3)."""
-    frames = np.arange(N_FRAMES)
+    """Return a path that misses a tremor, and the tremor: rotation vectors of the camera, (N_POSES, 3)."""
+    frames = np.arange(N_POSES)
     turns = [np.sin(2 * np.pi * (frames / period + phase)) for period, phase in ((41, 0.1), (27, 0.4), (35, 0.7))]
     tremor = np.sqrt(2) * rms_px / FOCAL_PX * np.stack(turns, axis=1)
     return TRUE.rotated(-tremor), tremor
@@ -131,7 +131,7 @@ def test_exposures_along_the_true_path_are_found_where_they_are() -> None:
 
 def test_lens_is_undone_and_images_nothing_beyond_the_frame() -> None:
     camera = Camera(MATRIX, np.array([-0.3, 0.05, 0.01, -0.02]))
-    lens = lens_of(camera, SHAPE)
+    lens = lens_of(camera, POSES_SHAPE)
     for x, y in ((0, 0), (159, 0), (80, 64), (3, 120)):
         np.testing.assert_allclose(imaged(lens, *lens.ideal[y, x]), (x, y), atol=1e-9)
         moved = camera.distorted(lens.ideal[y, x] + (0.01, -0.02)) - (x, y)
@@ -141,8 +141,8 @@ def test_lens_is_undone_and_images_nothing_beyond_the_frame() -> None:
 
 
 def test_frames_from_one_place_merge_as_they_are_through_a_lens() -> None:
-    source, rests = capture(distortion=LENS), Path(np.repeat(true_poses()[:1], N_FRAMES, axis=0))
-    found = merge_through_depth(source, Group(FrameSpan(0, 8), 3.5), rests, np.full(SHAPE, 0.2, np.float32), LENS_CAMERA)
+    source, rests = capture(distortion=LENS), Path(np.repeat(true_poses()[:1], N_POSES, axis=0))
+    found = merge_through_depth(source, Group(FrameSpan(0, 8), 3.5), rests, np.full(POSES_SHAPE, 0.2, np.float32), LENS_CAMERA)
     np.testing.assert_allclose(found.exposure.weight[1:-1, 1:-1], 8, atol=1e-4)
     counts = source.frames(FrameSpan(0, 8)).sum(axis=0)
     unsaturated = counts < 8
@@ -162,7 +162,7 @@ def observed_through(camera: Camera, noise_px: float = 0.03) -> tuple[np.ndarray
 
 def test_adjustment_finds_the_focal_length() -> None:
     poses, points, observations = observed_through(CAMERA)
-    found = adjust(poses, points, observations, Camera.of(1.04 * FOCAL_PX, SHAPE), finds_focal=True)
+    found = adjust(poses, points, observations, Camera.of(1.04 * FOCAL_PX, POSES_SHAPE), finds_focal=True)
     assert found.std_focal_px < 0.7
     assert abs(found.focal_px - FOCAL_PX) < 3 * found.std_focal_px
     given = adjust(poses, points, observations, CAMERA, finds_focal=False)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, Light, Merger, StageContext, Trajectory, capture_of, discover
-from photonpano.capture import MaskedSpan
-from photonpano.corrections.lighting import in_light
+from photonpano.capture import MaskedSpan, in_light
 from photonpano.geometry import Camera, translation
 from photonpano.merging import accumulate, chunks_of
 from photonpano.testing import MemorySource

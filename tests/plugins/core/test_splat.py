@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group, InputError, Light, Trajectory, VirtualExposure, capture_of
-from photonpano.corrections.lighting import in_light
+from photonpano.capture import in_light
 from photonpano.geometry import inverse, rescaling
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.mergers.splat import SplatMerger

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Light, Panorama, capture_of
-from photonpano.capture import MaskedSpan
-from photonpano.corrections.lighting import in_light
+from photonpano.capture import MaskedSpan, in_light
 from photonpano.geometry import Canvas, translation
 from photonpano.merging import Chunk, MergeRenderer, PhotonSum
 from photonpano.photometry import BinaryResponse, BinarySumResponse

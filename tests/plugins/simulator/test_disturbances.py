@@ -10,7 +10,7 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.geometry import corners, transform_points
-from photonpano.testing.scenes import z_scores
+from photonpano.testing.captures import z_scores
 from photonpano_simulator.config import FrameObject, Lens, Sensor, SimulatorConfig
 from photonpano_simulator.sensor import SpadSensor
 from photonpano_simulator.views import DrawnObject, undistorted

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
 from photonpano.capture.writing import write_packed
-from photonpano.testing.scenes import z_scores
+from photonpano.testing.captures import z_scores
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
 from photonpano_simulator.sensor import Draw, IntensityCamera, SpadSensor, generator

@@ -13,7 +13,7 @@ import pytest
 from photonpano import OutputError
 from photonpano.geometry import rescaling, translation
 from photonpano.pipeline.rendering import AttributedExporter
-from photonpano.testing.exporters import SHAPE, panorama
+from photonpano.testing.images import PANORAMA_SHAPE, panorama
 
 zarr = pytest.importorskip("zarr", reason="OME-Zarr needs photonpano[zarr]")
 
@@ -23,7 +23,7 @@ MAPS = ("flux", "weight", "std", "saturated")
 
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cut SHAPE into several bands, files and levels."""
+    """Cut PANORAMA_SHAPE into several bands, files and levels."""
     for name, value in {"_CHUNK": 8, "_SHARD_COLUMNS": 16, "_READ_ROWS": 3}.items():
         monkeypatch.setattr(ome, name, value)
 
@@ -34,9 +34,9 @@ def test_first_level_holds_the_panorama(tmp_path: Path, in_colour: bool) -> None
     stored = panorama(in_colour)
     ome.OmeZarrExporter().export(stored, tmp_path / "a.ome.zarr")
     group = zarr.open_group(tmp_path / "a.ome.zarr", mode="r")
-    rows = stored.rows(0, SHAPE[0])
-    expected = np.stack([getattr(rows, name) for name in MAPS]).reshape(4, *SHAPE, -1)
-    np.testing.assert_array_equal(group["0"][:], np.moveaxis(expected, -1, 1).reshape(-1, *SHAPE))
+    rows = stored.rows(0, PANORAMA_SHAPE[0])
+    expected = np.stack([getattr(rows, name) for name in MAPS]).reshape(4, *PANORAMA_SHAPE, -1)
+    np.testing.assert_array_equal(group["0"][:], np.moveaxis(expected, -1, 1).reshape(-1, *PANORAMA_SHAPE))
     assert [group[str(level)].shape[1:] for level in range(4)] == [(37, 53), (19, 27), (10, 14), (5, 7)]
     channels = group.attrs["ome"]["omero"]["channels"]
     ends = [".R", ".G", ".B"] if in_colour else [""]
@@ -52,7 +52,7 @@ def test_last_level_is_that_of_all_photons(tmp_path: Path) -> None:
     stored.weight[20:, 30:] /= 7
     ome.OmeZarrExporter().export(stored, tmp_path / "a.ome.zarr")
     maps = zarr.open_group(tmp_path / "a.ome.zarr", mode="r")["3"][:]
-    rows = stored.rows(0, SHAPE[0])
+    rows = stored.rows(0, PANORAMA_SHAPE[0])
     frames, (flux, weight, std, saturated) = rows.weight.sum(dtype=float), maps.astype(float)
     assert 64 * weight.sum() == pytest.approx(frames, rel=1e-5)
     assert 64 * np.nansum(weight * flux) == pytest.approx(np.nansum(rows.weight.astype(float) * rows.flux), rel=1e-5)

@@ -15,7 +15,7 @@ import pytest
 from photonpano import InputError, check_run, clean, compare, parse_spec, run, verify
 from photonpano.evaluation import RunTrajectory
 from photonpano.evaluation.run_scores import motion_difference, on_canvas
-from photonpano.files.atomic import locked
+from photonpano.files.folders import locked
 from photonpano.geometry import Canvas, translation
 from photonpano.pipeline.run import RunResult
 

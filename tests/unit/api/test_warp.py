@@ -11,8 +11,7 @@ import tifffile
 
 from photonpano import InputError, RunResult, load_panorama, load_trajectory, load_xarray, warp
 from photonpano.geometry import Camera, inverse, translation
-from photonpano.testing.captures import rolled
-from photonpano.testing.scenes import Scene
+from photonpano.testing.captures import Scene, rolled
 
 SHAPE = (40, 56)
 SCENE = Scene(3)

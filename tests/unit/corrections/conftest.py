@@ -8,9 +8,9 @@ import pytest
 from photonpano import FrameSpan
 from photonpano.corrections import Correction
 from photonpano.photometry import packed_counts
-from photonpano.specs.corrections import resolved_corrections
-from photonpano.specs.spec import Spec
-from photonpano.specs.written import Place, from_python
+from photonpano.specs.components import resolved_corrections
+from photonpano.specs.plan import Spec
+from photonpano.specs.yaml_reader import Place, from_python
 from photonpano.testing import MemorySource
 
 

@@ -21,7 +21,7 @@ from photonpano.corrections import (
 )
 from photonpano.geometry import translation
 from photonpano.testing import KnownMotion, MemorySource
-from photonpano.testing.scenes import detected, seen_along
+from photonpano.testing.captures import detected, seen_along
 from photonpano.values import Decision
 
 SHAPE = (20, 30)

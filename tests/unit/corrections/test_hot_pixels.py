@@ -10,7 +10,7 @@ from photonpano import Capture
 from photonpano.corrections import DarkFrames, corrected_source, write_dark
 from photonpano.geometry import translation
 from photonpano.testing import MemorySource
-from photonpano.testing.scenes import seen_along
+from photonpano.testing.captures import seen_along
 
 SHAPE = (60, 80)
 N = 2000

@@ -8,7 +8,7 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.capture import with_background
-from photonpano.corrections.moments import showing
+from photonpano.corrections.movers import showing
 from photonpano.execution.threads import in_order
 from photonpano.geometry import Canvas, translation
 from photonpano.merging.panorama import MergeRenderer

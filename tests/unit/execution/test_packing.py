@@ -11,11 +11,10 @@ import pytest
 
 import photonpano.pipeline.run as run_module
 from photonpano import FrameSpan, Light, parse_spec, run
-from photonpano.capture import Capture, capture_of, part_of, seen_through
+from photonpano.capture import Capture, capture_of, in_light, part_of, seen_through
 from photonpano.contracts.protocols import Source
 from photonpano.corrections import ColourFilter, HotPixels, Vignette, corrected_source, divided_by
-from photonpano.corrections.lighting import in_light
-from photonpano.execution.remote import packed, unpacked
+from photonpano.execution.executor import packed, unpacked
 from photonpano.geometry import Camera
 from photonpano.pipeline.executors import CaptureOpener, met_elsewhere
 from photonpano.testing import MemorySource

@@ -15,7 +15,7 @@ from photonpano import (
     Url,
 )
 from photonpano import text as words
-from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_path
 from photonpano.files.paths import location
 from photonpano.filtering import exceeding_noise
 
@@ -113,7 +113,7 @@ def test_atomic_path_reports_a_full_disk_and_keeps_the_old_file(tmp_path: Path, 
 
     final = tmp_path / "result.bin"
     final.write_bytes(b"old")
-    monkeypatch.setattr("photonpano.files.atomic.os.fsync", full)
+    monkeypatch.setattr("photonpano.files.folders.os.fsync", full)
     with pytest.raises(OutputError) as caught, atomic_path(final) as temporary:
         temporary.write_bytes(b"new")
     assert str(caught.value) == (f"cannot write {final}: No space left on device; free some space or choose another folder")

@@ -11,7 +11,7 @@ from photonpano.geometry import from_parameters, rescaling, translation
 from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource
-from photonpano.testing.scenes import detected
+from photonpano.testing.captures import detected
 
 SHAPE = (30, 40)
 FLUX = 0.7

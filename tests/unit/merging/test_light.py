@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Light, Response
-from photonpano.corrections.lighting import in_light
+from photonpano.capture import in_light
 from photonpano.geometry import translation
 from photonpano.merging import Chunk, accumulate
 from photonpano.merging.accumulate import LitFrames, gain_image

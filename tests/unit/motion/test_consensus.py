@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import patch_centres, transform_points, translation
-from photonpano.motion.consensus import agreeing, tolerances_px
+from photonpano.motion.models import agreeing, tolerances_px
 from photonpano.values import Located, Patches
 
 SHAPE = (120, 160)

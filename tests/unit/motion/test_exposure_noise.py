@@ -7,8 +7,7 @@ import pytest
 
 from photonpano import FrameSpan, Group
 from photonpano.geometry import corners, transform_points
-from photonpano.motion.adjustment import Problem
-from photonpano.motion.exposure_noise import ExposureNoise
+from photonpano.motion.adjustment import ExposureNoise, Problem
 from photonpano.motion.planar import PlanarAdjustment, Plane
 from photonpano.values import FloatArray
 

@@ -8,10 +8,9 @@ import pytest
 from photonpano import FrameSpan, Group, InputError, Located
 from photonpano.geometry import Camera, corner_displacements, right_handed_axes, rotation_matrices, rotation_vectors
 from photonpano.motion.graph import solve
-from photonpano.motion.gyroscope import Gyroscope
-from photonpano.motion.model import MotionModel
+from photonpano.motion.gyroscope import Gyroscope, Rates, read_rates
+from photonpano.motion.models import MotionModel
 from photonpano.motion.pairs import GYROSCOPE
-from photonpano.motion.rates import Rates, read_rates
 from photonpano.testing import measured_rates
 
 SHAPE, FOCAL_PX = (64, 96), 122.0

@@ -5,7 +5,7 @@ import pytest
 
 from photonpano.geometry import Camera, inverse, normalised, rotation_matrices, translation
 from photonpano.motion.graph import solve
-from photonpano.motion.model import MotionModel
+from photonpano.motion.models import MotionModel
 from photonpano.motion.planar import PLANAR_NAMES, PlanarName, basis_of, moved
 from photonpano.values import Edge
 

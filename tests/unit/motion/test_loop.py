@@ -12,10 +12,9 @@ from photonpano import FrameSpan, Group, PluginError
 from photonpano.contracts.attribution import attributed
 from photonpano.execution.context import Context, Quiet
 from photonpano.geometry import translation
-from photonpano.motion.level import Level
+from photonpano.motion.level import Cut, Level, Timeline
 from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import LevelResult, converges, estimate_motion
-from photonpano.motion.timeline import Cut, Timeline
 from photonpano.residuals.findings import Findings
 from photonpano.specs.settings import GraphSettings
 

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.geometry import inverse, rescaling, translation
-from photonpano.motion.closures import closure_candidates, exposure_similarity
 from photonpano.motion.graph import GraphSolution
 from photonpano.motion.pairs import pairs_of, shared_share
+from photonpano.motion.registration import closure_candidates, exposure_similarity
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import photographed
-from photonpano.testing.scenes import seen_along
+from photonpano.testing.captures import seen_along
 
 
 def groups(*starts: int, size: int = 100) -> list[Group]:

@@ -12,9 +12,8 @@ from photonpano.geometry import (
     parameters,
     rotation_matrices,
 )
-from photonpano.motion.refined_motion import Knots, RefinedMotion
-from photonpano.motion.rotation_graph import Rotations
-from photonpano.motion.rotations import RotationTrajectory
+from photonpano.motion.rotations import Rotations, RotationTrajectory
+from photonpano.motion.trajectories import Knots, RefinedMotion
 from photonpano.values import FloatArray
 
 SHAPE, FRAMES = (40, 64), 200

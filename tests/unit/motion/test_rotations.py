@@ -22,9 +22,8 @@ from photonpano.geometry import (
 )
 from photonpano.locating import fit_homography
 from photonpano.motion.graph import GraphSolution, solve
-from photonpano.motion.model import ModelName, MotionModel
-from photonpano.motion.rotation_graph import Rotations
-from photonpano.motion.rotations import RotationTrajectory, fit_rotations
+from photonpano.motion.models import ModelName, MotionModel
+from photonpano.motion.rotations import Rotations, RotationTrajectory, fit_rotations
 from photonpano.values import Edge, FloatArray, Located, NotLocated, Patches
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators import GeodesicInterpolator, LucasKanadeInterpolator, SmoothingSplineInterpolator

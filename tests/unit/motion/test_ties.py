@@ -7,8 +7,7 @@ import pytest
 
 from photonpano import FrameSpan, Group, InputError, Located, NotLocated, StreamInfo
 from photonpano.geometry import inverse, transform_points, translation
-from photonpano.motion.pairs import TIE
-from photonpano.motion.ties import read_ties, require_agreement, tied_pairs
+from photonpano.motion.pairs import TIE, read_ties, require_agreement, tied_pairs
 from photonpano.testing import KnownMotion
 from photonpano.testing.captures import rolled
 from photonpano.values import Edge

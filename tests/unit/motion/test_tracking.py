@@ -22,8 +22,8 @@ from photonpano.geometry import (
 )
 from photonpano.motion.frame_motion import FrameMotion, smooth_view
 from photonpano.motion.tracking import StartingMotion, starting_motion
-from photonpano.motion.tracking.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
-from photonpano.testing.scenes import detected, seen_along, textured
+from photonpano.motion.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
+from photonpano.testing.captures import detected, seen_along, textured
 
 SHAPE = (64, 96)
 LENGTH = 32  # frames of a group

@@ -8,7 +8,7 @@ import pytest
 from photonpano import Group
 from photonpano.geometry import from_parameters
 from photonpano.motion.graph import GraphSolution, solve
-from photonpano.motion.model import MotionModel
+from photonpano.motion.models import MotionModel
 
 from .measured_graphs import (
     NOISE_PX,

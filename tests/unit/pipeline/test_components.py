@@ -24,8 +24,7 @@ from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import build_levels, build_source, scale_of
 from photonpano.pipeline.forecast import TRIAL_GROUPS, forecast
 from photonpano.pipeline.rendering import build_renderer
-from photonpano.plugins.registry import Catalog, Origin
-from photonpano.plugins.registry.catalog import make_entry
+from photonpano.plugins.registry import Catalog, Origin, make_entry
 from photonpano.specs import Plan, parse_spec
 
 

@@ -20,7 +20,7 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.pipeline.film import Film
 from photonpano.record.picture_files import photo_sphere
 from photonpano.testing import MemorySource
-from photonpano.testing.scenes import detected
+from photonpano.testing.captures import detected
 
 SHAPE = (24, 32)
 

@@ -12,9 +12,9 @@ from photonpano import LocationError, hookimpl
 from photonpano.errors import described
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas
+from photonpano.motion.level import Timeline
 from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import estimate_motion
-from photonpano.motion.timeline import Timeline
 from photonpano.pipeline.observers import Observers, frozen
 from photonpano.plugins.registry import Catalog
 from photonpano.specs.settings import GraphSettings

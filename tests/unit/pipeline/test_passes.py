@@ -12,14 +12,13 @@ from photonpano.contracts.attribution import attributed
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, likely_rotations, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.timeline import Timeline
+from photonpano.motion.level import Timeline
 from photonpano.pipeline.passes import refine
 from photonpano.pipeline.state import State
 from photonpano.record.run_json import refinement_record, refinement_warnings
 from photonpano.residuals.refinement import Explained, NamedRefiner
 from photonpano.specs import parse_spec
-from photonpano.testing.captures import KnownMotion, ReadOnlySource, recorded
-from photonpano.testing.scenes import Scene
+from photonpano.testing.captures import KnownMotion, ReadOnlySource, Scene, recorded
 
 PLAN = parse_spec({"version": 1, "source": {"use": "simulator"}})
 

@@ -8,7 +8,7 @@ from pydantic import Field
 from ruamel.yaml import YAML
 
 from photonpano import Config, LocatorContribution, Requirement, SpecPath
-from photonpano.plugins.registry.description import (
+from photonpano.plugins.description import (
     ConfigRow,
     config_rows,
     snippet,

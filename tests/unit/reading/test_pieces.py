@@ -10,7 +10,7 @@ import pytest
 
 from photonpano import FrameSpan, InputError
 from photonpano.reading import Pieces, PixelOrder, npy_header, other_order, sampled_frames, sampled_spans
-from photonpano.testing.scenes import detected
+from photonpano.testing.captures import detected
 
 FRAMES = np.arange(1000, dtype=np.uint16).reshape(1000, 1)
 STARTS = [*range(0, 1000, 10), 1000]

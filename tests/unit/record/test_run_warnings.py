@@ -7,7 +7,7 @@ import pytest
 
 from photonpano.geometry import FrameTrajectory, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.timeline import Timeline
+from photonpano.motion.level import Timeline
 from photonpano.record.run_json import motion_warnings, timeline_warnings
 from photonpano.values import FrameSpan
 

@@ -10,11 +10,11 @@ from photonpano import FrameSpan
 from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.timeline import Cut
+from photonpano.motion.level import Cut
 from photonpano.residuals.cuts import find_cuts
 from photonpano.residuals.refinement import MotionFit
 from photonpano.testing import MemorySource
-from photonpano.testing.scenes import detected, seen_along
+from photonpano.testing.captures import detected, seen_along
 
 SHAPE, N_FRAMES, JUMP = (96, 128), 600, 330
 

@@ -12,7 +12,7 @@ from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory, canvas_of, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.residuals.halves import Halves, halves_of
-from photonpano.testing.scenes import detected, seen_along, textured
+from photonpano.testing.captures import detected, seen_along, textured
 
 SHAPE, N_FRAMES = (64, 96), 400
 PAN = np.array([translation(10 + 0.25 * frame, 20) for frame in range(N_FRAMES)])

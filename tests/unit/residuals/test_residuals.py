@@ -16,8 +16,7 @@ from photonpano.residuals.measure import Residuals, measure
 from photonpano.residuals.patterns import lens_distortion
 from photonpano.residuals.prediction import Predictions
 from photonpano.residuals.refinement import bounded_std_px, residual_ratio, unexplained_px
-from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, recorded
-from photonpano.testing.scenes import Scene
+from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, Scene, recorded
 from photonpano.values import FloatArray
 
 SHAPE = (48, 80)

@@ -13,7 +13,7 @@ from photonpano import FrameSpan
 from photonpano.geometry import Camera
 from photonpano.motion.graph import Freed, Rival
 from photonpano.motion.loop import LevelResult
-from photonpano.motion.model import SAME_LENS_PX, MotionModel
+from photonpano.motion.models import SAME_LENS_PX, MotionModel
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
 from photonpano.residuals.findings import Findings, Jump
 from photonpano.residuals.halves import Agreements, Halves

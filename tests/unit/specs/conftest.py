@@ -6,9 +6,8 @@ import pytest
 from pydantic import Field, model_validator
 
 from photonpano import Config, Recognised, Requirement, SpecPath
-from photonpano.plugins.registry import KINDS, Catalog, Origin
-from photonpano.plugins.registry.catalog import make_entry
-from photonpano.plugins.registry.plugins import contributions_of
+from photonpano.plugins.contributions import KINDS
+from photonpano.plugins.registry import Catalog, Origin, contributions_of, make_entry
 from photonpano.specs import builtin
 
 

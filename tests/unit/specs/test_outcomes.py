@@ -23,8 +23,8 @@ from photonpano import (
     SpecError,
     StreamInfo,
 )
+from photonpano.plugins.description import flow
 from photonpano.plugins.registry import Catalog
-from photonpano.plugins.registry.description import flow
 from photonpano.specs import Plan, check_stream, json_schema, parse_spec
 
 CASES = Path(__file__).with_name("outcomes.txt")

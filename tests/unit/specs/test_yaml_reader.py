@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from photonpano.specs.written import Place
-from photonpano.specs.yaml_reader import read_yaml
+from photonpano.specs.yaml_reader import Place, read_yaml
 
 
 def read(text):

@@ -23,11 +23,10 @@ from photonpano import (
 from photonpano.api.cli.errors import reported
 from photonpano.geometry import camera_matrix, translation
 from photonpano.pipeline.run import run
-from photonpano.plugins.registry import KINDS as OF_CATALOG
-from photonpano.plugins.registry import Catalog, Observer, discover
-from photonpano.plugins.registry.catalog import make_entry
+from photonpano.plugins.contributions import KINDS as OF_CATALOG
+from photonpano.plugins.registry import Catalog, Observer, discover, make_entry
 from photonpano.specs import parse_spec
-from photonpano.testing import KnownMotion, MemorySource, Scene, pose_estimators
+from photonpano.testing import KnownMotion, MemorySource, Scene, motions
 from photonpano.testing.captures import recorded
 
 from .strange import FRAMES, KINDS, ORIGIN, SHAPE, Keys, Outcome
@@ -85,9 +84,9 @@ def known_path(context: StageContext) -> KnownPath:
         poses = np.tile(np.eye(3, 4), (FRAMES, 1, 1))
         poses[:, 0, 3] = -np.linspace(0, 1, FRAMES)
         return KnownPath(poses, camera_matrix(60, (31.5, 23.5)), SHAPE)
-    poses = pose_estimators.true_poses()
+    poses = motions.true_poses()
     poses[:, :, 3] += 0.001 * np.random.default_rng(0).normal(size=(len(poses), 3))
-    return KnownPath(poses, camera_matrix(pose_estimators.FOCAL_PX, (79.5, 63.5)), pose_estimators.SHAPE)
+    return KnownPath(poses, camera_matrix(motions.FOCAL_PX, (79.5, 63.5)), motions.POSES_SHAPE)
 
 
 @pytest.fixture(scope="package")

@@ -29,8 +29,7 @@ from photonpano.geometry import from_parameters, inverse, normalised, parameters
 from photonpano.merging import MergeRenderer
 from photonpano.testing import KnownMotion, MemorySource, SourceConformance
 from photonpano.testing.conformance import Conformance
-from photonpano.testing.motions import REFERENCE, SHAPE
-from photonpano.testing.pose_estimators import capture
+from photonpano.testing.motions import REFERENCE, SHAPE, capture
 
 from .conftest import known_path
 from .strange import Around, around, given, instead

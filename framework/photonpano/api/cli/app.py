@@ -1,24 +1,45 @@
-"""The program `photonpano`. A command is a module of `api`, which is imported when it is used: that keeps `--help` fast."""
+"""The program `photonpano`. The module of a command is imported when it is used: that keeps `--help` fast."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 import photonpano
-from photonpano import api
-from photonpano.api.cli.errors import end_on_signals
+from photonpano.api.cli.errors import end_on_signals, prepare_streams
 from photonpano.api.cli.signatures import SETTINGS, loaded
-from photonpano.api.cli.streams import prepare_streams
 from photonpano.api.cli.verbosity import with_verbosity
 
-# The commands that `--help` lists before all others
-_FIRST = ("demo", "info", "check", "run", "batch", "check_run", "verify", "evaluate", "compare", "render", "video", "export")
+# The commands as `--help` lists them: the module of `api` that declares each, and its line there.
+_COMMANDS = {
+    "demo": ("simulated", "Simulate a small capture, make its panorama, and score it."),
+    "info": ("looks", "Print size, brightness and speed of a capture, and a spec."),
+    "check": ("specs", "Check a spec without running it."),
+    "run": ("run", "Make a panorama from a spec."),
+    "batch": ("batch", "Run one spec on many captures, and write one summary."),
+    "check-run": ("judging", "Judge a finished run by its capture."),
+    "verify": ("run_folders", "Verify that a run folder is as its run wrote it."),
+    "evaluate": ("judging", "Score a run against the truth of its capture."),
+    "compare": ("judging", "Lay runs of one capture side by side."),
+    "render": ("rendering", "Render a finished run again, with other settings."),
+    "video": ("rendering", "Make a video along the motion of a finished run."),
+    "export": ("export", "Write poses of a camera for other programs, and pictures with them."),
+    "clean": ("run_folders", "Remove what killed processes have left."),
+    "convert": ("copies", "Convert binary frames to a packed .npy file or a zarr array."),
+    "dark": ("copies", "Measure dark counts and hot pixels, with the lens covered."),
+    "explain": ("looks", "Print a spec with all defaults, explained in comments."),
+    "preview": ("looks", "Merge frames into pictures, to look at a capture."),
+    "schema": ("specs", "Print the JSON Schema of specs, for editors."),
+    "simulate": ("simulated", "Write a simulated capture with its truth to a packed .npy file."),
+    "warm-up": ("simulated", "Compile the loops over pixels for this machine."),
+    "plugins list": ("plugins", "List components that a spec can use, with their plugins."),
+    "plugins show": ("plugins", "Describe a component: its keys, and YAML to paste."),
+}
+_GROUPS = {"plugins": "List and describe the components of the installed plugins."}
 
 
 class _Command(TyperCommand):
@@ -30,41 +51,37 @@ class _Command(TyperCommand):
 
     @cached_property
     def loaded(self) -> Any:
-        return loaded(self.words, self._module)
+        return loaded(self.words, f"photonpano.api.{self._module}")
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
         return self.loaded.make_context(*arguments, **options)
 
 
 class _Commands(TyperGroup):
-    """The modules of a package that are commands, and its packages that hold some; with -v, -q and --log before the name."""
-
-    def __init__(self, *, package: str = "photonpano.api", **options: Any) -> None:
-        super().__init__(**options)
-        folder = Path(api.__path__[0], *package.split(".")[2:])
-        places = {name: place for place, name in enumerate(_FIRST)}
-        for file in sorted(folder.glob("*.py"), key=lambda file: (places.get(file.stem, len(places)), file.stem)):
-            if "\n@command(" in file.read_text(encoding="utf-8"):
-                words = " ".join([*package.split(".")[2:], file.stem.replace("_", "-")])
-                self.add_command(_Command(words, f"{package}.{file.stem}", _first_line(file)))
-        for file in sorted(folder.glob("*/__init__.py")):
-            name = file.parent.name
-            help_of_group: Any = {"help": _first_line(file), "no_args_is_help": True, "rich_markup_mode": None}
-            group = _Commands(name=name, package=f"{package}.{name}", context_settings=SETTINGS, **help_of_group)
-            if group.commands:
-                self.add_command(group)
+    """Commands; with -v, -q and --log before the name."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         return with_verbosity(super().get_params(ctx))
 
 
-def _first_line(file: Path) -> str:
-    return file.read_text(encoding="utf-8").partition("\n")[0].strip('"')
+class _Program(_Commands):
+    """All commands, some of them in groups."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        groups = {}
+        for words, (module, summary) in _COMMANDS.items():
+            group, _, _ = words.rpartition(" ")
+            if group and group not in groups:
+                help_of_group: Any = {"help": _GROUPS[group], "no_args_is_help": True, "rich_markup_mode": None}
+                groups[group] = _Commands(name=group, context_settings=SETTINGS, **help_of_group)
+                self.add_command(groups[group])
+            groups.get(group, self).add_command(_Command(words, module, summary))
 
 
 app = typer.Typer(
     name="photonpano",
-    cls=_Commands,
+    cls=_Program,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

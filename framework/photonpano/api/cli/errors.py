@@ -1,5 +1,7 @@
 """Report errors of commands, and signals that end them: a message on stderr, and an exit code."""
 
+from __future__ import annotations
+
 import errno
 import logging
 import os
@@ -122,3 +124,19 @@ def print_error(error: PhotonpanoError, debug: bool = False) -> int:
     count = len(error.problems)
     typer.echo(f"error: the spec has {count} problem{'' if count == 1 else 's'}", err=True)
     return WRONG_SPEC
+
+
+def prepare_streams() -> None:
+    """Open nothing in place of standard streams that are closed, and silence libraries.
+
+    A file that is opened later would take the number of a closed stream, and receive what is printed.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nothing = os.open(os.devnull, os.O_RDWR)
+            if nothing != number:
+                os.dup2(nothing, number)
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8"))  # noqa: PTH123, SIM115
+    # Readers of pictures print what they find in damaged ones; our own error says it in a sentence.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    logging.getLogger("tifffile").addHandler(logging.NullHandler())

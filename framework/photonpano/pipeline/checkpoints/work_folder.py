@@ -26,7 +26,7 @@ import numpy as np
 import photonpano
 from photonpano.errors import InputError, OutputError, PhotonpanoError
 from photonpano.execution.context import Checkpoints, KeepNothing, Progress
-from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_path
 from photonpano.pipeline.components import scale_of
 from photonpano.record.contents import changed_files, changes
 from photonpano.record.run_json import library_versions, plugin_records, read_record

@@ -13,19 +13,18 @@ import numpy as np
 import pytest
 
 from photonpano import BatchRow, Location
-from photonpano.api.batching import running
-from photonpano.api.batching.processes import rows_of
-from photonpano.api.batching.running import run_job
-from photonpano.api.batching.sweeps import Job, SpecText, capture_override
+from photonpano.api import batch_running as running
+from photonpano.api.batch_jobs import Job, SpecText, capture_override
+from photonpano.api.batch_running import rows_of, run_job
 from photonpano.pipeline.run import RunResult
 
 MODULE = """\
 import os, signal
 from dataclasses import dataclass, field
 from pathlib import Path
-from photonpano.api.batching.sweeps import Job
-from photonpano.api.batching.sweeps import SpecText
-from photonpano.files.atomic import atomic_path
+from photonpano.api.batch_jobs import Job
+from photonpano.api.batch_jobs import SpecText
+from photonpano.files.folders import atomic_path
 from photonpano.record.batch_row import BatchRow
 
 @dataclass(frozen=True)

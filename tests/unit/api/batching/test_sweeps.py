@@ -12,9 +12,8 @@ import pytest
 
 from photonpano import BatchRow, InputError, SpecError, discover
 from photonpano.api.batch import Batch, prepare_batch
-from photonpano.api.batching.captures import find_captures
-from photonpano.api.batching.summary import write_summary
-from photonpano.api.batching.sweeps import folder_name
+from photonpano.api.batch_jobs import find_captures, folder_name
+from photonpano.api.batch_running import write_summary
 
 Find = Callable[..., dict[str, Path]]
 

@@ -16,7 +16,7 @@ from photonpano.api.cli.errors import reported
 PROGRAM = """\
 import os, signal, time
 from pathlib import Path
-from photonpano.files.atomic import atomic_path
+from photonpano.files.folders import atomic_path
 from photonpano.api.cli.app import app, main
 from photonpano.api.cli.signatures import LoadedCommand as Command
 from photonpano.files.folders import staging_of

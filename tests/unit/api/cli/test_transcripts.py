@@ -35,14 +35,12 @@ from photonpano import (
     discover,
     hookimpl,
 )
-from photonpano.api.batching.sweeps import Job
+from photonpano.api.batch_jobs import Job
 from photonpano.api.cli.app import commands
 from photonpano.api.command import COMMANDS
 from photonpano.photometry import IntensityResponse
 from photonpano.pipeline.run import RunResult
-from photonpano.plugins.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin
-from photonpano.plugins.registry.catalog import make_entry
-from photonpano.plugins.registry.plugins import observation_of
+from photonpano.plugins.registry import BrokenPlugin, Catalog, DisabledPlugin, Observer, Origin, make_entry, observation_of
 from photonpano.values import Reason, Verdict
 
 INSTALLED = f"photonpano {version('photonpano')}"
@@ -62,8 +60,7 @@ class World:
     def answer(self, name: str, result: Any) -> None:
         """Let a command have a result without work."""
         commands()[name]  # imports its module
-        module = f"photonpano.api.{name.replace('-', '_')}"
-        self.patch.setitem(COMMANDS, module, replace(COMMANDS[module], calls=lambda **_: result))
+        self.patch.setitem(COMMANDS, name, replace(COMMANDS[name], calls=lambda **_: result))
 
     def runs(self, verdict: Verdict, *others: Verdict, **record: Any) -> None:
         """Let `run` have a verdict, and those of other shots of 120 frames."""

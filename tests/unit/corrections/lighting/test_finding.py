@@ -8,14 +8,14 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.corrections import Vignette, divided_by
+from photonpano.corrections.gains import SeenCells, local_flicker, solve_gains
 from photonpano.corrections.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
-from photonpano.corrections.lighting.gains import SeenCells, local_flicker, solve_gains
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas, translation
 from photonpano.merging.accumulate import gain_image
 from photonpano.merging.panorama import render
 from photonpano.testing import KnownMotion, MemorySource, Scene
-from photonpano.testing.scenes import detected, seen_along
+from photonpano.testing.captures import detected, seen_along
 
 SHAPE, N = (48, 64), 1024
 MOTION = KnownMotion(lambda frame: translation(0.06 * float(frame), 0.01 * float(frame)))

@@ -11,9 +11,8 @@ from photonpano import FrameSpan, Group, Located, NotLocated, Trajectory
 from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import inverse, translation
-from photonpano.motion.level import Level, VirtualExposures
+from photonpano.motion.level import Level, Timeline, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
-from photonpano.motion.timeline import Timeline
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import KnownMotion
 

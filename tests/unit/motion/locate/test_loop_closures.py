@@ -14,13 +14,12 @@ from photonpano import Group, Located, NotLocated, Trajectory, VirtualExposure
 from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import inverse, rescaling, translation
-from photonpano.motion.closures import MIN_SIMILARITY
-from photonpano.motion.level import Level, VirtualExposures
+from photonpano.motion.level import Level, Timeline, VirtualExposures
 from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
-from photonpano.motion.timeline import Timeline
+from photonpano.motion.registration import MIN_SIMILARITY
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import KnownMotion, MemorySource, photographed
-from photonpano.testing.scenes import seen_along
+from photonpano.testing.captures import seen_along
 from photonpano.values import Edge
 
 pytestmark = pytest.mark.usefixtures("one_thread")

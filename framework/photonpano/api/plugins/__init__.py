@@ -1,1 +1,0 @@
-"""List and describe the components of the installed plugins."""

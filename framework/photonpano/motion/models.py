@@ -1,0 +1,225 @@
+"""Models of the motion, any homographies or rotations of one camera; and the pairs that agree with one motion of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano.geometry import Camera, camera_matrix, generators, parameters, patch_centres, slopes, transform_points
+from photonpano.motion.planar import PlanarName
+from photonpano.values import BoolArray, FloatArray, Located, Patches
+
+# Initial focal length, in longer sides of a frame.
+_FIRST_FOCAL = 3.0
+_LENS = (None, None, 0.0, 0.0)  # what "auto" finds of a lens: k1 and k2
+SAME_LENS_PX = 0.05  # largest difference of what two lenses do to a frame that does not matter
+_FAR_FOCAL = 1e4  # that of a camera whose turns shift and roll the image
+# Residuals of patches, in px, within which they agree: all of them at first, and then those of the background alone
+# (graduated non-convexity, Black and Rangarajan 1996).
+_TOLERANCES_PX = (2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+_LEAST_TOLERANCE = 0.5  # of the usual photon noise of patches: below that, chance decides which of them agree
+_CERTAIN = 0.5  # least error of a patch beside photon noise, as a share of the tolerance
+_TELLING = 48  # patches of most pairs that must show something
+_FEWEST = 8.0  # patches, by their weights, that determine the motion of a pair
+_UNCERTAIN = 1e-4  # factor of the information of a pair that has fewer
+_FAR, _FAR_PX = 4.0, 0.5  # standard deviations, and px, beyond which a patch contradicts a motion
+_ALIKE_PX = 0.1  # error of patches beside photon noise
+APART = 9.0  # mean square of the residuals of a patch that does not follow the motion, in variances
+_DAMPING, _TINY = 1e-6, 1e-12
+
+
+ModelName = Literal["auto", "translation", "euclidean", "similarity", "affine", "homography", "rotation"]
+
+
+@dataclass(frozen=True, slots=True)
+class MotionModel:
+    """The model of the motion of a camera."""
+
+    kind: ModelName = "homography"  # "auto" for the one that the pairs support
+    focal_px: float | None = None  # of the camera; None if it is to be found
+    centre_px: tuple[float, float] | None = None  # (x, y) of its principal point; None for the middle of the frames
+    # k1, k2, p1, p2 of its lens; None for those that are to be found
+    distortion: tuple[float | None, float | None, float | None, float | None] = (0.0, 0.0, 0.0, 0.0)
+    known: Camera | None = None  # the camera that the level before has found
+    layered: bool = False  # whether frames are known to show more than a background that follows the camera
+
+    @property
+    def unknown(self) -> tuple[int, ...]:
+        """Which numbers of the camera are to be found: 0 for the focal length, 1 to 4 for k1, k2, p1, p2."""
+        return tuple(index for index, number in enumerate((self.focal_px, *self.distortion)) if number is None)
+
+    @property
+    def name(self) -> str:
+        """Its name, such as "rotation with a lens" where the distortion is to be found."""
+        return f"{self.kind} with a lens" if self.finds_lens else self.kind
+
+    @property
+    def planar(self) -> PlanarName:
+        """The group of its homographies; any but those of a rotation have one."""
+        if self.kind == "rotation" or self.kind == "auto":
+            raise ValueError(f"{self.kind} is no planar model")
+        return self.kind
+
+    @property
+    def rotations(self) -> tuple[MotionModel, ...]:
+        """The rotations that "auto" compares with homographies: without a lens, and with one unless that is known."""
+        rotation = replace(self, kind="rotation")
+        if any(self.distortion) or self.finds_lens:
+            return (rotation,)
+        return rotation, replace(rotation, distortion=_LENS)
+
+    @property
+    def finds_lens(self) -> bool:
+        """Whether the distortion of the lens is to be found."""
+        return any(index > 0 for index in self.unknown)
+
+    def camera(self, frame_shape: tuple[int, int]) -> Camera:
+        """Return what is known of the camera so far; what is not begins at 3 sides of a frame, and without distortion."""
+        if self.known is not None:
+            return self.known
+        middle = (frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2
+        matrix = camera_matrix(self.focal_px or _FIRST_FOCAL * max(frame_shape), self.centre_px or middle)
+        return Camera(matrix, np.array([number or 0.0 for number in self.distortion]))
+
+    def seen_by(self, frame_shape: tuple[int, int]) -> Camera:
+        """Return the camera by whose lens frames are warped: without distortion as long as its focal length is unknown."""
+        camera = self.camera(frame_shape)
+        if self.known is None and self.focal_px is None:
+            return Camera(camera.matrix)
+        return camera
+
+    def turning_camera(self, frame_shape: tuple[int, int]) -> Camera | None:
+        """Return the camera that locators may use: one that only turns, of a focal length that is given or was found."""
+        if self.known is None and self.focal_px is None:
+            if self.kind != "auto":
+                return None
+            middle = (frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2
+            return Camera(camera_matrix(_FAR_FOCAL * max(frame_shape), middle))
+        return self.camera(frame_shape) if self.kind in ("rotation", "auto") else None
+
+    def knowing(self, camera: Camera | None) -> MotionModel:
+        """Return the model after a level that has found the camera, or None.
+
+        Frames are then seen through its lens, if it has one: "auto" keeps to that, and goes on to find it.
+        """
+        if camera is None:
+            return self
+        if self.kind == "auto" and camera.distorts:
+            return replace(self, kind="rotation", distortion=self.distortion if self.finds_lens else _LENS, known=camera)
+        return replace(self, known=camera)
+
+
+HOMOGRAPHIES = MotionModel()
+
+
+def tolerances_px(motions: Sequence[Located]) -> tuple[float, ...]:
+    """Return the residuals within which patches agree, coarse to fine, as far as their noise lets them agree."""
+    information = [each.patches.information for each in motions if each.patches is not None]
+    stds_px = [np.sqrt(np.trace(_covariances(each[each[:, 0, 0] > 0]), axis1=1, axis2=2) / 2) for each in information]
+    least_px = _LEAST_TOLERANCE * float(np.median(np.concatenate(stds_px))) if stds_px else 0.0
+    return tuple(each for each in _TOLERANCES_PX if each in _TOLERANCES_PX[:1] or each >= least_px)
+
+
+def agreeing(motions: Sequence[Located], residuals: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> list[Located]:
+    """Return the motions of pairs by the patches that agree with a motion of the camera.
+
+    `residuals` (E, P, 2) are what that leaves of where patches lie, in px of frames of (height, width).
+    """
+    weights = _weights(residuals, tolerance_px)
+    return [_by_patches(*each, tolerance_px, shape) for each in zip(motions, weights, strict=True)]
+
+
+def agreed_share(motions: Sequence[Located], residuals: FloatArray, tolerance_px: float) -> float:
+    """Return the share of the patches that show something and agree with a motion, by the weights that they have then."""
+    weights = _weights(residuals, tolerance_px)
+    patches = [each.patches for each in motions]
+    shown = [each[seen.information[:, 0, 0] > 0] for each, seen in zip(weights, patches, strict=True) if seen is not None]
+    return float(np.concatenate(shown).mean()) if shown else 0.0
+
+
+def _weights(residuals: FloatArray, tolerance_px: float) -> FloatArray:
+    """Return the weights of Geman and McClure: (E, P)."""
+    return np.asarray(1 / (1 + (residuals**2).sum(axis=-1) / (2 * tolerance_px**2)) ** 2)
+
+
+def contradicting(motions: Sequence[Located], residuals: FloatArray) -> float:
+    """Return the share of the patches that lie elsewhere than a motion lets expect; 0 if too few show anything to tell."""
+    shown = [(motion.patches, left) for motion, left in zip(motions, residuals, strict=True) if motion.patches is not None]
+    found = [_far(*each) for each in shown]
+    if np.median([len(each) for each in found] or [0]) < _TELLING:
+        return 0.0
+    return float(np.concatenate(found).mean())
+
+
+def _far(patches: Patches, residuals: FloatArray) -> BoolArray:
+    """Return which of the patches that show something are far from where they are expected."""
+    seen = patches.information[:, 0, 0] > 0
+    variances = np.trace(_covariances(patches.information[seen]), axis1=1, axis2=2)
+    return np.asarray((residuals[seen] ** 2).sum(axis=-1) > _FAR**2 * variances + _FAR_PX**2)
+
+
+def _covariances(information: FloatArray) -> FloatArray:
+    """Return the inverses of (N, 2, 2) information; what nothing is known of varies by much, but not without end."""
+    traces = np.trace(information, axis1=1, axis2=2)
+    return np.linalg.inv(information + np.maximum(_DAMPING * traces, _TINY)[:, None, None] * np.eye(2))
+
+
+def layers(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: FloatArray, n_nodes: int) -> FloatArray:
+    """Return the mean squares of the residuals of the patches of each node, in variances: (n_nodes, P); 0 if not known.
+
+    `pairs` (E, 2) are the moving and the fixed node of each pair; patches are those of the moving one.
+    """
+    squares, numbers = np.zeros((2, n_nodes, residuals.shape[1]))
+    for (moving, _), motion, left in zip(pairs, motions, residuals, strict=True):
+        if motion.patches is not None:
+            seen = motion.patches.information[:, 0, 0] > 0
+            limited = _covariances(motion.patches.information[seen]) + _ALIKE_PX**2 * np.eye(2)
+            squares[moving, seen] += (
+                np.einsum("pi,pi->p", left[seen], np.linalg.solve(limited, left[seen, :, None])[..., 0]) / 2
+            )
+            numbers[moving, seen] += 1
+    return np.asarray(squares / np.maximum(numbers, 1))
+
+
+def travelled(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: FloatArray, layers: FloatArray) -> float:
+    """Return how far what does not follow the camera moves beside the background from the first node to the last, px."""
+    steps = []
+    for (moving, fixed), motion, left in zip(pairs, motions, residuals, strict=True):
+        apart = layers[moving] > APART
+        if motion.patches is not None and (apart := apart & (motion.patches.information[:, 0, 0] > 0)).sum() >= _FEWEST:
+            noise = np.trace(_covariances(motion.patches.information[apart]), axis1=1, axis2=2)
+            sizes = np.sqrt(np.maximum((left[apart] ** 2).sum(axis=-1) - noise, 0))
+            steps.append(float(np.median(sizes)) / abs(moving - fixed))
+    return float(np.median(steps)) * (len(layers) - 1) if steps else 0.0
+
+
+def _by_patches(motion: Located, weights: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> Located:
+    """Return the homography that patches with these weights, (P,), show, with its information."""
+    patches = motion.patches
+    if patches is None or motion.information is None:
+        return motion
+    middles = patch_centres(shape)
+    there = motion.homography @ np.concatenate([middles, np.ones((len(middles), 1))], axis=1).T
+    moves = generators(shape)
+    by_points = slopes(there, moves @ there).reshape(len(middles), 2, 8)
+    shown = patches.information[:, 0, 0] > 0
+    limited = _covariances(patches.information) + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
+    information = np.where(shown[:, None, None], weights[:, None, None] * np.linalg.inv(limited), 0)
+    if (weights * shown).sum() < _FEWEST:
+        return replace(motion, information=motion.information * _UNCERTAIN, patches=Patches(patches.shifts, information))
+    normal = np.einsum("pki,pkl,plj->ij", by_points, information, by_points)
+    right = np.einsum("pki,pkl,pl->i", by_points, information, patches.shifts)
+    normal += _DAMPING * np.trace(normal) * np.eye(8)
+    step = np.linalg.solve(normal, right)
+    homography = motion.homography + np.einsum("i,ijk->jk", step, moves) @ motion.homography
+    homography /= homography[2, 2]
+    changed = moves @ homography
+    by_step = parameters(np.eye(3) + changed - homography * changed[:, 2:, 2:])
+    to_step = np.linalg.inv(by_step.T)
+    shifts = transform_points(motion.homography, middles) + patches.shifts - transform_points(homography, middles)
+    kept = Patches(np.where(shown[:, None], shifts, 0), information)
+    return replace(motion, homography=homography, information=to_step.T @ normal @ to_step, patches=kept)
