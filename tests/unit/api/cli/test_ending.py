@@ -5,13 +5,14 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 import typer
 
 from photonpano import PluginError
-from photonpano.api.cli.errors import reported
+from photonpano.api.cli.errors import Signalled, end_on_signals, reported
 
 PROGRAM = """\
 import os, signal, time
@@ -49,6 +50,23 @@ def test_signal_ends_command_and_leaves_no_file(tmp_path: Path, sent: signal.Sig
     assert (process.returncode, out) == (128 + sent, "")
     assert err == "\ninterrupted; no file is left half-written under its final name\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_signal_in_a_callback_of_llvm_is_raised_after_it() -> None:
+    """LLVM, which loads compiled code, calls Python, and what is raised there is lost."""
+    before = {each: signal.signal(each, signal.SIG_DFL) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    module = {"__name__": "llvmlite.binding.executionengine", "raise_signal": signal.raise_signal}
+    try:
+        end_on_signals()
+        eval("raise_signal(2)", module)
+        with pytest.raises(Signalled) as raised:
+            time.sleep(10)
+        assert raised.value.args == (signal.SIGINT,)
+        with pytest.raises(Signalled):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def test_full_standard_output_is_one_sentence(folder: Path, program: list[str]) -> None:
