@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from photonpano.errors import InputError
 from photonpano.merging.panorama import RenderedPanorama
@@ -148,6 +148,7 @@ def read_record(run_folder: Path) -> RunRecord:
     try:
         record: RunRecord = json.loads(file.read_text(encoding="utf-8"))
         record["spec"]  # what everything else can be made from
+        findings_of(record)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
             f"{file}: cannot be read as the record of a run ({error}); give the folder of a finished run"
@@ -226,8 +227,12 @@ def decision_records(decisions: Sequence[Decision]) -> list[DecisionRecord]:
 
 
 def findings_of(record: RunRecord) -> Findings:
-    """Return the findings that a record describes."""
-    return _FINDINGS.validate_python(record.get("findings", {}))
+    """Return the findings that a record describes; `ValueError` if they are wrong. Older records have none."""
+    try:
+        return _FINDINGS.validate_python(record.get("findings", {}))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{'.'.join(['findings', *map(str, first['loc'])])}: {first['msg']}") from error
 
 
 def panorama_record(plan: Plan, panorama: RenderedPanorama, rendered: Sequence[Decision]) -> PanoramaRecord:

@@ -51,6 +51,16 @@ def test_check_run_judges_as_the_run_did_and_writes_nothing(finished: Path, smal
     assert {file: (file.stat().st_mtime_ns, file.stat().st_size) for file in finished.parent.rglob("*")} == before
 
 
+def test_findings_that_no_run_writes_are_named_and_older_runs_have_none(finished: Path) -> None:
+    change(finished, lambda record: record["findings"].update(standing_share="most"))
+    assert error_of(finished) == (
+        f"{finished / 'run.json'}: cannot be read as the record of a run (findings.standing_share: Input should be a valid "
+        "number, unable to parse string as a number); give the folder of a finished run"
+    )
+    change(finished, lambda record: record.pop("findings"))
+    assert check_run(finished).verdict.status == "trusted"
+
+
 def test_check_run_doubts_other_photons_of_the_same_size(finished: Path) -> None:
     cube = finished.parent / "cube.npy"
     np.save(cube, np.load(cube)[:, ::-1])
