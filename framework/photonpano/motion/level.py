@@ -16,9 +16,6 @@ from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import Camera, corners, inverse, rescaled, scaled_ahead, transform_points
 from photonpano.values import BoolArray, Decision, DecisionValue, FloatArray, FrameSpan, Group, Located, VirtualExposure
 
-# Names of decisions in a record.
-CUT, DARK_FRAMES, DARK_JUMP, REPEATED = "cut", "dark_frames", "jump_in_the_dark", "repeated_frames"
-SHOTS, UNCUT_JUMP = "shots", "uncut_jump"
 # Frames of the shortest part of a group that is kept beside a cut.
 _SHORTEST_PART = 4
 _SAMPLED = 8  # instants of a group at which its motion is looked at
