@@ -55,10 +55,10 @@ _CHANGING, _FEWEST_SEEN, _TOGETHER, _STEADY, _MOST_CHANGING = 3.0, 8, 5, 0.6, 0.
 _SMOOTH = 5  # sums over which deviations are averaged where the background was never seen
 _LEAST_HIDDEN = 0.25  # share of the sums that are taken for the background there
 _SIZES = 1.6  # largest ratio of the size of a mover that is shown several times to the usual one, and its inverse
-_BORDER = 2.0  # largest square of the length of its cut by the border of a frame, in areas
+_CUT_BY_BORDER = 2.0  # largest square of the length of its cut by the border of a frame, in areas
 _APART = np.ones((13, 13), np.uint8)  # half cells around a mover that is shown several times, without others
 _BESIDE = np.ones((5, 5), np.uint8)  # half cells that a cell covers, and those beside it
-_BORDERS = np.ones((7, 7), np.uint8)  # that, and the half cells at the borders of frames, which others may not see
+_BESIDE_BORDERS = np.ones((7, 7), np.uint8)  # that, and the half cells at the borders of frames, which others may not see
 _MOVED, _LONGEST = 0.03, 8  # share of a mover that leaves its place while it is shown, and most instants, to either side
 
 
@@ -384,7 +384,7 @@ class _Scene:
         # A frame shows what both instants next to it show, so that no frame would be left of a single instant.
         reach = int(np.clip(_MOVED * (_LONGEST - 1) / max(stays[0] - stays[1], 1e-6), 1, _LONGEST))
         for each in range(max(instant - reach, 0), min(instant + reach + 1, len(hidden))):
-            image &= cv2.erode(self.painted(each, np.ones_like(cells)), _BORDERS).astype(np.uint8)
+            image &= cv2.erode(self.painted(each, np.ones_like(cells)), _BESIDE_BORDERS).astype(np.uint8)
         return reach, image
 
 
@@ -433,7 +433,7 @@ def _whole_movers(hidden: BoolArray) -> list[tuple[int, BoolArray]]:
         number, labels = cv2.connectedComponents(cells)
         for patch in (labels == label for label in range(1, number)):
             border = max(int(each.sum()) for each in (patch[0], patch[-1], patch[:, 0], patch[:, -1]))
-            if border**2 <= _BORDER * patch.sum():
+            if border**2 <= _CUT_BY_BORDER * patch.sum():
                 found.append((instant, patch))
     sizes = np.array([patch.sum() for _, patch in found], int)
     usual = np.median(sizes.repeat(sizes)) if found else 0  # of most of what is hidden
