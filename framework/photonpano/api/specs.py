@@ -14,7 +14,6 @@ from photonpano.api.command import CHANGES, SPEC, command
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, PhotonpanoError
 from photonpano.files.folders import atomic_path, require_new
-from photonpano.motion.pairs import pairs_of
 from photonpano.pipeline.components import foreseen_groups, open_source, scale_of
 from photonpano.plugins.contributions import KINDS
 from photonpano.plugins.description import flow
@@ -101,6 +100,8 @@ def _require_levels(plan: Plan) -> None:
 
 def _levels(plan: Plan, source: Source) -> Iterator[str]:
     """Yield a comment for each level; of an open number of levels, for all of them together."""
+    from photonpano.motion.pairs import pairs_of  # imports OpenCV, which `check` does without
+
     if plan.until_converged:
         yield f"up to {len(plan.levels)} levels, until the motion has converged"
     for number, groups in enumerate(foreseen_groups(plan, source), start=1):
