@@ -10,12 +10,13 @@ STEP := @printf '\n== %s\n'
 # The tests start Python hundreds of times: each must find its modules compiled, whatever the environment says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help install test demo dist docs paper bench clean
+.PHONY: help install test check demo dist docs paper bench clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make demo     simulate a small capture, make its panorama, and score it'
-	@echo 'make test     run all checks and tests'
+	@echo 'make test     run all checks, and the tests except those of documentation and benchmarks'
+	@echo 'make check    run all checks and all tests, as continuous integration does'
 	@echo 'make dist     build and check the wheel and the source distribution, in dist'
 	@echo 'make docs     build the documentation as a site'
 	@echo 'make paper    make the figures of the paper, which takes long'
@@ -33,6 +34,9 @@ $(RUNS) $(COMPLETE): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.$(EXTRAS)'
 	@touch $(RUNS) $@
 
+check: TESTS := -m '' tests tests/benchmarks/checks
+check: test
+
 test: $(COMPLETE)
 	$(STEP) 'ruff check'
 	@$(BIN)/ruff check .
@@ -41,8 +45,9 @@ test: $(COMPLETE)
 	$(STEP) 'import-linter'
 	@$(BIN)/lint-imports --no-logo
 	$(STEP) 'mypy, and pytest as soon as the loops over pixels are compiled'
-	@$(BIN)/mypy & types=$$!; $(BIN)/photonpano warm-up && $(BIN)/pytest -n auto --dist worksteal --durations 40; status=$$?; \
-	wait $$types || { echo 'error: mypy found what it printed before the results of pytest'; status=1; }; exit $$status
+	@$(BIN)/mypy & types=$$!; $(BIN)/photonpano warm-up && $(BIN)/pytest -n auto --dist worksteal --durations 40 $(TESTS); status=$$?; \
+	wait $$types || { echo 'error: mypy found what it printed before the results of pytest'; status=1; }; \
+	$(if $(TESTS),,printf '\nmake check runs the code of the documentation, the examples and the checks of the benchmarks, too\n';) exit $$status
 
 demo: $(RUNS)
 	$(STEP) 'simulating a capture, making its panorama, and scoring it (a minute or two)'

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import settings
+from scipy.spatial.transform import Rotation
 
-from photonpano import FrameSpan, Group, VirtualExposure
+from photonpano import FrameSpan, Group, StageContext, StreamInfo, Trajectory, VirtualExposure
 from photonpano.execution.threads import one_thread_inside
-from photonpano.geometry import translation
+from photonpano.geometry import from_parameters, normalised, translation
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.run import RunResult
 from photonpano.plugins import registry
@@ -26,6 +27,9 @@ from photonpano.testing import KnownMotion, MemorySource
 from photonpano_simulator import scenes
 
 sys.path.append(str(Path(__file__).parent / "benchmarks" / "baselines"))  # a plugin that is not installed
+
+FRAME_SHAPE = (254, 496)
+FOCAL_PX = 1500.0
 
 settings.register_profile("suite", max_examples=50, deadline=None)  # the machine may be busy
 settings.load_profile("suite")
@@ -214,6 +218,45 @@ def clouds() -> Callable[..., np.ndarray]:
     return clouds
 
 
+@pytest.fixture(scope="session")
+def fit() -> Callable[..., Trajectory]:
+    """Fit by name: `fit("lie", instants, homographies, information=None, **config)`."""
+    import photonpano_baselines
+
+    catalog = photonpano_baselines.catalog()
+    context = StageContext(StreamInfo(1000, *FRAME_SHAPE, None), response=None)
+
+    def fit(name: str, instants: Any, homographies: np.ndarray, information: np.ndarray | None = None, **config: float) -> Any:
+        contribution = catalog.find("interpolator", name).contribution
+        interpolator = contribution.build(contribution.config(**config), context)
+        return interpolator.fit(np.asarray(instants, dtype=float), homographies, information)
+
+    return fit
+
+
+@pytest.fixture(scope="session")
+def turning() -> Callable[[np.ndarray], np.ndarray]:
+    """Return the homographies of a phone camera rotated by (T, 3) rotation vectors, in radians."""
+    height, width = FRAME_SHAPE
+    lens = np.array([[FOCAL_PX, 0, (width - 1) / 2], [0, FOCAL_PX, (height - 1) / 2], [0, 0, 1]])
+
+    def turning(vectors: np.ndarray) -> np.ndarray:
+        return normalised(lens @ Rotation.from_rotvec(vectors).as_matrix() @ np.linalg.inv(lens))
+
+    return turning
+
+
+@pytest.fixture(scope="session")
+def motions() -> Callable[[int, int], np.ndarray]:
+    """Return (N, 3, 3) random homographies, of more than rotating cameras: `motions(n, seed)`."""
+
+    def motions(n: int, seed: int) -> np.ndarray:
+        sizes = np.array([1e-2, 1e-2, 1e-2, 1e-2, 30, 30, 1e-5, 1e-5])
+        return from_parameters(np.random.default_rng(seed).normal(size=(n, 8)) * sizes)
+
+    return motions
+
+
 @pytest.fixture
 def write_video(tmp_path: Path) -> Callable[..., Path]:
     """Write grey levels unchanged as the luma of a video."""
@@ -295,8 +338,8 @@ def plugins_found_once() -> Iterator[None]:
 def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write an empty report in runs of this process: drawing it takes longer than a small run."""
     monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
-    monkeypatch.setattr("photonpano.pipeline.pose_run.render_pose_report", lambda *_: "<html></html>")
-    monkeypatch.setattr("photonpano.pipeline.run_steps.render_failure", lambda *_: "<html></html>")
+    monkeypatch.setattr("photonpano.pipeline.run.render_pose_report", lambda *_: "<html></html>")
+    monkeypatch.setattr("photonpano.pipeline.run.render_failure", lambda *_: "<html></html>")
 
 
 def pytest_collection_finish() -> None:

@@ -13,8 +13,6 @@ from .api.judging import compare as compare
 from .api.judging import evaluate as evaluate
 from .api.looks import CaptureInfo as CaptureInfo
 from .api.looks import Preview as Preview
-from .api.looks import explain as explain
-from .api.looks import forecast as forecast
 from .api.looks import info as info
 from .api.looks import preview as preview
 from .api.rendering import RenderResult as RenderResult
@@ -31,6 +29,8 @@ from .api.run_folders import verify as verify
 from .api.simulated import demo as demo
 from .api.simulated import simulate as simulate
 from .api.simulated import warm_up as warm_up
+from .api.specs import explain as explain
+from .api.specs import forecast as forecast
 from .capture import Capture as Capture
 from .capture import capture_of as capture_of
 from .contracts.protocols import Arrived as Arrived

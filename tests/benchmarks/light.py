@@ -21,7 +21,7 @@ from harness import Compared, Study, chosen, command, packed, passing, record_of
 from photonpano import LocationError, parse_spec
 from photonpano.capture.writing import truth_path
 from photonpano.corrections import divided_by
-from photonpano.corrections.lighting import LIGHT_DECISION, find_light, in_light, in_light_of
+from photonpano.corrections.lighting import find_light, in_light, in_light_of
 from photonpano.evaluation.scores import covered, image_score, true_panorama, white_flux
 from photonpano.execution.context import Context
 from photonpano.motion.locate import LoopSetting
@@ -31,7 +31,7 @@ from photonpano.pipeline.components import build_levels, open_source
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.obstacles import timeline_of
 from photonpano.pipeline.passes import vignette_of
-from photonpano.values import Decision, FloatArray, Light
+from photonpano.values import FloatArray, Light
 
 Settings: TypeAlias = dict[str, Any]
 SMALL: Settings = {"frame_shape": [128, 192], "n_frames": 3000, "frame_rate_hz": 20_000.0}
@@ -204,9 +204,8 @@ def false_alarm(seed: int) -> tuple[str, bool, bool] | None:
             divided = divided_by(source, vignette) if vignette else source
             if find_light(divided, first.trajectory, context) is None:
                 return name, False, False
-            decisions: list[Decision] = []
-            estimate(plan, source, decisions, context)
-    return name, True, any(each.what == LIGHT_DECISION for each in decisions)
+            state = estimate(plan, source, [], context)
+    return name, True, state.light is not None
 
 
 def print_false_alarms(number: int) -> None:

@@ -32,7 +32,7 @@ from trust_scores import is_honest, reasons, status
 
 from photonpano import evaluate, load_panorama, open_source, parse_spec
 from photonpano.api.run_folders import opened_run
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of, with_background
 from photonpano.capture.writing import truth_path
 from photonpano.corrections import divided_by, estimate_vignette
 from photonpano.corrections.movers import showing
@@ -145,8 +145,8 @@ def ghosts(cube: Path, bare: Path, folder: Path) -> dict[str, float]:
     canvas, motion = found.canvas_of(panorama.flux.shape[:2]), FrameTrajectory(found.homographies)
     with opened_run(folder) as run, open_source(parse_spec(packed(bare, corrections=[]))) as other:
         alone = replace(capture_of(run.source), steps=capture_of(run.capture).steps, source=capture_of(other).source)
-        vignette = estimate_vignette(before(alone, None), motion)
-        shown, _ = showing(alone if vignette is None else divided_by(alone, vignette), motion, found.camera, "hide")
+        vignette = estimate_vignette(with_background(alone, None), motion)
+        shown, *_ = showing(alone if vignette is None else divided_by(alone, vignette), motion, found.camera, "hide")
         oracle, seen = rendered(shown, motion, canvas), rendered(run.source, motion, canvas).weight >= FEWEST_FRAMES
     around = truth.turn if truth.around else None
     alignment = evaluate(folder, truth_path(cube), oracle=False).trajectory.alignment

@@ -262,6 +262,7 @@ class Reader:
         importlib.invalidate_caches()
 
 
+@pytest.mark.documentation
 @pytest.mark.parametrize("page", PAGES, ids=ident)
 @pytest.mark.usefixtures("without_report")
 def test_code_and_commands_of_page_work(page, workplace, make_capture, monkeypatch):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, PluginError, run
+from photonpano import FrameSpan, Group, run
 from photonpano.plugins import hookspecs, registry
 from photonpano.plugins.registry import OBSERVATION_HOOKS, contributions_of, discover, observation_of
 from photonpano.specs import parse_spec
@@ -123,23 +123,6 @@ def test_merger_example_masks_invalid_pixels(memory_source: type) -> None:
     np.testing.assert_array_equal(exposure.weight, np.where(valid, 10, 0))
 
 
-def test_merger_example_at_half_scale_breaks_contract(tiny_spec: dict[str, Any], tmp_path: Path) -> None:
-    catalog = discover().including(example_of("photonpano_mergers"))
-    spec = tiny_spec | {"merge": {"use": "naive-sum"}, "levels": [{"scale": 0.5}]}
-    with pytest.raises(PluginError) as caught:
-        run(parse_spec(spec, output=tmp_path / "run", catalog=catalog))
-    assert str(caught.value) == (
-        "merger 'naive-sum' of example_of_photonpano_mergers unreleased broke its contract at level 1: "
-        "expected an exposure of scale 0.5, got 1"
-    )
-
-
-def test_resampler_example_gives_two_groups() -> None:
-    (contribution,) = contributions_of(example_of("photonpano_resamplers"))
-    groups = contribution.build(contribution.config(), None).groups(100, 1)
-    assert [str(group) for group in groups] == ["frames 0 to 49", "frames 50 to 99"]
-
-
 def kept(hook: str, kit: type[Conformance]) -> type[Conformance]:
     """Return the tests that the example of a hook keeps what components of its kind promise."""
     (contribution,) = contributions_of(example_of(hook))
@@ -150,9 +133,3 @@ TestHalves = kept("photonpano_resamplers", ResamplerConformance)
 TestJump = kept("photonpano_refiners", RefinerConformance)
 TestNearestPixel = kept("photonpano_renderers", RendererConformance)
 TestPgm = kept("photonpano_exporters", ExporterConformance)
-
-
-def test_locator_example_returns_not_located() -> None:
-    (contribution,) = contributions_of(example_of("photonpano_locators"))
-    locator = contribution.build(contribution.config(), None)
-    assert locator.register(locator.describe(None), locator.describe(None), None).reason == "this example looks at nothing"

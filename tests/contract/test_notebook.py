@@ -44,7 +44,7 @@ def executed(make_notebook: Any, tmp_path_factory: pytest.TempPathFactory) -> tu
 
 
 # ipykernel itself warns of its transport, and of event loops
-pytestmark = pytest.mark.filterwarnings("ignore")
+pytestmark = [pytest.mark.documentation, pytest.mark.filterwarnings("ignore")]
 
 
 def test_cells_show_what_is_saved(executed: tuple[Any, Any, Path]) -> None:

@@ -59,6 +59,7 @@ def test_specs_are_valid_and_linked(spec):
         assert f"{spec.name})" in page.read_text(encoding="utf-8")
 
 
+@pytest.mark.documentation
 def test_quick_figures_show_what_the_paper_says(make_paper, tmp_path, without_report):
     """Levels refine the motion, and a constant number of groups does not; the page is filled with the numbers of the run."""
     study = make_paper.Study(tmp_path, quick=True)

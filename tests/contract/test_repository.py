@@ -128,7 +128,7 @@ def test_continuous_integration_can_be_started() -> None:
     script = ROOT / ".ci" / "run"
     assert script.stat().st_mode & 0o111
     subprocess.run(["bash", "-n", script], check=True)
-    assert "make test" in script.read_text(encoding="utf-8")
+    assert "make check" in script.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)

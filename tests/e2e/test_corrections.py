@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import photonpano
-from photonpano import FrameSpan, SpecError, evaluate, run
+from photonpano import FrameSpan, evaluate, run
 from photonpano.api.cli.app import app
 from photonpano.capture.writing import truth_path, write_packed
 from photonpano.evaluation import Evaluation
 from photonpano.execution.context import Context
 from photonpano.merging.panorama import plan_canvas, render
 from photonpano.pipeline.components import build_source
-from photonpano.pipeline.forecast import forecast
 from photonpano.specs import parse_spec
 from photonpano.testing import KnownMotion
 
@@ -165,12 +163,6 @@ def test_unsuitable_correction_is_reported_at_its_place(small_capture: Path, tmp
     )
 
 
-def test_forecast_includes_corrections(raw: Path, dark_file: Path) -> None:
-    plan = parse_spec(spec_of(raw, *GEOMETRY, {"dark-counts": {"dark": str(dark_file)}}) | {"levels": 1})
-    with build_source(plan) as source:
-        assert forecast(plan, source).canvas[0] < 200
-
-
 def test_run_masks_hot_pixels_by_itself(simulated: Callable[..., Path], tmp_path: Path) -> None:
     """With them in it, the run locks onto the pixels, which do not move: 13 px off when this was written."""
     street = {"kind": "street", "width": 1024, "height": 682}  # its first houses: others have parts that a pan does not change
@@ -183,51 +175,3 @@ def test_run_masks_hot_pixels_by_itself(simulated: Callable[..., Path], tmp_path
     assert record["spec"]["corrections"] == "auto"
     masked = next(each for each in record["decisions"] if each["what"] == "still_pixels")
     assert masked["value"] == pytest.approx(0.1 * SHAPE[0] * SHAPE[1], rel=0.15)
-
-
-def test_run_divides_by_vignette(simulated: Callable[..., Path], tmp_path: Path) -> None:
-    """Left in, it makes the error larger."""
-    errors = {}
-    for name, settings in {"clean": {}, "divided": {"lens": {"vignette": 0.8}}}.items():
-        capture = simulated(n_frames=400, **settings)
-        spec = spec_of(capture) | {"levels": 3}
-        if name == "divided":
-            errors["as read"] = mean_error_px(spec, capture, tmp_path / "as-read")
-        errors[name] = mean_error_px(spec | {"corrections": "auto"}, capture, tmp_path / name)
-    assert errors["divided"] < 1.5 * errors["clean"] + 0.02
-    assert errors["as read"] > 1.05 * errors["divided"]
-    again = photonpano.render(tmp_path / "divided" / "run", tmp_path / "again")
-    whole = json.loads((tmp_path / "divided" / "run" / "run.json").read_text())
-    assert "vignette.npz" in whole["files"]
-    assert again.record["files"] == {name: each for name, each in whole["files"].items() if name != "report.html"}
-
-
-def test_run_divides_by_flat_field(simulated: Callable[..., Path], tmp_path: Path) -> None:
-    """Rendered again, it divides by the same."""
-    spec = spec_of(simulated(n_frames=300, lens={"vignette": 0.6}), "flat-field") | {"levels": 1}
-    whole = run(parse_spec(spec, output=tmp_path / "run")).record
-    decision = next(each for each in whole["decisions"] if each["what"] == "flat_field")
-    with np.load(tmp_path / "run" / "vignette.npz") as arrays:
-        assert decision["value"] == pytest.approx(float(arrays["gain"].std()), abs=1e-3)
-        middle, corner = np.s_[48:80, 64:96], np.s_[:8, :8]
-        assert arrays["gain"][corner].mean() < 0.75 * arrays["gain"][middle].mean()
-        assert arrays["std"].max() < 0.3
-    again = photonpano.render(tmp_path / "run", tmp_path / "again")
-    assert again.record["files"] == {name: each for name, each in whole["files"].items() if name != "report.html"}
-
-
-@pytest.mark.parametrize(
-    ("section", "message"),
-    [
-        (
-            {"merge": {"use": "splat"}},
-            "flat-field divides sums of frames, and 'splat' merges single frames; choose another merger",
-        ),
-        ({"pose": "stratified-pose"}, "flat-field does not apply with `pose`: it is measured along a panorama; remove it"),
-    ],
-    ids=["splat", "pose"],
-)
-def test_flat_field_is_refused_where_nothing_is_divided_by_it(section: dict[str, Any], message: str) -> None:
-    with pytest.raises(SpecError) as caught:
-        parse_spec({"version": 1, "source": {"use": "simulator"}, "corrections": ["flat-field"]} | section)
-    assert f"corrections.0: {message}" in str(caught.value)

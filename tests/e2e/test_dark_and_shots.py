@@ -13,11 +13,9 @@ import pytest
 from photonpano import LocationError, open_source
 from photonpano import run as run_plan
 from photonpano.execution.context import Context, Quiet
-from photonpano.pipeline.obstacles import timeline_of
-from photonpano.pipeline.shots import run_others
+from photonpano.pipeline.obstacles import run_others, timeline_of
 from photonpano.specs import parse_spec
 from photonpano.specs.plan import Plan
-from photonpano.text import listed
 from photonpano.values import FrameSpan
 
 pytestmark = pytest.mark.usefixtures("without_report")
@@ -50,17 +48,6 @@ def dark_spans(capture: Path) -> tuple[FrameSpan, ...]:
 
 def test_frames_without_light_are_found_to_the_frame(shutter_closes: Path) -> None:
     assert dark_spans(shutter_closes) == FIRST
-
-
-def test_dim_scene_flicker_and_short_darkness_are_no_closed_shutter(small_capture: Path, tmp_path: Path) -> None:
-    frames, rng = np.unpackbits(np.load(small_capture), axis=-1), np.random.default_rng(0)
-    dim, flickering, short = frames.copy(), frames.copy(), frames.copy()
-    dim[100:200] &= rng.random((100, 128, 160)) < 0.15
-    short[100:120] = 0
-    flickering[np.arange(300) // 16 % 2 == 0] = 0
-    for name, each in (("dim", dim), ("short", short), ("flickering", flickering)):
-        np.save(tmp_path / f"{name}.npy", np.packbits(each, axis=-1))
-        assert dark_spans(tmp_path / f"{name}.npy") == (), name
 
 
 def test_dark_frames_are_not_located_and_cost_the_others_nothing(
@@ -154,28 +141,12 @@ def test_shots_that_nothing_ties_together_are_run_apart(
     assert (folder / "notes.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("how", ["upside down", "largest"])
-def test_what_no_camera_passes_is_two_shots(two_shots: Path, small_capture: Path, tmp_path: Path, how: str) -> None:
-    """The image is upside down from one frame to the next; or the largest part of what is not tied was asked for."""
-    spec, frames = spec_of(two_shots), np.unpackbits(np.load(small_capture), axis=-1)
-    if how == "upside down":
-        frames[160:] = frames[160:, ::-1, ::-1]
-        np.save(tmp_path / "turned.npy", np.packbits(frames, axis=-1))
-        spec = spec_of(tmp_path / "turned.npy") | {"motion": {"model": "homography"}}
-    else:
-        spec["graph"] = {"disconnected": "largest"}
-    result = run_plan(parse_spec(spec, output=tmp_path / "run"))
-    shots = [each["value"] for each in result.record["decisions"] if each["what"] == "shots"]
-    assert len(shots) == len(result.others) == 1
-    assert how == "largest" or "frames 0 to 159 and frames 160 to" in shots[0]
-
-
 def test_other_shots_are_numbered_by_their_length_and_those_that_fail_are_left_out(
     tiny_spec: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spans = [FrameSpan(0, 10), FrameSpan(10, 40), FrameSpan(40, 60), FrameSpan(60, 100)]
     record: Any = {
-        "decisions": [{"what": "shots", "value": listed(map(str, spans))}],
+        "findings": {"shots": [{"start": each.start, "stop": each.stop} for each in spans]},
         "source": {"frame_rate_hz": 100.0},
     }
 
@@ -200,14 +171,3 @@ def test_other_shots_are_numbered_by_their_length_and_those_that_fail_are_left_o
     assert offsets_s == [(7.6, 7.6), (7.5, 7.5)]
     name = tmp_path / "run.panorama-3"
     assert caplog.messages == [f"no panorama of frames 40 to 59, another shot, was written into {name}: too dark"]
-
-
-def test_constant_velocity_is_tried_where_exposures_are_not_located(simulated: Callable[..., Path], tmp_path: Path) -> None:
-    spec = spec_of(simulated(flux=0.001)) | {
-        "resample": {"use": "midpoint", "with": {"group_size": 50}},
-        "motion": {},
-        "levels": 1,
-    }
-    record = run_plan(parse_spec(spec, output=tmp_path / "run")).record
-    start = next(each for each in record["decisions"] if each["what"] == "start")
-    assert start["reason"].endswith("; without it, pairs of exposures could not be located")

@@ -88,16 +88,3 @@ def test_run_with_failing_locator_matches_its_fallback(
     ]
     recorded = parse_spec(json.loads(json.dumps(rescued.record["spec"])), catalog=catalog)
     assert [each.contribution.name for each in recorded.levels[0].fallbacks] == ["opencv-sift"]
-
-
-def test_chain_of_backends_equals_locator_with_fallbacks(
-    run: Callable, rescued: Any, small_spec: dict[str, Any], catalog: Catalog
-) -> None:
-    """On one thread, and on three."""
-    chain = {"use": "chain-of-backends", "with": {"backends": [FORGETS, "opencv-sift"]}}
-    with_chain = run(small_spec | {"locate": chain}, catalog, threads=1)
-    np.testing.assert_array_equal(with_chain.homographies, rescued.homographies)
-    (level,), (expected,) = with_chain.record["levels"], rescued.record["levels"]
-    assert (level["located_by"], level["rescued"]) == (expected["located_by"], expected["rescued"])
-    specs = [{key: value for key, value in each.record["spec"].items() if key != "run"} for each in (with_chain, rescued)]
-    assert specs[0] == specs[1]

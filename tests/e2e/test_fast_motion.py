@@ -35,12 +35,6 @@ def error_px(simulated: Callable[..., Path], outcome_of: Callable) -> Callable[.
     return error_px
 
 
-def test_first_level_is_right_where_distant_pairs_hardly_overlap(error_px: Callable) -> None:
-    """Groups move by 18 px, so that those four groups apart share a quarter of the frame."""
-    path = {"kind": "pan", "length_px": 360}
-    assert error_px(12, path=path, n_frames=240, flux=0.5) < 4
-
-
 @pytest.mark.parametrize("defect", [False, True])
 def test_first_level_does_not_lock_onto_the_next_panel(error_px: Callable, tmp_path: Path, defect: bool) -> None:
     """Groups move by 25 px, which panels of 32 px fit 7 px the other way, too."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -10,10 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from photonpano import evaluate, open_source, run
-from photonpano.api.cli.app import app
 from photonpano.evaluation import Evaluation
 from photonpano.specs import parse_spec
 
@@ -86,14 +83,3 @@ def test_noisy_compressed_video_is_nearly_as_accurate_as_clean_one(scored: Calla
 def test_alternative_stages_accept_grey_frames(scored: Callable, sections: dict[str, Any]) -> None:
     """Measured: 0.08 px for keypoints, and less for the others."""
     assert scored(**sections)[0].trajectory.mean_px < 0.15
-
-
-def test_explain_describes_capture_of_grey_frames(tmp_path: Path) -> None:
-    small = camera()
-    small["with"] = small["with"] | {"n_frames": 40, "frame_shape": [64, 80], "path": {"kind": "pan", "length_px": 100}}
-    spec = {"version": 1, "source": small, "resample": {"with": {"group_size": 4}}, "levels": 1}
-    (tmp_path / "scan.yaml").write_text(json.dumps(spec))
-    done = CliRunner().invoke(app, ["explain", str(tmp_path / "scan.yaml"), "--forecast"])
-    assert done.exit_code == 0, done.output
-    assert "on 40 8-bit frames of 64x80 at 500 Hz" in done.output
-    assert "forecast from a trial" in done.output

@@ -27,18 +27,13 @@ ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 FOLDERS = ROOT / "framework", ROOT / "plugins"
 EXAMPLE = ROOT / "examples" / "third_party_plugin"
-# Commands of one process, each with its exit code after what it prints.
-COMMANDS = """
+PROGRAM = """
 import sys
 import photonpano_example
 from photonpano.api.cli import main
 print(photonpano_example.__file__)
-for arguments in {commands!r}:
-    sys.argv[1:] = arguments
-    try:
-        main()
-    except SystemExit as ended:
-        print("exit code", ended.code or 0, flush=True)
+sys.argv[1:] = {arguments!r}
+main()
 """
 
 
@@ -83,23 +78,17 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Environment:
     source = shutil.copytree(EXAMPLE, folder / "source", ignore=shutil.ignore_patterns("__pycache__"))
     # A folder that is only listed would be searched without its own .pth files, by which editable installs are found.
     made = environment_with(source, folder, "import site; site.addsitedir({!r})\n")
-    for name in ("tests", "scan.yaml"):  # and not the package, which has to come from the environment
-        path = EXAMPLE / name
-        (shutil.copytree if path.is_dir() else shutil.copy)(path, folder / name)
+    shutil.copy(EXAMPLE / "scan.yaml", folder)  # and not the package, which has to come from the environment
     return made
 
 
 @pytest.fixture(scope="module")
 def commands(environment: Environment, small_capture: Path) -> CompletedProcess[str]:
-    """List the plugins, check a spec with a misspelt name, and run the spec of the example."""
+    """Run the spec of the example."""
     changes = {"source.with.path": small_capture, "resample.with.group_size": 50, "levels": 2, "refine": "[]"}
     options = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
-    arguments = [
-        ["plugins", "list"],
-        ["check", "scan.yaml", "--set", "locate.use=profile-shfit"],
-        ["run", "scan.yaml", *options],
-    ]
-    return done(environment.python, "-c", COMMANDS.format(commands=arguments), folder=environment.folder)
+    program = PROGRAM.format(arguments=["run", "scan.yaml", *options])
+    return done(environment.python, "-c", program, folder=environment.folder)
 
 
 def test_only_the_package_is_installed_and_is_imported_from_there(
@@ -111,21 +100,7 @@ def test_only_the_package_is_installed_and_is_imported_from_there(
     assert Path(commands.stdout.splitlines()[0]).is_relative_to(environment.folder / "venv")
 
 
-def test_plugins_list_shows_distribution_and_version(commands: CompletedProcess[str]) -> None:
-    rows = [line.split()[:4] for line in commands.stdout.splitlines() if " photonpano-example " in line]
-    assert rows == [
-        ["merger", "short-exposure", "photonpano-example", "0.1.0"],
-        ["locator", "profile-shift", "photonpano-example", "0.1.0"],
-    ]
-
-
-def test_misspelt_name_suggests_component_of_plugin(commands: CompletedProcess[str]) -> None:
-    assert "exit code 2" in commands.stdout
-    assert "locate.use: there is no locator 'profile-shfit'; did you mean 'profile-shift'?" in commands.stderr
-
-
 def test_pipeline_runs_with_installed_plugin(environment: Environment, commands: CompletedProcess[str]) -> None:
-    assert "exit code 1" not in commands.stdout
     record = json.loads((environment.folder / "runs" / "example" / "run.json").read_text())
     first, second = (level["located"] for level in record["levels"])
     assert first == 6
@@ -135,13 +110,6 @@ def test_pipeline_runs_with_installed_plugin(environment: Environment, commands:
         {"stage": "merge", "use": "short-exposure", "plugin": "photonpano-example", "version": "0.1.0"},
         {"stage": "locate", "use": "profile-shift", "plugin": "photonpano-example", "version": "0.1.0"},
     ]
-
-
-def test_example_plugin_passes_its_own_tests(environment: Environment) -> None:
-    own = ["-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", "tests"]
-    printed = done(environment.python, *own, folder=environment.folder).stdout
-    assert " passed" in printed
-    assert "failed" not in printed
 
 
 def test_names_of_missing_plugin_are_errors_with_suggestions(small_capture: Path, tmp_path: Path) -> None:
@@ -197,27 +165,13 @@ def test_package_index_shows_description_whose_links_lead_to_files_of_the_versio
     assert [target for target in targets if not (ROOT / target).is_file()] == []
 
 
-def test_demo_runs_from_installed_wheel(built: Path, tmp_path: Path) -> None:
+def test_installed_wheel_offers_its_plugins(built: Path, tmp_path: Path) -> None:
+    """`.github/workflows/wheel.yml` runs the demo from it."""
     (wheel,) = built.glob("*.whl")
     installed = environment_with(wheel, tmp_path, "{}\n")  # the checkout is not there
-    for folder in FOLDERS:
-        for source in folder.rglob("*.py"):
-            copy_machine_code(source, installed.site / source.relative_to(folder))
     where = "import photonpano, photonpano_core as core; print(photonpano.__file__, core.__file__, photonpano.__version__)"
     *files, version = done(installed.python, "-c", where, folder=tmp_path).stdout.split()
     assert all(Path(file).is_relative_to(installed.site) for file in files)
     assert version == PROJECT["version"]
-    printed = done(installed.python.with_name("photonpano"), "demo", "made", "--small", folder=tmp_path).stdout
-    assert "verdict   trusted\n" in printed
-    assert "frames located             100.0 %\n" in printed
-    assert (tmp_path / "made" / "run" / "report.html").is_file()
-
-
-def copy_machine_code(source: Path, installed: Path) -> None:
-    """Give an installed module the machine code of the checkout, which takes a minute to compile: its source is the same."""
-    files = [*(source.parent / "__pycache__").glob(f"{source.stem}.*.nb[ci]")]
-    if files:
-        (installed.parent / "__pycache__").mkdir(exist_ok=True)
-        os.utime(installed, ns=(source.stat().st_atime_ns, source.stat().st_mtime_ns))
-    for file in files:
-        shutil.copy(file, installed.parent / "__pycache__")
+    listed = done(installed.python.with_name("photonpano"), "plugins", "list", folder=tmp_path).stdout
+    assert {"photon-mle", "simulator", "opencv-sift"} <= set(listed.split())

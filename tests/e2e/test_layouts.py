@@ -60,12 +60,6 @@ def test_run_reads_what_the_message_said_to_write(spec: Path, clouds: Callable[.
     assert len(set(panoramas.values())) == 1
 
 
-def test_run_warns_of_a_stated_order_that_the_frames_contradict(spec: Path, clouds: Callable[..., np.ndarray]) -> None:
-    np.save("cube.npy", np.packbits(clouds(), axis=2, bitorder="little"))
-    done = CliRunner().invoke(app, ["run", "scan.yaml", "--set", "source.with.bit_order=big"])
-    assert "the pixels of the frames seem to be in another order than they are read in: pixels correlate by " in done.output
-
-
 def test_sums_of_frames_run_and_packed_copies_of_bits_equal_their_source(spec: Path, clouds: Callable[..., np.ndarray]) -> None:
     frames = clouds()
     np.save("bits.npy", frames)

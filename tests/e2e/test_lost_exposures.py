@@ -13,7 +13,6 @@ import pytest
 from photonpano import LocationError, OutputError
 from photonpano import run as run_plan
 from photonpano.specs import parse_spec
-from photonpano.values import CaptureSummary
 
 pytestmark = pytest.mark.usefixtures("without_report")
 
@@ -59,19 +58,6 @@ def with_a_wall(small_capture: Path, tmp_path_factory: pytest.TempPathFactory) -
         return path
 
     return with_a_wall
-
-
-def test_single_lost_exposure_is_interpolated_with_warning(run: Callable, with_a_wall: Callable) -> None:
-    outcome = run(with_a_wall(100, 150), "resample.with.group_size=50")
-    (level,) = outcome.record["levels"]
-    assert (level["groups"], level["located"]) == (6, 5)
-    assert {tuple(failure["moving"]) for failure in level["failures"]} >= {(100, 150), (150, 200)}
-    assert all(failure["evidence"]["opencv-sift.keypoints_moving"] > 0 for failure in level["failures"])
-    assert outcome.record["warnings"][0] == (
-        "level 1: 1 of 6 exposures are not located (frames 100 to 149); the motion is interpolated across 1 of them"
-    )
-    # Between two located exposures the motion is known.
-    assert outcome.located[100:150].all()
 
 
 def test_failed_run_leaves_a_report_until_a_run_succeeds(with_a_wall: Callable, tmp_path: Path) -> None:
@@ -137,28 +123,6 @@ def test_failure_distinguishes_dark_from_blurred(run: Callable, simulated: Calla
     ]
 
 
-def test_groups_that_are_chosen_too_long_are_shortened(
-    run: Callable, simulated: Callable, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The places at which the speed was measured showed hardly any motion."""
-    path = {"kind": "random-spline", "length_px": 700, "seed": 3}
-    capture = simulated(n_frames=480, frame_shape=[64, 96], path=path)
-    resting = CaptureSummary(0.5, 0.01, "measured where the image rests")
-    monkeypatch.setattr("photonpano.pipeline.summary.summarise", lambda *_: resting)
-    outcome = run(capture)
-    (size,) = (each for each in outcome.record["decisions"] if each["what"] == "group_size")
-    assert size["value"] == 16
-    assert size["reason"].endswith("; since such groups could not be located, they are shortened to 16")
-    assert outcome.located.all()
-
-
-def test_motion_blurred_exposures_are_not_located_by_chance(run: Callable, simulated: Callable) -> None:
-    """Groups are blurred by 500 px on frames of 160 px, so two of them show similar stripes."""
-    fast = simulated(path={"kind": "random-spline", "length_px": 1500, "knots": 12, "seed": 1})
-    with pytest.raises(LocationError):
-        run(fast, "resample.with.group_size=100")
-
-
 @pytest.mark.parametrize("obstacle", ["render_failure", "atomic_path"])
 def test_failure_of_the_report_does_not_hide_that_of_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, obstacle: str
@@ -166,7 +130,7 @@ def test_failure_of_the_report_does_not_hide_that_of_the_run(
     def fail(*_: object) -> None:
         raise OutputError("the disk is full")
 
-    monkeypatch.setattr(f"photonpano.pipeline.run_steps.{obstacle}", fail)
+    monkeypatch.setattr(f"photonpano.pipeline.run.{obstacle}", fail)
     np.save(tmp_path / "cube.npy", np.random.default_rng(0).integers(0, 256, (80, 48, 8), dtype=np.uint8))
     with pytest.raises(LocationError) as caught:
         run_plan(

@@ -56,12 +56,6 @@ def _error_px(folder: Path, first: int = 0) -> float:
     return float(np.linalg.norm(transform_points(homographies, corners(SHAPE)) - expected, axis=-1).mean())
 
 
-def test_bar_without_a_mask_bends_the_motion_and_makes_the_run_doubtful(spec: dict[str, Any], tmp_path: Path) -> None:
-    result = run(parse_spec(spec | {"corrections": []}, output=tmp_path / "run"))
-    assert result.record["verdict"]["status"] == "doubtful"
-    assert _error_px(tmp_path / "run") > 0.2
-
-
 def test_masked_bar_leaves_motion_panorama_and_its_error_as_without_it(spec: dict[str, Any], tmp_path: Path) -> None:
     first = 100  # that is read; the frames of the mask are still those of the recording
     part = spec["source"]["with"] | {"frames": [first, N_FRAMES]}

@@ -1,4 +1,4 @@
-"""Runs of small captures of every kind of motion: 900 frames of 96x128 px of a texture, with known truth."""
+"""Runs of small captures of every kind of motion: 600 frames of 96x128 px of a texture, with known truth."""
 
 from __future__ import annotations
 
@@ -13,19 +13,14 @@ import pytest
 from photonpano import parse_spec
 from photonpano.evaluation import corner_errors, load_run_trajectory
 from photonpano.geometry import corner_displacements
-from photonpano.residuals.verdict import NARROW
 from photonpano.testing.captures import detected, seen_along, textured
 
-SHAPE, SCENE_SHAPE, N_FRAMES, FLUX = (96, 128), (400, 520), 900, 0.3
+SHAPE, SCENE_SHAPE, N_FRAMES, FLUX = (96, 128), (400, 520), 600, 0.3
 FEW_ROWS = (8, 512)
 MOST_PX = {
-    "shift-roll": 0.1,
     "roll-60": 0.1,
     "zoom": 0.2,
-    "breathing": 0.2,
-    "shear": 0.2,
     "keystone": 0.2,
-    "f600": 0.1,
     "tripod": 0.1,
 }
 """The mean error that a motion may have, by its name in `MOTIONS` of the benchmark."""
@@ -49,7 +44,7 @@ def test_motion_is_found_by_default(motion: str, tmp_path: Path, outcome_of: Cal
 def test_frames_of_few_rows_are_located(tmp_path: Path, outcome_of: Callable[..., Any]) -> None:
     """Pairs of which a single row overlaps say nothing of some directions."""
     true = np.tile(np.eye(3), (N_FRAMES, 1, 1))
-    true[:, 0, 2], true[:, 1, 2] = 20 + np.linspace(0, 300, N_FRAMES), 200 + 3 * np.sin(np.arange(N_FRAMES) / 90)
+    true[:, 0, 2], true[:, 1, 2] = 20 + np.linspace(0, 200, N_FRAMES), 200 + 3 * np.sin(np.arange(N_FRAMES) / 90)
     scene = textured((400, 900), FLUX, seed=1).astype(np.float32)
     mean_px, within_3 = run_along(true, scene, FEW_ROWS, tmp_path, outcome_of)
     assert mean_px < 0.3
@@ -85,17 +80,6 @@ def test_error_of_the_reference_frame_is_that_of_all(tmp_path: Path, outcome_of:
     errors_px = corner_displacements(np.linalg.inv(to_reference) @ found.homographies, np.eye(3), SHAPE).mean(axis=-1)
     assert errors_px.mean() > 0.2
     assert np.mean(errors_px <= 3 * found.std_px) >= WITHIN_3
-
-
-def test_what_a_freer_motion_explains_does_not_move_by_itself(tmp_path: Path, outcome_of: Callable[..., Any]) -> None:
-    """Shifts and rolls of a camera that zooms leave much that looks as if it moved by itself."""
-    true = motion_paths.path_of(motion_paths.MOTIONS["zoom"], SHAPE, N_FRAMES, SCENE_SHAPE, 5)
-    scene = textured(SCENE_SHAPE, FLUX, seed=5).astype(np.float32)
-    outcome = outcome_of(spec_of(true, scene, SHAPE, tmp_path, motion={"model": "euclidean"}))
-    verdict, decisions = outcome.record["verdict"], {each["what"] for each in outcome.record["decisions"]}
-    assert verdict["status"] == "doubtful"
-    assert NARROW in [each["what"] for each in verdict["reasons"]]
-    assert "movers" not in decisions
 
 
 def run_along(

@@ -13,7 +13,6 @@ from pathlib import Path
 from photonpano import batch
 from photonpano.capture.writing import truth_path
 
-SCRIPT = Path(__file__).parents[1] / "benchmarks" / "crashes.py"
 SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 40}}, "levels": 1, "refine": []}
 INTERRUPTED = """\
 import sys, time
@@ -90,11 +89,3 @@ def test_interrupted_batch_keeps_what_is_finished(tiny_capture: Path, tmp_path: 
     assert "[1/3] a: " in err
     assert statuses(tmp_path / "out") == ["done", "interrupted", "interrupted"]
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"a", "begun", "summary.csv", "summary.html"}
-
-
-def test_killed_runs_end_with_the_same_bytes() -> None:
-    """A few of the trials of tests/benchmarks/crashes.py: runs in processes that are killed (SIGKILL), and resumed."""
-    command = [sys.executable, str(SCRIPT), "resumes", "--number", "1", "--writing", "1", "--seed", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "1 of 1 runs ended with the same bytes and left nothing behind" in done.stdout

@@ -108,15 +108,6 @@ def test_panorama_is_zoomed_and_dragged(opened: Any) -> None:
     assert settled(opened, shown) == whole
 
 
-def test_wheel_scrolls_the_page_until_the_panorama_is_clicked(opened: Any) -> None:
-    left, top, width, height = box(opened, "#viewer canvas")
-    shown = "document.querySelector('#viewer canvas').toDataURL()"
-    whole = settled(opened, shown)
-    opened.mouse("mouseWheel", left + width / 2, top + height / 2, deltaX=0, deltaY=400)
-    opened.wait_for("window.scrollY > 0")
-    assert settled(opened, shown) == whole
-
-
 def test_maps_and_path_are_drawn_over_the_panorama(opened: Any) -> None:
     shown = "document.querySelector('#viewer canvas').toDataURL()"
     pictures = [settled(opened, shown)]
@@ -128,32 +119,6 @@ def test_maps_and_path_are_drawn_over_the_panorama(opened: Any) -> None:
     opened.run("document.querySelector('#viewer input[type=checkbox]').click()")
     pictures.append(settled(opened, shown))
     assert len(set(pictures)) == 5
-
-
-def test_frames_are_scrubbed(opened: Any) -> None:
-    shown = "document.querySelector('#viewer canvas').toDataURL()"
-    seen = []
-    for frame in (0, 299):
-        put(opened, "Frame", frame)
-        glimpse = opened.run("document.querySelector('.glimpse').src")
-        text = opened.run("document.querySelector('.scrubber output').textContent")
-        seen.append((settled(opened, shown), glimpse, text))
-    assert all(first != last for first, last in zip(*seen, strict=True))
-    assert re.fullmatch(r"299, 3\.09 ms: expected error [\d.]+ px", seen[1][2])
-
-
-def test_pictures_of_one_instant_are_compared(opened: Any) -> None:
-    names = opened.run("[...document.querySelector('[aria-label=\"Picture on the left\"]').options].map((each) => each.text)")
-    assert names == ["One frame", "Plain average", "Level 1", "Level 2", "Level 3", "Panorama"]
-    left, top, width, height = box(opened, ".stack")
-    opened.drag((left + width / 2, top + height / 2), (left + width / 4, top + height / 2))
-    divider = opened.run("document.querySelector('.stack').style.getPropertyValue('--divider')")
-    assert float(divider.rstrip("%")) == pytest.approx(25, abs=0.5)
-    sources = "[...document.querySelectorAll('.stack img')].map((each) => each.src)"
-    before = opened.run(sources)
-    put(opened, "Picture on the left", 3)
-    after = opened.run(sources)
-    assert (after[0], after[1] == before[1]) == (before[0], False)
 
 
 def test_pictures_of_one_instant_show_the_same_place(opened: Any) -> None:

@@ -8,25 +8,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import InputError, parse_spec, run, simulate
+from photonpano import parse_spec, run, simulate
 from photonpano.geometry import align_rotations, rotation_vectors
 from photonpano.pipeline.run import RunResult
 
 FOCAL_PX = 163.0
 SIMULATED: dict[str, Any] = {
     "scene": {"kind": "street", "width": 1024, "height": 512, "seed": 2},
-    "path": {"kind": "turn", "degrees": 100, "pitch_wobble_deg": 3, "roll_wobble_deg": 2},
+    "path": {"kind": "turn", "degrees": 80, "pitch_wobble_deg": 3, "roll_wobble_deg": 2},
     "frame_shape": [96, 160],
     "focal_length_px": FOCAL_PX,
     "flux": 0.5,
-    "n_frames": 1200,
+    "n_frames": 800,
     "distortion": {"k1": -0.08},
 }
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A turn by 100 degrees, through a lens that distorts."""
+    """A turn by 80 degrees, through a lens that distorts."""
     path = tmp_path_factory.mktemp("turn") / "turn.npy"
     simulate(parse_spec({"version": 1, "source": {"use": "simulator", "with": SIMULATED}}), path)
     return path
@@ -66,28 +66,7 @@ def test_rotations_focal_length_and_lens_are_found(result: RunResult, capture: P
     assert result.verdict.status == "trusted", [str(each) for each in result.verdict.reasons]
 
 
-def test_trajectory_holds_the_camera_and_homographies_of_determinant_1(result: RunResult) -> None:
-    with np.load(result.directory / "trajectory.npz") as found:
-        assert str(found["model"]) == "rotation"
-        matrix, reference = found["camera_matrix"], int(found["reference"])
-        np.testing.assert_allclose(found["homographies"], matrix @ found["rotations"] @ np.linalg.inv(matrix), atol=1e-9)
-        np.testing.assert_allclose(np.linalg.det(found["homographies"]), 1)
-        np.testing.assert_allclose(found["rotations"][reference], np.eye(3), atol=1e-12)
-        assert found["distortion"].shape == (4,)
-
-
 def test_auto_records_which_model_it_took_and_why(result: RunResult) -> None:
     [decision] = [each for each in result.record["decisions"] if each["what"] == "motion_model"]
     assert decision["value"] == "rotation with a lens"
     assert decision["reason"].startswith("beyond shift and roll, the ends of a frame move by ")
-
-
-def test_principal_point_outside_the_frames_is_refused(capture: Path, tmp_path: Path) -> None:
-    sections = {"motion": {"model": "rotation"}, "camera": {"centre_px": [247.5, 126.5]}}
-    with pytest.raises(InputError) as caught:
-        run(parse_spec(spec_of(capture, **sections), output=tmp_path / "run"))
-    assert str(caught.value) == (
-        "camera.centre_px: (247.5, 126.5) does not lie in the frames of 96x160 px; a camera that was calibrated with other "
-        "frames has another principal point and focal length here: scale and shift both"
-    )
-    assert not (tmp_path / "run").exists()

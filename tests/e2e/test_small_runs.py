@@ -15,7 +15,6 @@ import tifffile
 import photonpano
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import Evaluation, corner_errors
-from photonpano.geometry import rescaling
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.run import RunResult
 from photonpano.specs import Plan, parse_spec
@@ -85,30 +84,10 @@ def test_a_second_level_reduces_the_error_to_what_a_third_one_leaves(
     assert errors[2] < 0.04
 
 
-def test_constant_groups_are_less_accurate_without_refinement(run: Callable, error_px: Callable) -> None:
-    ablation, method = (run(f"resample.use={name}", "refine=[]") for name in ("constant-groups", "midpoint"))
-    assert error_px(ablation.homographies) > 1.8 * error_px(method.homographies)
-
-
 def test_naive_average_is_less_accurate(run: Callable, three_levels: np.ndarray, error_px: Callable) -> None:
     """Measured: 0.040 px, and 0.026 px with compensation; more levels do not help."""
     naive = run("merge.with.compensate=false", levels=2)
     assert error_px(naive.homographies) > 1.3 * error_px(three_levels)
-
-
-def test_half_size_first_level_suffices_for_second(run: Callable, error_px: Callable) -> None:
-    coarse, fine = run(levels=[{"scale": 0.5}]), run(levels=[{"scale": 0.5}, {}])
-    assert error_px(coarse.homographies) < 2.5
-    assert error_px(fine.homographies) < 0.4
-    assert [level["scale"] for level in fine.record["levels"]] == [0.5, 1.0]
-
-
-def test_panorama_has_scale_of_spec(run: Callable) -> None:
-    once, twice = run(levels=1), run("render.scale=2", levels=1)
-    assert twice.flux.shape == (2 * once.flux.shape[0], 2 * once.flux.shape[1])
-    np.testing.assert_allclose(twice.canvas, rescaling(2) @ once.canvas, atol=1e-9)
-    assert np.nanmean(twice.flux) == pytest.approx(np.nanmean(once.flux), rel=0.02)
-    assert twice.coverage.max() == pytest.approx(once.coverage.max(), rel=0.02)
 
 
 @pytest.fixture(scope="module")
@@ -161,10 +140,3 @@ def test_run_whose_time_is_over_ends_with_the_motion_known_by_then(run: Callable
     assert decision["value"].startswith("further levels, corrections")
     assert [warning for warning in result.record["warnings"] if "are left out, since 1e-06 s were over" in warning]
     assert not [each for each in run("run.time_limit=9999").record["warnings"] if "run.time_limit" in each]
-
-
-def test_poses_have_no_time_limit(small_spec: dict[str, Any]) -> None:
-    posed = {"pose": {"use": "colmap-averages"}, "camera": {"focal_px": 200}, "run": {"time_limit": 60}}
-    kept = {key: small_spec[key] for key in ("version", "source")}
-    with pytest.raises(photonpano.SpecError, match=r"run\.time_limit: a pose estimator cannot end early; remove it"):
-        parse_spec(kept | posed)

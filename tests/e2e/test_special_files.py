@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-import socket
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +13,8 @@ from typer.testing import CliRunner
 
 from photonpano import InputError, SourceContext, SpecError, discover, evaluate, load_spec, parse_spec
 from photonpano.api.cli.app import app
-from photonpano.files.paths import given_path, refusal
 from photonpano.pipeline.run import RunResult
-from photonpano.reading import read_arrays, read_start
+from photonpano.reading import read_arrays
 
 PIPE = "is a named pipe, not a regular file; copy what it holds to a file, and name that"
 SOURCE = "version: 1\nsource: {use: packed-npy, with: {path: cube.npy}}\n"
@@ -84,29 +81,6 @@ def test_pipe_in_folder_of_pictures_is_refused(folder: Path) -> None:
     with pytest.raises(InputError) as caught:
         contribution.build(contribution.config(path=folder / "pictures"), SourceContext())
     assert str(caught.value) == f"{folder}/pictures/1.png {PIPE}"
-
-
-def test_start_of_pipe_is_not_read(folder: Path) -> None:
-    assert read_start(folder / "pipe.npy", 8) == b""
-
-
-def test_refusal_names_sockets_and_passes_files_folders_and_nothing(folder: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind("socket")
-        assert refusal(Path("socket")) == "socket is a socket, not a regular file; copy what it holds to a file, and name that"
-    assert [refusal(folder / name) for name in ("cube.npy", "", "nowhere", "cube.npy/x")] == [None] * 4
-    assert given_path(Path("x")) == Path("x")
-
-
-def test_folder_that_cannot_be_listed_is_one_sentence(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def locked(path: Path) -> Any:
-        raise PermissionError(13, "Permission denied")
-
-    (folder / "locked").mkdir()
-    monkeypatch.setattr(Path, "iterdir", locked)
-    with pytest.raises(SpecError) as caught:
-        parse_spec({"version": 1, "source": {"use": "auto", "with": {"path": "locked"}}})
-    assert str(caught.value) == f"source.with.path: cannot read {folder}/locked: Permission denied"
 
 
 def test_path_that_is_too_long_is_one_sentence(folder: Path) -> None:

@@ -14,7 +14,7 @@ import tifffile
 from photonpano import FrameSpan, InputError, PackedSource, SourceContext, discover, evaluate, parse_spec, run
 from photonpano.capture import Capture, capture_of
 from photonpano.capture.writing import write_packed
-from photonpano.corrections import CORRECTIONS, DarkCounts, Mask, Vignette, corrected_source, divided_by
+from photonpano.corrections import DarkCounts, corrected_source
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas
 from photonpano.merging.canvas_noise import CanvasNoise
@@ -71,35 +71,12 @@ def test_channels_are_colours_and_a_grey_pixel_is_lit_in_any(cube: np.ndarray, t
             np.testing.assert_array_equal(blue.frames(span), cube[3:40, ..., 2])
 
 
-def test_corrections_move_and_mask_all_channels(cube: np.ndarray, tmp_path: Path) -> None:
-    masked = np.zeros(SHAPE[::-1], np.bool_)
-    masked[5, 7] = True
-    np.save(tmp_path / "mask.npy", masked)
-    with opened(cube, tmp_path) as capture:
-        turned = corrected_source(capture, [CORRECTIONS["rot90"](), Mask(file=tmp_path / "mask.npy")])
-        for channel, each in enumerate(turned.colours().values()):
-            counts = np.rot90(cube[..., channel].sum(axis=0), -1)
-            np.testing.assert_array_equal(each.counts(each.info.span), counts)
-            np.testing.assert_array_equal(each.valid, ~masked)
-
-
 def test_what_is_for_one_channel_is_refused(cube: np.ndarray, tmp_path: Path) -> None:
     with opened(cube, tmp_path) as capture:
         with pytest.raises(InputError, match=r"^dark-counts is for one channel, and this capture has three; leave it out$"):
             corrected_source(capture, [DarkCounts(dark=tmp_path / "dark.npz")])
         with pytest.raises(InputError, match=r"holds one channel, and this capture has three; write channel: 0, 1 or 2$"):
             write_packed(capture, tmp_path / "grey.npy")
-
-
-def test_gain_of_the_pixels_is_divided_out_of_each_channel(tmp_path: Path) -> None:
-    gain = np.broadcast_to(np.linspace(0.5, 1, SHAPE[1], dtype=np.float32), SHAPE)
-    cube = detected(np.broadcast_to(np.multiply.outer(gain, FLUX), (400, *SHAPE, 3)), 1)
-    with opened(cube, tmp_path) as capture:
-        even = divided_by(capture, Vignette(gain, cube.any(axis=-1).mean(axis=0, dtype=np.float32), ()))
-        for flux, each in zip(FLUX, even.colours().values(), strict=True):
-            columns = each.corrected_counts(each.info.span).mean(axis=0) / 400
-            expected = -np.expm1(-flux)
-            np.testing.assert_allclose(columns[[0, 40, 91]], expected, atol=4 * np.sqrt(expected / 400 / SHAPE[0] / 0.4))
 
 
 def test_noise_of_each_colour_is_what_its_error_bars_say(

@@ -15,7 +15,6 @@ import tifffile
 
 import photonpano
 from photonpano import Config, ExporterContribution, PluginError, discover
-from photonpano.geometry import translation
 from photonpano.merging.panorama import BYTES_PER_PIXEL
 from photonpano.pipeline.run import RunResult
 from photonpano.record.contents import changed_files
@@ -49,18 +48,6 @@ def test_panorama_larger_than_memory_is_written_in_parts(run: Callable[..., RunR
     shown = picture[: blocks.shape[0], : blocks.shape[1]]
     assert np.corrcoef(np.sqrt(blocks).ravel(), shown.ravel())[0, 1] > 0.98
     assert f"<code>panorama.png</code> one pixel for {factor}" in (tmp_path / "run" / "report.html").read_text()
-
-
-@pytest.mark.parametrize(("reference", "frame"), [("first", 0), ("last", 159), (77, 77)])
-def test_panorama_lies_in_plane_of_reference_frame(
-    tiny_spec: dict[str, Any], outcome_of: Callable, reference: str | int, frame: int
-) -> None:
-    outcome = outcome_of(parse_spec(tiny_spec, overrides=(f"render.reference={reference}",)))
-    assert outcome.trajectory["reference"] == frame
-    np.testing.assert_allclose(outcome.homographies[frame], np.eye(3), atol=1e-12)
-    # A canvas of scale 1 samples the pixels of the reference plane as they are.
-    canvas = outcome.canvas
-    np.testing.assert_array_equal(canvas, translation(round(canvas[0, 2]), round(canvas[1, 2])))
 
 
 def test_bytes_of_results_depend_neither_on_threads_nor_on_where_the_spec_comes_from(
@@ -98,16 +85,6 @@ def test_run_without_report_keeps_its_results(
     assert json.loads((tmp_path / "run" / "run.json").read_text()) == json.loads(json.dumps(record))
     assert set(record["files"]) == {"trajectory.npz", "panorama.tiff", "panorama-std.tiff", "coverage.tiff", "panorama.png"}
     assert photonpano.verify(tmp_path / "run").problems == ()
-
-
-@pytest.mark.usefixtures("without_report")
-def test_resumed_run_writes_exposures_that_were_not_kept(run: Callable[..., RunResult], tmp_path: Path) -> None:
-    run(resume=True)
-    assert not run("output.keep=exposures", resume=True).was_finished
-    assert (tmp_path / "run" / "exposures" / "level-1.npy").exists()
-    assert run("output.keep=exposures", resume=True).was_finished
-    run()
-    assert not (tmp_path / "run" / "exposures").exists()
 
 
 @pytest.mark.usefixtures("without_report")

@@ -15,46 +15,20 @@ from PIL import Image
 from photonpano import (
     BatchResult,
     BatchRow,
-    InputError,
     Quiet,
-    RunTrajectory,
     capture_plan,
-    evaluate,
     info,
     load_panorama,
     load_trajectory,
 )
-from photonpano.capture.writing import truth_path
-from photonpano.evaluation.poses import pose_errors
 from photonpano.execution.context import usual
-from photonpano.notebooks import NotebookBars, facts, in_notebook, picture
+from photonpano.notebooks import NotebookBars, in_notebook
 
 
 def pixels_of(html: str) -> np.ndarray:
     data = re.search(r'src="data:image/png;base64,([^"]+)"', html)
     assert data is not None
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data[1]))))
-
-
-def test_facts_are_escaped() -> None:
-    assert '<td style="text-align:left">a &lt;b&gt; &amp; c</td>' in facts([("name", "a <b> & c")])
-
-
-@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 3)], ids=["grey", "colour"])
-def test_picture_is_square_root_of_flux_and_black_where_unknown(shape: tuple[int, ...]) -> None:
-    flux = np.full(shape, 4.0, np.float32)
-    flux[:, :10], flux[:, 10:15] = np.nan, 1.0
-    shown = pixels_of(picture(flux, "flux"))
-    assert (shown[:, :10].max(), shown[0, 12].max(), shown[0, 20].max()) == (0, 128, 255)
-
-
-@pytest.mark.parametrize("value", [np.nan, 0.0])
-def test_picture_without_light_is_black(value: float) -> None:
-    assert pixels_of(picture(np.full((4, 5), value, np.float32), "nothing")).max() == 0
-
-
-def test_large_picture_is_made_smaller() -> None:
-    assert pixels_of(picture(np.ones((100, 3000), np.float32), "wide")).shape == (30, 900)
 
 
 @pytest.fixture
@@ -108,19 +82,6 @@ def test_bars_are_one_output_that_ends_with_what_was_done(cell: list[str]) -> No
     assert "level 1: 3 &lt; 4" in cell[-1]
 
 
-def test_bar_of_failed_stage_keeps_what_was_done(cell: list[str]) -> None:
-    bars = NotebookBars()
-
-    def fail() -> None:
-        with bars.stage("level 1", 8, "exposures") as advance:
-            advance(3)
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fail()
-    assert 'value="3" max="8"' in cell[-1]
-
-
 def test_run_shows_picture_verdict_and_folder(small_run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(small_run.directory.parent)
     html = small_run._repr_html_()
@@ -138,21 +99,6 @@ def test_viewer_of_a_run_is_its_report_in_a_frame(small_run: Any, tmp_path: Path
     assert (browser_page.messages, browser_page.requests) == ([], [])
 
 
-def test_viewer_needs_a_report(small_run: Any, tmp_path: Path) -> None:
-    import dataclasses
-
-    with pytest.raises(InputError, match=r"report\.html does not exist; the run was rendered without a report"):
-        dataclasses.replace(small_run, directory=tmp_path / "gone").viewer()
-
-
-def test_run_whose_files_are_gone_shows_the_rest(small_run: Any, tmp_path: Path) -> None:
-    import dataclasses
-
-    html = dataclasses.replace(small_run, directory=tmp_path / "gone")._repr_html_()
-    assert "<img" not in html
-    assert "verdict" in html
-
-
 def test_panorama_and_trajectory_of_run_show_themselves(small_run: Any) -> None:
     panorama = load_panorama(small_run.directory)
     assert pixels_of(panorama._repr_html_()).shape == panorama.flux.shape
@@ -162,36 +108,11 @@ def test_panorama_and_trajectory_of_run_show_themselves(small_run: Any) -> None:
     assert len(re.findall(r"[-\d.]+,[-\d.]+", html[html.index("<polyline") :])) == min(500, trajectory.located.sum())
 
 
-def test_path_beyond_plane_is_not_drawn() -> None:
-    turned = np.stack([np.eye(3), [[1, 0, 0], [0, 1, 0], [-1 / 10, 0, 1]]])
-    trajectory = RunTrajectory(turned, np.eye(3), (20, 30), np.ones(2, bool), np.full(2, np.nan))
-    html = trajectory._repr_html_()
-    assert "2 of 2 located" in html
-    nothing = RunTrajectory(turned, np.eye(3), (20, 30), np.zeros(2, bool), np.full(2, np.nan))
-    assert "<svg" not in nothing._repr_html_()
-
-
-@pytest.mark.parametrize("load", [load_panorama, load_trajectory])
-def test_folder_that_is_no_run_is_refused(load: Any, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no run has finished in it|is not a folder|is no run folder"):
-        load(tmp_path)
-
-
 def test_capture_shows_itself(small_capture: Path) -> None:
     found = info(capture_plan(small_capture, {"frame_rate_hz": 96_800}))
     html = found._repr_html_()
     assert all(name in html for name, _ in found.rows())
     assert "photons per pixel per frame" in html
-
-
-def test_scores_show_themselves(small_run: Any, small_capture: Path) -> None:
-    scores = evaluate(small_run.directory, truth_path(small_capture), oracle=False)
-    poses = np.tile(np.eye(3, 4), (9, 1, 1))
-    poses[:, :, 3] = np.random.default_rng(0).normal(size=(9, 3))
-    for each in (scores, pose_errors(poses, poses, np.ones(9, bool), 1)):
-        html = each._repr_html_()
-        assert each.rows()
-        assert all(f">{name}<" in html and f">{value}<" in html for name, value in each.rows())
 
 
 def test_batch_shows_its_runs_and_its_summary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import typer
 
 from photonpano.api.command import command
 from photonpano.api.run_folders import OpenedRun, opened_run
-from photonpano.capture import before
+from photonpano.capture import with_background
 from photonpano.errors import InputError
 from photonpano.evaluation import RunPoses, RunTrajectory, has_poses, load_run_poses, load_run_trajectory
 from photonpano.execution.context import Progress, usual
@@ -114,7 +114,7 @@ def _film(opened: OpenedRun, box: tuple[int, int, int, int]) -> Film:
     settings, recorded = opened.plan.render, opened.record["panorama"]
     if recorded is None:
         raise InputError(f"{opened.folder}: the run made no panorama, and the pictures are as bright as that")
-    source, canvas = before(opened.source, None), canvas_of_box(box, 1.0)  # what moves is shown, wherever it is
+    source, canvas = with_background(opened.source, None), canvas_of_box(box, 1.0)  # what moves is shown, wherever it is
     # A path that is smoothed over no frames is that of the camera.
     view = (opened.motion, canvas, settings.tolerance_px, 0.0, recorded["white_flux"], settings.white_balance)
     return Film(source, *view)

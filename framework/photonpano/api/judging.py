@@ -36,18 +36,17 @@ from photonpano.files.folders import atomic_path, require_new
 from photonpano.geometry import Canvas
 from photonpano.merging.colour import composed
 from photonpano.merging.panorama import render
-from photonpano.motion.level import REPEATED
 from photonpano.pipeline.obstacles import timeline_of
 from photonpano.pipeline.rendering import build_renderer
 from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import require_one_run
-from photonpano.record.run_json import read_record
+from photonpano.record.run_json import findings_of, read_record
 from photonpano.record.schema import PanoramaRecord, RunRecord
 from photonpano.report import ComparedRun, render_comparison
 from photonpano.residuals.refinement import MotionFit
 from photonpano.residuals.verdict import NARROW, REPEATS, judge
 from photonpano.text import columns
-from photonpano.values import Decision, Panorama, Reason, Verdict
+from photonpano.values import Panorama, Reason, Verdict
 
 _FEW = 0.1  # if fewer positions lie within 3 expected errors, the truth is probably of another capture
 _PICTURE_PIXELS = 1600  # longer side of a panorama on the page
@@ -98,12 +97,12 @@ def check_run(
     with opened_run(Path(run_folder), catalog, moved=capture) as opened, one_thread_inside():
         record, plan = opened.record, opened.plan
         context = Context(thread_count(plan.run.threads), usual(progress))
-        copied = any(each["what"] == REPEATED for each in record.get("decisions", ()))
-        copies = timeline_of(opened.source, context).copies if copied else None
+        findings = findings_of(record)
+        copies = timeline_of(opened.source, context).copies if findings.repeated else None
         source = replace(capture_of(opened.source), copies=copies)
         fit = MotionFit(source, opened.motion, int(plan.run.memory), context)
         explained = fit.explained()
-    verdict = judge(explained, (), [Decision(**decision) for decision in record.get("decisions", ())])
+    verdict = judge(explained, (), findings)
     reasons = list(verdict.reasons)
     recorded = (record.get("verdict") or {"reasons": ()})["reasons"]
     reasons += [Reason(**each) for each in recorded if each["what"] in (REPEATS, NARROW)]

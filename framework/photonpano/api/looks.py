@@ -1,9 +1,8 @@
-"""Look before a run: at the size, brightness and speed of a capture, at its frames, and at a spec with all defaults."""
+"""Look at a capture before it is run: its size, brightness and speed, and its frames."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,34 +12,30 @@ import typer
 from photonpano.api.command import command, json_lines, warn
 from photonpano.contracts.protocols import Source
 from photonpano.corrections import HotPixels, without_still_pixels
-from photonpano.errors import InputError, PhotonpanoError
+from photonpano.errors import InputError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.files.folders import require_new
 from photonpano.files.paths import Url
-from photonpano.motion.pairs import pairs_of
 from photonpano.notebooks import facts, from_here
-from photonpano.pipeline.components import build_source, foreseen_decisions, foreseen_groups, open_source, scale_of
+from photonpano.pipeline.components import build_source, foreseen_decisions
 from photonpano.pipeline.obstacles import order_warning
 from photonpano.pipeline.summary import require_photons, saturated_share, summarise
-from photonpano.plugins.contributions import KINDS
 from photonpano.plugins.description import flow
-from photonpano.plugins.registry import Catalog, discover
+from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import capture_files
 from photonpano.record.picture_files import advancing, require_writable, write_pictures
 from photonpano.report.preview import Style, pictures, preview_spans, white_flux
 from photonpano.specs import Plan, parse_spec
-from photonpano.specs.yaml_reader import joined
-from photonpano.text import byte_size, columns, counted, duration
+from photonpano.text import columns, counted, duration
 from photonpano.values import CaptureSummary, StreamInfo
 
 if TYPE_CHECKING:
-    from photonpano.pipeline.forecast import Forecast  # imports numba, which only a forecast needs
+    pass  # imports numba, which only a forecast needs
 
 HOT_SHARE = 0.001  # fraction of hot pixels above which a mask is recommended
 STANDING_SHARE = 0.5  # if more of the frame is static than this, `corrections: auto` masks nothing
 SATURATED_SHARE = 0.01  # fraction of pixels saturated in every frame above which less light is recommended
-_DESCRIBED_LEVELS = 3  # maximum number of levels described under `levels: until-converged`
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,14 +147,13 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
         with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as other:
             hot = read.valid & ~other.valid
         still = read.valid & ~marked.valid
-        decided = {each.what: each for each in marked.decisions}
         keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
         spec: dict[str, Any] = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
         if not plan.corrects_itself:
             spec["corrections"] = plan.document["corrections"]
         found = CaptureInfo(
             source=plan.source.contribution.name,
-            reason=next((decision.reason for decision in plan.decisions if decision.what == "source"), None),
+            reason=None if plan.recognised is None else plan.recognised.reason,
             n_frames=stream.n_frames,
             height=stream.height,
             width=stream.width,
@@ -173,8 +167,8 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
             unused_share=1 - float(read.valid.mean()),
             hot_share=float(hot[read.valid].mean()),
             still_share=float(still[read.valid].mean()),
-            standing_share=float(decided["standing_share"].value) if "standing_share" in decided else 0.0,
-            still_how=decided["still_pixels"].reason if "still_pixels" in decided else "not measured",
+            standing_share=marked.still.share,
+            still_how=marked.still.how,
             saturated_share=saturated_share(source),
             group_size=size,
             group_size_reason=reason,
@@ -194,10 +188,10 @@ def _group_size(plan: Plan, source: Source, summary: CaptureSummary, catalog: Ca
     source_section = {"use": plan.source.contribution.name, "with": plan.source.config.model_dump(by_alias=True)}
     spec = {"version": 1, "source": source_section, "resample": {"use": "midpoint"}, "levels": 1}
     try:
-        decisions = foreseen_decisions(parse_spec(spec, catalog=catalog), source, summary)
+        (chosen,) = foreseen_decisions(parse_spec(spec, catalog=catalog), source, summary)
     except InputError as error:
         return None, str(error)
-    return next((int(each.value), each.reason) for each in decisions if each.what == "group_size")
+    return int(chosen.value), chosen.reason
 
 
 def _warnings(source: Source, found: CaptureInfo, hot_left: float) -> Iterator[str]:
@@ -316,149 +310,3 @@ def preview(
         with usual(progress).stage(f"writing {output.name}", len(spans), "pictures") as advance:
             write_pictures(output, advancing(pictures(source, spans, style, threads), advance), names, fps)
         return Preview(output, len(spans), len(spans[0]), style.white_flux, source.info)
-
-
-def forecast(plan: Plan) -> Forecast:
-    """Predict time and memory of a run, from a trial on the middle of the capture.
-
-    Raises:
-        InputError: the spec finds poses.
-        PhotonpanoError: the trial failed, as the run may.
-    """
-    from photonpano.pipeline.forecast import forecast as forecast_from
-
-    _require_levels(plan)
-    with open_source(plan) as source:
-        return forecast_from(plan, source)
-
-
-@command(
-    "scan.yaml > resolved.yaml",
-    lambda text: [text.removesuffix("\n")],
-    plan="spec",
-    with_forecast=typer.Option("--forecast", help="Try the middle of the capture, and predict time and memory of the run."),
-)
-def explain(plan: Plan, *, with_forecast: bool = False, catalog: Catalog | None = None) -> str:
-    """Write a spec with all defaults, explained in comments.
-
-    The text is a spec itself. Its comments name the plugin of each component, the origin of each value that does not stand in
-    the file, and the number of groups and pairs of each level.
-
-    Args:
-        plan: from `load_spec` or `parse_spec`.
-        with_forecast: whether comments at the end give what `forecast` predicts, or why its trial failed.
-        catalog: the catalog that the plan was made with; by default what the installed plugins offer.
-
-    Returns:
-        YAML.
-
-    Raises:
-        InputError: the capture cannot be used as it is.
-        SpecError: a stage does not suit it.
-    """
-    if with_forecast:
-        _require_levels(plan)
-    with open_source(plan, look=with_forecast) as source:
-        title = f"# {plan.file or 'the spec'} as it will run, on {source.info}"
-        writer = _Writer(plan, discover() if catalog is None else catalog, list(_levels(plan, source)))
-        prediction = [f"# {line}" for line in _forecast_lines(plan, source)] if with_forecast else []
-    return "\n".join([title, *writer.lines(), *prediction]) + "\n"
-
-
-def _require_levels(plan: Plan) -> None:
-    if plan.pose is not None:
-        raise InputError("a forecast is of panoramas, and the spec finds poses: leave out --forecast")
-
-
-def _levels(plan: Plan, source: Source) -> Iterator[str]:
-    """Yield a comment for each level; of an open number of levels, for all of them together."""
-    if plan.until_converged:
-        yield f"up to {len(plan.levels)} levels, until the motion has converged"
-    for number, groups in enumerate(foreseen_groups(plan, source), start=1):
-        if plan.until_converged and number > _DESCRIBED_LEVELS:
-            yield "each further level: about twice the groups and pairs of the one before"
-            return
-        scale = f"at scale {scale_of(plan, number, source.info.frame_shape):g}"
-        if isinstance(groups, str):
-            yield f"level {number}: groups are {groups}; {scale}"
-            continue
-        sizes = sorted({len(group.span) for group in groups})
-        frames = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
-        pairs = len(pairs_of(groups, plan.graph.skips))
-        yield f"level {number}: {len(groups)} groups of {frames} frames, {pairs} pairs, {scale}"
-
-
-def _forecast_lines(plan: Plan, source: Source) -> list[str]:
-    from photonpano.pipeline.forecast import forecast as forecast_from
-
-    try:
-        found = forecast_from(plan, source)
-    except PhotonpanoError as error:
-        return ["the trial in the middle of the capture failed, as the run may:", *str(error).splitlines()]
-    each = ", ".join(f"{name}: {duration(seconds)}" for name, seconds in found.seconds.items())
-    total, threads = duration(sum(found.seconds.values())), counted(found.threads, "thread")
-    memory, (height, width) = byte_size(found.memory_bytes), found.canvas
-    return [
-        f"forecast from a trial on {found.tried}: about {total} with {threads} ({each})",
-        f"memory: about {memory}, for a panorama of about {height}x{width} px if no place is seen twice",
-    ]
-
-
-class _Writer:
-    """Writes a resolved spec as YAML with comments."""
-
-    def __init__(self, plan: Plan, catalog: Catalog, levels: Sequence[str]) -> None:
-        self._plan = plan
-        self._catalog = catalog
-        self._levels = levels
-
-    def lines(self) -> Iterator[str]:
-        for section, value in self._plan.document.items():
-            if section == "levels" and self._plan.until_converged:
-                yield from (f"# {comment}" for comment in self._levels)
-                yield from self._mapping({section: value}, "", "")
-            elif section == "levels":
-                yield "levels:"
-                for index, (level, comment) in enumerate(zip(value, self._levels, strict=True)):
-                    yield f"  # {comment}"
-                    yield from self._item(level, f"levels.{index}", "  ")
-            else:
-                yield from self._mapping({section: value}, "", "")
-
-    def _mapping(self, mapping: Mapping[str, Any], where: str, indent: str) -> Iterator[str]:
-        for key, value in mapping.items():
-            path = joined(where, key)
-            if isinstance(value, dict) and value:
-                yield f"{indent}{key}:"
-                yield from self._mapping(value, path, f"{indent}  ")
-            elif (
-                isinstance(value, list) and value and re.fullmatch(r"corrections|refine|(levels\.\d+\.)?locate\.fallback", path)
-            ):
-                yield f"{indent}{key}:"
-                for index, item in enumerate(value):
-                    yield from self._item(item, f"{path}.{index}", f"{indent}  ")
-            else:
-                comment = ", ".join(filter(None, [self._provider(path, value), self._origin(path)]))
-                yield f"{indent}{key}: {flow(value)}" + (f"  # {comment}" if comment else "")
-
-    def _item(self, item: Mapping[str, Any] | str, where: str, indent: str) -> Iterator[str]:
-        first, *others = [item] if isinstance(item, str) else self._mapping(item, where, "")
-        yield f"{indent}- {first}"
-        yield from (f"{indent}  {line}" for line in others)
-
-    def _provider(self, path: str, value: Any) -> str:
-        """Return which plugin provides a component, and the reason if the spec left the choice open."""
-        *_, section, key = ["", *re.sub(r"(\.fallback)?\.\d+", "", path).split(".")]
-        kinds = [kind.name for kind in KINDS.values() if kind.section == section]
-        if key != "use" or not kinds:
-            return ""
-        entry = self._catalog.find(kinds[0], value)
-        reasons = [decision.reason for decision in self._plan.decisions if decision.what == path.removesuffix(".use")]
-        return ", ".join([f"{entry.origin.plugin} {entry.origin.version}", *reasons])
-
-    def _origin(self, path: str) -> str:
-        """Return "default" or "--set" for a value that does not stand in the file."""
-        place = self._plan.place(path)
-        if place.is_written and place.override is not None:
-            return "--set"
-        return "default" if not place.is_written or place.line is None else ""

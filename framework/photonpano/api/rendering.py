@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from photonpano.api.command import command
 from photonpano.api.run_folders import OpenedRun, load_trajectory, opened_run
-from photonpano.capture import before
+from photonpano.capture import with_background
 from photonpano.corrections.movers import showing
 from photonpano.errors import InputError
 from photonpano.execution.context import Context, Progress, usual
@@ -158,8 +158,9 @@ def require_same_plane(opened: OpenedRun) -> None:
 def _record(opened: OpenedRun, panorama: RenderedPanorama, chosen: Sequence[Decision], seconds: float) -> RunRecord:
     """Return the record of the run, with what was rendered again."""
     plan, old = opened.plan, opened.record
+    # The last decisions are those of renderer and exporters.
     before = [] if old["panorama"] is None else old["panorama"].get("decisions", [])
-    kept = [each for each in old["decisions"] if each["what"] not in before]
+    kept = old["decisions"][: len(old["decisions"]) - len(before)]
     return {
         **old,
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -167,6 +168,7 @@ def _record(opened: OpenedRun, panorama: RenderedPanorama, chosen: Sequence[Deci
         "plugins": plugin_records(plan),
         "libraries": library_versions(plan),
         "decisions": [*kept, *decision_records(chosen)],
+        "findings": {**old.get("findings", {}), "never_seen_share": panorama.never_seen_share},
         "panorama": panorama_record(plan, panorama, chosen),
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_memory_bytes(),
@@ -316,7 +318,7 @@ def _frames(exposure: str, rate: float | None) -> int:
 def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> Film:
     plan, motion, recorded = opened.plan, opened.motion, opened.record["panorama"]
     memory = int(plan.run.memory)
-    source = before(opened.source, None)  # what moves is shown, wherever it is
+    source = with_background(opened.source, None)  # what moves is shown, wherever it is
     if recorded is None:
         raise InputError(f"{opened.folder}: the run made no panorama, and a video is as bright as that")
     if view == "panorama":
@@ -334,7 +336,7 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
             f"{byte_size(memory)} of run.memory; lower render.scale, or choose a part with render.extent"
         )
     tolerance_px = plan.render.tolerance_px
-    still, _ = showing(opened.source, motion.trajectory, motion.camera, plan.render.movers)
+    still, *_ = showing(opened.source, motion.trajectory, motion.camera, plan.render.movers)
     brighter = plan.render.exposure_stops - opened.record["spec"]["render"]["exposure_stops"]
     return Film(
         source,

@@ -10,10 +10,8 @@ import typer
 
 from photonpano.api.command import CHANGES, SPEC, WrongArgumentError, command, logger, require_trust, verdict_lines, warn
 from photonpano.execution.context import Progress
-from photonpano.motion.level import CUT, DARK_FRAMES, DARK_JUMP, REPEATED, SHOTS
-from photonpano.motion.pairs import GYROSCOPE
-from photonpano.pipeline.estimate import START
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
+from photonpano.record.run_json import findings_of
 from photonpano.record.schema import PanoramaRecord
 from photonpano.specs import load_spec
 from photonpano.text import byte_size, counted, duration
@@ -33,9 +31,9 @@ def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
         yield from verdict_lines(result.verdict)
     for warning in record["warnings"]:
         warn(warning)
-    for decision in record["decisions"]:
-        if decision["what"] in (START, GYROSCOPE, SHOTS, DARK_FRAMES, CUT, DARK_JUMP, REPEATED):
-            yield f"{decision['what']:<9} {decision['value']}: {decision['reason']}"
+    findings = findings_of(record)
+    for decision in (*findings.started, *findings.of_frames):
+        yield f"{decision.what:<9} {decision.value}: {decision.reason}"
     for refinement in record["refinements"]:
         if refinement["rounds"]:  # the first of them is the largest
             yield f"refined   {refinement['change_px']:.2g} px on average by {refinement['use']}: {refinement['rounds'][0]}"

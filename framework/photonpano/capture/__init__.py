@@ -8,13 +8,13 @@ from photonpano.capture.capture import (
     Index,
     LinearCorrection,
     MaskedSpan,
-    before,
     capture_of,
     in_light,
     leaving_out,
     numbered,
     part_of,
     seen_through,
+    with_background,
 )
 from photonpano.capture.plugin_source import PluginSource
 
@@ -27,11 +27,11 @@ __all__ = [
     "LinearCorrection",
     "MaskedSpan",
     "PluginSource",
-    "before",
     "capture_of",
     "in_light",
     "leaving_out",
     "numbered",
     "part_of",
     "seen_through",
+    "with_background",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from photonpano.capture.plugin_source import PluginSource
 from photonpano.contracts.protocols import Closing
 from photonpano.photometry import MAX_FRAMES, packed_counts
-from photonpano.values import Background, BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, StreamInfo
+from photonpano.values import Background, BoolArray, Counts, Decision, FluxImage, Frames, FrameSpan, Light, Still, StreamInfo
 
 if TYPE_CHECKING:
     from photonpano.contracts.protocols import Source
@@ -121,6 +121,7 @@ class Capture(Closing):
     # the panorama.
     background: Background | None = None
     copies: BoolArray | None = None  # (T,) True for frames that are copies of the one before; None if there are none
+    still: Still = field(default_factory=Still)  # what stands still in the frames
     decisions: tuple[Decision, ...] = ()  # what was decided because of what the frames show
 
     @property
@@ -316,7 +317,7 @@ def seen_through(source: Source, camera: Camera) -> Capture:
     return replace(capture_of(source), camera=camera)
 
 
-def before(source: Source, background: Background | None) -> Capture:
+def with_background(source: Source, background: Background | None) -> Capture:
     """Return a capture in which what hides the background is left out; None for nothing. Counts stay as they are."""
     return replace(capture_of(source), background=background)
 

@@ -46,7 +46,7 @@ def corrected_source(
         step = _linear(pixels, valid, capture.info.kind == "binary")
         corrected = replace(corrected, steps=(step,))
     valid.flags.writeable = False
-    corrected = replace(corrected, valid=valid, masks=_masks(pixels), decisions=tuple(decisions))
+    corrected = replace(corrected, valid=valid, masks=_masks(pixels), still=pixels.still, decisions=tuple(decisions))
     if capture.colour is not None:
         parts = {
             name: replace(_rearranged(part, pixels.index), valid=valid, steps=corrected.steps)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar, TypeAlias
 
@@ -15,7 +15,7 @@ from pydantic import Field, field_validator, model_validator
 from photonpano.capture import MISSING, Capture, Index, MaskedSpan, numbered
 from photonpano.errors import InputError
 from photonpano.plugins.contributions import Config
-from photonpano.values import BoolArray, FluxImage, FrameSpan
+from photonpano.values import BoolArray, FluxImage, FrameSpan, Still
 
 Decide: TypeAlias = Callable[[str, float, str], None]  # records a decision: what was chosen, its value, and the reason
 
@@ -31,6 +31,7 @@ class Pixels:
     # int8, the place in `COLOURS` of the colour that each pixel sees; -1 where all pixels are treated alike
     colour: NDArray[np.int8]
     masks: tuple[MaskedSpan, ...] = ()  # more pixels that must not be used, each in some frames
+    still: Still = field(default_factory=Still)  # what stands still in the frame
 
     @classmethod
     def as_read(cls, capture: Capture) -> Pixels:
@@ -55,6 +56,7 @@ class Pixels:
             np.where(missing, np.float32(0), self.dark_rates.ravel()[order]),
             np.where(missing, np.int8(-1), self.colour.ravel()[order]),
             tuple(MaskedSpan(each.span, each.valid.ravel()[order]) for each in self.masks),
+            self.still,
         )
 
     def alike(self) -> list[BoolArray]:

@@ -31,7 +31,6 @@ from photonpano.geometry import corner_displacements, inverse
 from photonpano.reading import reading
 from photonpano.values import Decision, FloatArray, FluxImage, FrameSpan, Light
 
-LIGHT_DECISION = "light"  # what a record names the decision to divide by the gain of the light
 # Least root mean square of changes of the light, between instants that see the same places, that are divided out.
 LEAST_CHANGE = 0.03
 _LEAST_SIGMAS = 3.0  # least ratio of these changes to their noise
@@ -46,8 +45,8 @@ _SMALLEST = 0.01  # least root mean square of a flicker, relative to the light
 _DARKEST = 0.02  # least gain of spans from which slow changes are fitted
 LIGHT_FILE = "light.npz"
 _ARRAYS = ("gain", "waves", "maps", "to_map", "frequency", "std", "camera_matrix")  # the last one if there is one
-_SPANS, _FLAT_SPAN_PX = 128, 4.0  # most spans of frames that are compared; the image moves by no more than this in each
-_KNOTS = 12  # knots of the gain along the shorter side of a frame; between them, its logarithm is bilinear
+_FLAT_SPANS, _FLAT_SPAN_PX = 128, 4.0  # most spans of frames that are compared; the image moves by no more than this in each
+_KNOTS_ACROSS = 12  # knots of the gain along the shorter side of a frame; between them, its logarithm is bilinear
 _LENGTH = 0.5  # distance over which knots are correlated, relative to the shorter side of a frame
 _WIDEST = 1.0  # prior standard deviation of the logarithm of the gain
 # Rounds of least squares, in which noise and spread of the gain are measured. Outliers keep their weight: counts of few
@@ -55,7 +54,7 @@ _WIDEST = 1.0  # prior standard deviation of the logarithm of the gain
 _ROUNDS = 4
 # Standard deviation of the logarithm of the light before it is measured, and the least. A gain that falls along x and light
 # that changes as the image shifts look alike, so that the light changes by no more than the gain leaves over.
-_STEADY, _LEAST_CHANGE = 0.03, 1e-3
+_STEADY, _STEADIEST = 0.03, 1e-3
 _LEAST_KNOWN = 0.5  # least share of the prior variance of the gain that photons and motion must remove
 _NARROWEST = 1e-3  # least standard deviation of the prior
 
@@ -134,7 +133,7 @@ def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:
     if light.frequency:
         period = f"with a period of {1 / light.frequency:.4g} frames"
         where += f", {period}" if frame_rate_hz is None else f", at {light.frequency * frame_rate_hz:.2f} Hz"
-    return Decision(LIGHT_DECISION, round(depth, 3), where)
+    return Decision("light", round(depth, 3), where)
 
 
 def _gains(source: Source, trajectory: Trajectory, spans: list[FrameSpan], context: Context) -> Gains:
@@ -287,8 +286,8 @@ def measure_pixel_gain(source: Source, trajectory: Trajectory, context: Context)
         InputError: the motion cannot tell the gain from the scene.
     """
     n_frames, shape = source.info.n_frames, source.info.frame_shape
-    length = max(1, min(int(_FLAT_SPAN_PX / max(speed_px(source, trajectory), 1e-9)), n_frames // _SPANS))
-    starts = np.linspace(0, n_frames - length, min(_SPANS, n_frames // length)).astype(int).tolist()
+    length = max(1, min(int(_FLAT_SPAN_PX / max(speed_px(source, trajectory), 1e-9)), n_frames // _FLAT_SPANS))
+    starts = np.linspace(0, n_frames - length, min(_FLAT_SPANS, n_frames // length)).astype(int).tolist()
     spans = [FrameSpan(start, start + length) for start in starts]
     seen = seen_cells(source, trajectory, spans, context)
     knots = _Knots.of(shape)
@@ -320,7 +319,7 @@ class _Knots:
 
     @classmethod
     def of(cls, frame_shape: tuple[int, int]) -> _Knots:
-        side = min(frame_shape) / (_KNOTS - 1)
+        side = min(frame_shape) / (_KNOTS_ACROSS - 1)
         rows, columns = (round(length / side) + 1 for length in frame_shape)
         return cls(frame_shape, (rows, columns))
 
@@ -341,7 +340,7 @@ class _Knots:
         """Return the correlation of knots before anything is known of them, exp(-distance / length): (K, K)."""
         rows, columns = np.indices(self.shape).reshape(2, -1)
         distance = np.hypot(rows[:, None] - rows, columns[:, None] - columns)
-        return np.asarray(np.exp(-distance / (_LENGTH * (_KNOTS - 1))))
+        return np.asarray(np.exp(-distance / (_LENGTH * (_KNOTS_ACROSS - 1))))
 
     def image(self, mean: FloatArray, covariance: FloatArray, valid: Any) -> tuple[FloatArray, FloatArray]:
         """Return the logarithm of the gain, 0 on average over valid pixels, and its variance: (H, W) each."""
@@ -393,7 +392,7 @@ def _solved(seen: SeenCells, basis: Any, correlation: FloatArray) -> tuple[Float
         of_cells = (seen_step - mixed @ change) / of_cell
         unknowns, brightness = unknowns + change, brightness + of_cells
         known_times = n_times - precision * float(np.trace(np.linalg.inv(normal[light, light])))
-        light_std = max(float(np.sqrt((unknowns[light] ** 2).sum() / max(known_times, 1e-9))), _LEAST_CHANGE)
+        light_std = max(float(np.sqrt((unknowns[light] ** 2).sum() / max(known_times, 1e-9))), _STEADIEST)
         left = (step - columns @ change - of_cells[seen.cells]) * np.sqrt(weight)
         # Smoothed squares share photons: their residuals are small, and correlated.
         noise = max(float(np.sqrt(np.mean(left**2))) * SMOOTHING, 1e-9)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, uniform_filter, uniform_filter1d
 
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of, with_background
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.corrections.gains import least_weight, scene_canvas
 from photonpano.corrections.lighting import speed_px
@@ -28,7 +28,6 @@ from photonpano.reading import reading
 from photonpano.robust import cauchy_weights, robust_std
 from photonpano.values import CELL_PX, Background, BoolArray, Decision, FloatArray, FluxImage, FrameSpan, Homography
 
-MOVERS = "movers"  # name of the decision
 LAYERS_FILE = "layers.npz"
 _ARRAYS = ("instants", "shown", "filled")
 _INSTANTS = 400  # at which frames are compared with the background
@@ -56,10 +55,10 @@ _CHANGING, _FEWEST_SEEN, _TOGETHER, _STEADY, _MOST_CHANGING = 3.0, 8, 5, 0.6, 0.
 _SMOOTH = 5  # sums over which deviations are averaged where the background was never seen
 _LEAST_HIDDEN = 0.25  # share of the sums that are taken for the background there
 _SIZES = 1.6  # largest ratio of the size of a mover that is shown several times to the usual one, and its inverse
-_BORDER = 2.0  # largest square of the length of its cut by the border of a frame, in areas
+_CUT_BY_BORDER = 2.0  # largest square of the length of its cut by the border of a frame, in areas
 _APART = np.ones((13, 13), np.uint8)  # half cells around a mover that is shown several times, without others
 _BESIDE = np.ones((5, 5), np.uint8)  # half cells that a cell covers, and those beside it
-_BORDERS = np.ones((7, 7), np.uint8)  # that, and the half cells at the borders of frames, which others may not see
+_BESIDE_BORDERS = np.ones((7, 7), np.uint8)  # that, and the half cells at the borders of frames, which others may not see
 _MOVED, _LONGEST = 0.03, 8  # share of a mover that leaves its place while it is shown, and most instants, to either side
 
 
@@ -174,7 +173,8 @@ def decision_of(background: Background) -> Decision:
     hidden = 1 - background.shown.mean(axis=(1, 2))
     most = round(float(background.instants[int(np.argmax(hidden))]))
     reason = f"do not show the background, which moves as the camera does, most at frame {most} ({hidden.max():.0%})"
-    return Decision(MOVERS, round(float(hidden.mean()), 4), f"{hidden.mean():.1%} of the frames {reason}; they are left out")
+    share = background.hidden_share
+    return Decision("movers", round(share, 4), f"{share:.1%} of the frames {reason}; they are left out")
 
 
 def _seen(source: Source, trajectory: Trajectory, camera: Camera | None, span: FrameSpan, context: Context) -> _Seen | None:
@@ -337,7 +337,7 @@ def before_background_of(source: Source, folder: Path) -> Source:
     expected = len(instants), *(-(-side // CELL_PX) for side in shape)
     if not shown.shape == filled.shape == expected:
         raise InputError(f"{path} has cells of the shape {shown.shape}, not {expected} as the capture; run again")
-    return before(source, Background(instants, shown, filled, shape))
+    return with_background(source, Background(instants, shown, filled, shape))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -384,14 +384,14 @@ class _Scene:
         # A frame shows what both instants next to it show, so that no frame would be left of a single instant.
         reach = int(np.clip(_MOVED * (_LONGEST - 1) / max(stays[0] - stays[1], 1e-6), 1, _LONGEST))
         for each in range(max(instant - reach, 0), min(instant + reach + 1, len(hidden))):
-            image &= cv2.erode(self.painted(each, np.ones_like(cells)), _BORDERS).astype(np.uint8)
+            image &= cv2.erode(self.painted(each, np.ones_like(cells)), _BESIDE_BORDERS).astype(np.uint8)
         return reach, image
 
 
 def showing(
     source: Source, trajectory: Trajectory, camera: Camera | None, movers: Literal["hide", "show", "action"] | int
-) -> tuple[Source, list[Decision]]:
-    """Return a capture with what of its movers a panorama shows, and what there is to say of that.
+) -> tuple[Source, list[Decision], float]:
+    """Return a capture with the movers that a panorama shows, decisions on them, and the share whose background was never seen.
 
     Args:
         source: the capture, without what hides its background; as it is, if nothing does.
@@ -401,7 +401,7 @@ def showing(
     """
     background = capture_of(source).background
     if background is None:
-        return before(source, None), []
+        return with_background(source, None), [], 0.0
     motions = trajectory.at(background.instants)
     frames = scene_canvas(camera, motions, source.info.frame_shape, 2 / CELL_PX)
     margin = max(background.shown.shape[1:])  # half a frame, for lenses
@@ -414,7 +414,7 @@ def showing(
         said = f"the background of {share:.1%} of the panorama was never seen{instead}"
         decisions.append(Decision("background_never_seen", share, said))
     if movers == "show":
-        return before(source, None), decisions
+        return with_background(source, None), decisions, share
     hidden, moments = ~background.filled, list[tuple[int, BoolArray]]()
     if movers != "hide":
         nearest = 0 if movers == "action" else int(np.abs(background.instants - movers).argmin())
@@ -423,7 +423,7 @@ def showing(
     if movers != "hide":
         at = ", ".join(f"{background.instants[each]:.0f}" for each in times) or "none"
         decisions.append(Decision("shown_movers", len(times), f"what moves is shown as it was around frames: {at}"))
-    return before(source, shown), decisions
+    return with_background(source, shown), decisions, share
 
 
 def _whole_movers(hidden: BoolArray) -> list[tuple[int, BoolArray]]:
@@ -433,7 +433,7 @@ def _whole_movers(hidden: BoolArray) -> list[tuple[int, BoolArray]]:
         number, labels = cv2.connectedComponents(cells)
         for patch in (labels == label for label in range(1, number)):
             border = max(int(each.sum()) for each in (patch[0], patch[-1], patch[:, 0], patch[:, -1]))
-            if border**2 <= _BORDER * patch.sum():
+            if border**2 <= _CUT_BY_BORDER * patch.sum():
                 found.append((instant, patch))
     sizes = np.array([patch.sum() for _, patch in found], int)
     usual = np.median(sizes.repeat(sizes)) if found else 0  # of most of what is hidden

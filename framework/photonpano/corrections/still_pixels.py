@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from photonpano.contracts.protocols import Source
     from photonpano.corrections.geometry import Decide, Pixels
-from photonpano.values import BoolArray, FluxImage
+from photonpano.values import BoolArray, FluxImage, Still
 
 _SPANS, _SPAN_FRAMES = 32, 128  # 32 spans of at most 128 frames are summed all over the capture
 _THRESHOLD = 6.0  # smallest deviation of a hot or dead pixel from its neighbours, in robust standard deviations
@@ -55,11 +55,12 @@ class StillPixels(Correction):
             return pixels
         spans = capture.info.spread(_SPANS, n_frames)
         sums = np.stack([counts.ravel()[pixels.index].astype(np.uint8) for counts in capture.chunks(spans)])
-        found = find_still(sums, n_frames, pixels.valid & ~pixels.interpolated, pixels.alike())
-        n_masked, n_pixels = int((found.mask & pixels.valid).sum()), int(pixels.valid.sum())
-        decide("still_pixels", n_masked, f"{n_masked / max(n_pixels, 1):.2%} of {n_pixels} pixels {found.why}")
-        decide("standing_share", found.share, _SHARE_OF)
-        return pixels.without(found.mask)
+        mask, share, why = find_still(sums, n_frames, pixels.valid & ~pixels.interpolated, pixels.alike())
+        n_masked, n_pixels = int((mask & pixels.valid).sum()), int(pixels.valid.sum())
+        still = Still(share, f"{n_masked / max(n_pixels, 1):.2%} of {n_pixels} pixels {why}")
+        decide("still_pixels", n_masked, still.how)
+        decide("standing_share", share, _SHARE_OF)
+        return replace(pixels.without(mask), still=still)
 
 
 def without_still_pixels(source: Source, look: bool = True) -> Capture:
@@ -77,16 +78,9 @@ def without_still_pixels(source: Source, look: bool = True) -> Capture:
     return corrected_source(capture, corrections, look=look)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Still:
-    """What stands still in the frame."""
-
-    mask: BoolArray  # (H, W) bool, the pixels to mask
-    share: float  # share of the frame that stands still, of the parts that show motion or rest; 0 if none moves
-    why: str  # a clause on the masked pixels
-
-
-def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike: Sequence[BoolArray]) -> Still:
+def find_still(
+    sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike: Sequence[BoolArray]
+) -> tuple[BoolArray, float, str]:
     """Find what stands still while the rest of the frame moves, from (M, H, W) sums of binary frames at M times of a capture.
 
     A pixel that sees one thing all the time varies by photon noise only; a pixel that the scene moves past varies by its
@@ -96,6 +90,9 @@ def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike:
 
     Pixels of each mask in `alike` may be compared with each other, such as those of one colour. The parts are those that most
     of the pixels show.
+
+    Returns the (H, W) mask of the pixels to mask, the share of the frame that stands still, 0 if none moves, and a clause on
+    the masked pixels.
     """
     import cv2
 
@@ -106,15 +103,13 @@ def find_still(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray, alike:
     n_standing, n_moving = int(standing.sum()), int((moving & ~standing).sum())
     share = n_standing / max(n_standing + n_moving, 1)
     if moving.mean() < _LEAST_MOVING:
-        return Still(np.zeros_like(usable), 0.0, "are masked: nothing in the frame moves")
+        return np.zeros_like(usable), 0.0, "are masked: nothing in the frame moves"
     if share > _HALF:
         why = f"are masked: {share:.0%} of the frame stands still, so that it is open which part is the scene"
-        return Still(np.zeros_like(usable), share, why)
+        return np.zeros_like(usable), share, why
     side = 2 * (_SIDE_PX // 2 + 2) + 1  # a square that reaches over the edge of what stands shows motion
     mask = (single | (cv2.dilate(standing.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)) & usable
-    return Still(
-        mask, share, f"stand still in {len(sums) * n_frames} frames sampled all over the capture, while the rest moves"
-    )
+    return mask, share, f"stand still in {len(sums) * n_frames} frames sampled all over the capture, while the rest moves"
 
 
 def _single_pixels(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> BoolArray:

@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeVar
 from photonpano.execution import Executor, LocalExecutor
 from photonpano.execution.threads import batched, in_order
 from photonpano.notebooks import NotebookBars, in_notebook
+from photonpano.values import Journal
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
@@ -69,11 +70,14 @@ class Checkpoints(Protocol):
     run, and need not be repeated.
     """
 
-    def once(self, step: str, compute: Callable[[], ResultT], *given: Any) -> ResultT:
-        """Return the result of a step: the one that was kept, or else the one that `compute` returns, which is kept."""
+    def once(self, step: str, compute: Callable[[], ResultT], *given: Any, decisions: Journal | None = None) -> ResultT:
+        """Return the result of a step: the one that was kept, or else the one that `compute` returns, which is kept.
 
-    def log(self, step: str, *given: Any) -> Log:
-        """Open the results of a step that has many of them."""
+        What it adds to `decisions` is kept, too, and added again where the result is found.
+        """
+
+    def log(self, step: str, *given: Any, decisions: Journal | None = None) -> Log:
+        """Open the results of a step that has many of them; for `decisions`, see `once`."""
 
     def within(self, *given: Any) -> Checkpoints:
         """Return checkpoints whose results depend on more."""
@@ -94,14 +98,14 @@ class NoLog:
 class KeepNothing:
     """Checkpoints that are never kept."""
 
-    def once(self, step: str, compute: Callable[[], ResultT], *given: Any) -> ResultT:
+    def once(self, step: str, compute: Callable[[], ResultT], *given: Any, decisions: Journal | None = None) -> ResultT:
         """Compute the result."""
-        del step, given
+        del step, given, decisions
         return compute()
 
-    def log(self, step: str, *given: Any) -> Log:
+    def log(self, step: str, *given: Any, decisions: Journal | None = None) -> Log:
         """Open an empty log."""
-        del step, given
+        del step, given, decisions
         return NoLog()
 
     def within(self, *given: Any) -> KeepNothing:

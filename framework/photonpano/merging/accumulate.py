@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from photonpano.capture import Capture, before, capture_of
+from photonpano.capture import Capture, capture_of, with_background
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.execution.threads import InOrder
 from photonpano.geometry import BLOCK_FRAMES, Canvas, inverse, steps_px
@@ -443,7 +443,7 @@ def binning_of(source: Source) -> int:
 
 def binned_mean(source: Source, span: FrameSpan) -> FluxImage:
     """Return the mean count per frame of a span in binned pixels, (h, w); NaN where no pixel is valid."""
-    capture = before(source, None)
+    capture = with_background(source, None)
     if len(pieces := capture.pieces(span)) > 1:
         means = np.array([binned_mean(source, each) for each in pieces])
         frames = np.isfinite(means) * np.array([len(each) for each in pieces], np.float32)[:, None, None]

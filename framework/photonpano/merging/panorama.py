@@ -365,3 +365,4 @@ class RenderedPanorama:
     seconds: float  # time of rendering and writing
     std: FluxImage  # of the flux of a pixel, averaged down as the thumbnail
     dynamic_range: DynamicRange  # the range of flux, with what its noise depends on
+    never_seen_share: float = 0.0  # share whose background no frame showed

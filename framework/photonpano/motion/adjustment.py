@@ -33,7 +33,6 @@ MEDIAN_NORM = 0.958  # the median of the root mean square of eight Gaussian numb
 # Unknowns of a singular system are damped by this share of the system; a floor on numbers that are divided by.
 _DAMPING, _TINY = 1e-10, 1e-200
 SAMPLES = 64  # solutions drawn to estimate the expected error of each node, to a few per cent
-_DRAWN_ROWS = 8192  # equations that are drawn at a time
 # Error of the corners that all pairs have in common: interpolation bends them so that focal lengths of 4,464 px are 1 to 5 %
 # too small.
 _COMMON_PX = 0.003

@@ -14,12 +14,8 @@ from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Interpolator, Locator, Merger, Resampler, Source, Trajectory
 from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import Camera, corners, inverse, rescaled, scaled_ahead, transform_points
-from photonpano.text import listed
 from photonpano.values import BoolArray, Decision, DecisionValue, FloatArray, FrameSpan, Group, Located, VirtualExposure
 
-# Names of decisions in a record.
-CUT, DARK_FRAMES, DARK_JUMP, REPEATED = "cut", "dark_frames", "jump_in_the_dark", "repeated_frames"
-SHOTS, UNCUT_JUMP = "shots", "uncut_jump"
 # Frames of the shortest part of a group that is kept beside a cut.
 _SHORTEST_PART = 4
 _SAMPLED = 8  # instants of a group at which its motion is looked at
@@ -50,16 +46,6 @@ class Cut:
     def size_px(self) -> float:
         """Length of the shift, in px."""
         return float(np.linalg.norm(self.shift_px))
-
-    @property
-    def decision(self) -> Decision:
-        """What was found, for the record."""
-        jump = f"the image jumps by {self.size_px:.2g} px ({self.sigmas:.0f} standard deviations)"
-        if self.dark is not None:
-            reason = f"{jump} while they show nothing; the interpolation is cut in the middle, at frame {self.frame}"
-            return Decision(DARK_JUMP, str(self.dark), reason)
-        reason = f"{jump} from the frame before to this one, as where frames are missing or doubled"
-        return Decision(CUT, self.frame, f"{reason}; the interpolation is cut there")
 
     @property
     def bounds(self) -> tuple[int, ...]:
@@ -107,16 +93,9 @@ class Timeline:
         return max(self.shots, key=len, default=FrameSpan(0, len(self.taken)))
 
     @property
-    def decisions(self) -> list[Decision]:
-        """What is known of missing, repeated and dark frames, for the record."""
-        repeated = int(len(self.taken) - 1 - self.taken[-1])
-        found = [Decision(REPEATED, repeated, "copies of the frame before; the motion stands still there")]
-        dark = [
-            Decision(DARK_FRAMES, str(span), "no light reaches the sensor; these frames are left out") for span in self.dark
-        ]
-        apart = f"no motion ties them together; {self.shot} are located, since they are the most"
-        shots = [Decision(SHOTS, listed(map(str, self.shots)), apart)] if self.shots else []
-        return (found if repeated else []) + shots + dark + [cut.decision for cut in self.cuts]
+    def n_repeated(self) -> int:
+        """How many frames are copies of the one before."""
+        return int(len(self.taken) - 1 - self.taken[-1])
 
     def cut_at(self, cuts: Sequence[Cut]) -> Timeline:
         """Return this timeline with other cuts."""
@@ -237,7 +216,7 @@ class Recorder:
 
     def __init__(self, decisions: list[Decision] | None = None) -> None:
         """Take the list of a run that receives decisions; None in another process."""
-        self._decisions, self._waiting = decisions, list[Decision]()
+        self.decisions, self._waiting = decisions, list[Decision]()
 
     def __call__(self, what: str, value: DecisionValue, reason: str) -> None:
         """Record a decision; a `TypeError` if its value is no plain one."""
@@ -247,7 +226,7 @@ class Recorder:
 
     def add(self, decision: Decision) -> None:
         """Record a decision that was taken elsewhere."""
-        (self._waiting if self._decisions is None else self._decisions).append(decision)
+        (self._waiting if self.decisions is None else self.decisions).append(decision)
 
     def taken(self) -> tuple[Decision, ...]:
         """Return the decisions that another process has collected, once; in that of the run, there are none."""

@@ -116,8 +116,10 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
     if previous is not None:
         pairs = alike(pairs, previous.at(instants_of(groups)), shape)
     known = None if previous is None else previous.at(np.arange(exposures.source.info.n_frames))
-    given = groups, pairs, known, exposures.timeline, camera_of(exposures.source)
-    log = context.checkpoints.log(f"level-{level.number}", *given)
+    camera, decisions = camera_of(exposures.source), level.recorder.decisions
+    log = context.checkpoints.log(
+        f"level-{level.number}", groups, pairs, known, exposures.timeline, camera, decisions=decisions
+    )
     with thread_pool(context.threads) as pool:
         registrar = Registrar(exposures, log, context, start, excluded)
         title = f"level {level.number}: merge and locate"
@@ -137,7 +139,9 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
             edges = _checked_fallbacks(edges, level.locators[0].name, groups, shape, registrar.to_plane, model)
         if by_hand:
             starts = [_started(each, registrar.to_plane) for each in by_hand]
-            kept = context.checkpoints.log(f"level-{level.number}-ties", groups, [each.expected for each in starts])
+            kept = context.checkpoints.log(
+                f"level-{level.number}-ties", groups, [each.expected for each in starts], decisions=decisions
+            )
             registered = registrar.closures(starts, pool, kept)
             edges += tuple(each.checked(edge) for each, edge in zip(by_hand, registered, strict=True))
         if gyroscope is not None:
@@ -154,7 +158,9 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
             rivals = solution.compare()
             candidates = [pair for pair in closure_candidates(groups, solution, shape, graph) if pair not in excluded]
             between = [inverse(solution.homographies[fixed]) @ solution.homographies[moving] for moving, fixed in candidates]
-        revisits = context.checkpoints.log(f"level-{level.number}-revisits", groups, candidates, solution.homographies)
+        revisits = context.checkpoints.log(
+            f"level-{level.number}-revisits", groups, candidates, solution.homographies, decisions=decisions
+        )
         returning = [
             Pair(*pair, FrameHomography(motion), closure=True) for pair, motion in zip(candidates, between, strict=True)
         ]

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.contracts.attribution import blaming
-from photonpano.contracts.information import why_undetermined
-from photonpano.contracts.requirements import require_no_standstill
+from photonpano.contracts.requirements import require_no_standstill, why_undetermined
 from photonpano.execution.context import Context, Log
 from photonpano.execution.threads import Guard, Stopwatch, batched, in_order, lagging
 from photonpano.geometry import corners, inverse, rescaled, rescaling, transform_points, translation, why_implausible

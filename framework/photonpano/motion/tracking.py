@@ -27,7 +27,7 @@ SHORTEST = {"binary": 4, "intensity": 1}  # frames of the shortest span: sums of
 PEAK_PX = 1.5  # standard deviation of the peak of the phase correlation, in binned pixels
 DARK = 0.2  # sums, and frames, with less than this share of the usual light show nothing
 _SPANS = 16  # a window is divided into 16 spans: between two of them the image moves by a sixteenth of a group's motion blur
-_PEAK_PX = 1.0  # standard deviation of the peak of the phase correlation, in binned pixels
+_SUMMED_PEAK_PX = 1.0  # the same, where the correlations of several spans are summed
 # Least height of a peak, in standard deviations of the correlation: of noise alone, the highest of 8,000 values reaches 5.
 _SIGNIFICANT = 7.0
 _RIVAL = 0.6  # least height of the peak of a hypothesis, relative to the highest
@@ -284,7 +284,7 @@ def _refined(spectra: Spectrum, shape: tuple[int, ...], shifts: FloatArray) -> F
 
 def _surface(spectra: Spectrum, shape: tuple[int, ...]) -> FloatArray | None:
     """Return the phase correlation of successive images, in standard deviations of its noise."""
-    surface = correlation_surface((spectra[1:] * spectra[:-1].conj()).sum(axis=0), shape, _PEAK_PX)
+    surface = correlation_surface((spectra[1:] * spectra[:-1].conj()).sum(axis=0), shape, _SUMMED_PEAK_PX)
     # Robust, since a scene that repeats has many peaks.
     return None if surface is None else surface / max(robust_std(surface), 1e-12)
 

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from photonpano.capture import before
+from photonpano.capture import with_background
 from photonpano.geometry import corners, inverse, transform_points
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.level import UNCUT_JUMP
 from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
-from photonpano.residuals.causes import changing_places, distorting_lens
+from photonpano.residuals.causes import TestedRun, changing_places, distorting_lens
+from photonpano.residuals.findings import Doubt, Findings
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.tested_run import RIVAL, TestedRun
 from photonpano.residuals.verdict import MUCH, of_either_part, second_place_px
-from photonpano.values import Decision, FloatArray
+from photonpano.values import FloatArray
 
 _MISFIT = 1.5  # reduced chi-square from which the motion does not explain a block of the sensor
 _LEAST = 0.2  # least share of the frame that is not explained
@@ -25,16 +23,17 @@ _DIFFERENT_PX = 3.0  # least distance over a window and a half between two motio
 _KNOWN = 0.5  # least share of the windows of a capture in which the rival must show
 
 
-def beside_alternatives(state: State, explained: Explained, decisions: Sequence[Decision]) -> tuple[Explained, list[Decision]]:
+def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, Findings]:
     """Let the expected error of a motion contain the distance to others, where the frames do not tell which one is right.
 
     These are a motion that jumps where the image seems to, one that a lens does not bend, one along a second place of a scene
     that repeats, homographies that are likelier than the model of the spec, and that of parts of the frame which the motion
     does not explain. Where such a part is large and its motion is not found, the error is infinite: not known.
     """
-    run = TestedRun(explained, state.results, decisions)
+    findings = state.found()
+    run = TestedRun(explained, state.results, findings)
     n_frames, located = len(explained.motion.std_px), np.flatnonzero(explained.motion.located)
-    jumps_px = sum(float(each.value) for each in decisions if each.what == UNCUT_JUMP)
+    jumps_px = 0.0 if findings.uncut_jump is None else findings.uncut_jump.px
     last = state.results[-1]
     freer_px = last.located.rivals["homography"].apart_px if last.narrow else 0.0
     explained = _apart(explained, np.full(n_frames, np.linalg.norm([jumps_px, second_place_px(run), freer_px])))
@@ -42,7 +41,9 @@ def beside_alternatives(state: State, explained: Explained, decisions: Sequence[
         frames = np.linspace(located[0], located[-1], len(lens.bend_px))
         explained = _apart(explained, np.interp(np.arange(n_frames), frames, abs(lens.k1) * lens.bend_px))
     beside, rival = _beside_rival(state, explained)
-    return (beside if rival or not of_either_part(run) else _apart(beside, np.full(n_frames, np.inf))), rival
+    if rival is None and of_either_part(run):
+        beside = _apart(beside, np.full(n_frames, np.inf))
+    return beside, replace(findings, rival_motion=rival)
 
 
 def _apart(explained: Explained, distances_px: FloatArray) -> Explained:
@@ -50,20 +51,20 @@ def _apart(explained: Explained, distances_px: FloatArray) -> Explained:
     return replace(explained, motion=replace(explained.motion, std_px=std_px))
 
 
-def _beside_rival(state: State, explained: Explained) -> tuple[Explained, list[Decision]]:
+def _beside_rival(state: State, explained: Explained) -> tuple[Explained, Doubt | None]:
     """Look for a second motion in short spans of frames, where the motion does not explain parts of the frame.
 
     Nobody can know from the frames which motion is that of the scene. If much of the panorama changes, the motion of the spans
     counts, too, where these show a single one.
     """
     share = float((np.nan_to_num(explained.residuals.block_chi2) > _MISFIT).mean())
-    start = starting_motion(before(state.source, None), state.results[0].groups, state.context) if share > _LEAST else None
-    if start is None:
-        return explained, []
+    source = with_background(state.source, None)
+    if share <= _LEAST or (start := starting_motion(source, state.results[0].groups, state.context)) is None:
+        return explained, None
     known = np.isfinite(start.rivals).all(axis=1)
     shows = bool(known.mean() >= _KNOWN)
     if not shows and changing_places(explained.residuals)[0] <= MUCH:
-        return explained, []
+        return explained, None
     motion = explained.motion
     apart = np.stack([start.velocities, start.rivals]) - _velocities(motion, start.instants, start.reach)
     speeds = np.nan_to_num(np.linalg.norm(apart, axis=-1))
@@ -76,10 +77,11 @@ def _beside_rival(state: State, explained: Explained) -> tuple[Explained, list[D
     distances_px = np.linalg.norm(away, axis=1)
     explained = _apart(explained, distances_px)
     if not shows:
-        return explained, []
+        return explained, None
     mean_px = float(distances_px[motion.located].mean())
-    reason = f"px on average between both; {share:.0%} of the frame is not explained by the motion that was found"
-    return explained, [Decision(RIVAL, mean_px, reason)]
+    return explained, Doubt(
+        mean_px, f"px on average between both; {share:.0%} of the frame is not explained by the motion that was found"
+    )
 
 
 def _velocities(motion: FrameMotion, instants: FloatArray, frames: float) -> FloatArray:

@@ -30,7 +30,7 @@ from photonpano.plugins.contributions import (
 from photonpano.specs.builtin import check_stream
 from photonpano.specs.plan import Choice, Plan
 from photonpano.text import listed
-from photonpano.values import CaptureSummary, Decision, FrameSpan, Group
+from photonpano.values import CaptureSummary, FrameSpan, Group, Journal
 
 HALVED_LEVELS = 2  # with `scale: auto`, the first two levels are located at half size
 LARGE_FRAME_PX = 192  # minimum shorter side of frames located at half size: the pyramids of locators need pixels
@@ -70,8 +70,7 @@ def build_source(plan: Plan, look: bool = True) -> Capture:
                 _require_frames(plan, whole, f"corrections.{index}.mask.frames", each.frames)
         capture = _part(plan, whole)
     except InputError as error:
-        found = next((decision for decision in plan.decisions if decision.what == "source"), None)
-        if found is None:
+        if (found := plan.recognised) is None:
             raise
         # The spec says `auto`, so the message explains how this source was chosen.
         raise InputError(f"{error} (source {found.value}: {found.reason})") from error
@@ -107,7 +106,7 @@ def _require_frames(plan: Plan, capture: Capture, where: str, frames: tuple[int,
         raise SpecError([plan.place(where).problem(message)])
 
 
-def build_levels(plan: Plan, source: Source, decisions: list[Decision], shortened: int = 1) -> tuple[Level, ...]:
+def build_levels(plan: Plan, source: Source, decisions: Journal, shortened: int = 1) -> tuple[Level, ...]:
     """Build the components of all levels; those with the same config are shared. `decisions` receives their choices.
 
     Groups whose size is chosen from the capture are `shortened` that many times.
@@ -148,7 +147,7 @@ def build_levels(plan: Plan, source: Source, decisions: list[Decision], shortene
     )
 
 
-def build_pose_estimator(plan: Plan, source: Source, decisions: list[Decision]) -> PoseEstimator:
+def build_pose_estimator(plan: Plan, source: Source, decisions: Journal) -> PoseEstimator:
     """Build the pose estimator of a plan that has one; `decisions` receives its choices."""
     from photonpano.pipeline.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
@@ -184,9 +183,9 @@ def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]
     return foreseen
 
 
-def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> list[Decision]:
+def foreseen_decisions(plan: Plan, source: Source, capture: CaptureSummary) -> Journal:
     """Return the decisions of the first level's resampler, such as its group size, for a capture with this summary."""
-    decisions: list[Decision] = []
+    decisions: Journal = []
     context = stage_context(plan, source, Recorder(decisions), lambda: capture)
     resampler: Resampler = built(plan.levels[0].resample, context, "level 1")
     resampler.groups(source.info.n_frames, 1)

@@ -8,8 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from photonpano.capture import leaving_out
+from photonpano.capture import capture_of, leaving_out
 from photonpano.contracts.protocols import Source
+from photonpano.corrections.lighting import decision_of
 from photonpano.errors import InputError, LocationError
 from photonpano.execution.context import Context
 from photonpano.motion.diagnosis import UntiedError, tell_attempt
@@ -18,60 +19,69 @@ from photonpano.motion.level import Timeline
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
-from photonpano.pipeline.components import build_levels
-from photonpano.pipeline.obstacles import timeline_of
-from photonpano.pipeline.shots import ApartError, parts_of, shots_of
+from photonpano.pipeline.components import build_levels, foreseen_groups
+from photonpano.pipeline.obstacles import ApartError, parts_of, shots_of, timeline_of
 from photonpano.pipeline.state import State, model_of, within
+from photonpano.residuals.findings import Findings
 from photonpano.specs.plan import Plan
 from photonpano.text import listed
-from photonpano.values import Decision, FrameSpan
+from photonpano.values import Decision, FrameSpan, Journal
 
 _MOST_LENSES = 4  # times that the last level is run again, through the lens that it has found
 _SHORTENED = 2, 4  # how many times groups are shortened whose exposures are not located
-START = "start"  # name of the decision on the initial motion
 
 
-def estimate(plan: Plan, source: Source, journal: list[Decision], context: Context) -> State:
+def estimate(plan: Plan, source: Source, journal: Journal, context: Context) -> State:
     """Estimate the motion of a capture, and correct the lens, shading, flicker and cuts that its own frames show.
 
-    `journal` receives the decisions: first those of components, then those of passes that hold at the end. For errors, see
+    `journal` receives the decisions that hold at the end; if there is no motion, those of the last attempt. For errors, see
     `run`.
     """
     require_centre(plan, source)
-    timeline, started, before = timeline_of(source, context), plan.motion.start != "none", len(journal)
+    attempts: list[Journal] = [[]]
     try:
-        return _in_shots(timeline, plan, source, journal, context, started)
+        return _in_attempts(plan, source, attempts, context)
+    finally:
+        journal += attempts[-1]
+
+
+def _in_attempts(plan: Plan, source: Source, attempts: list[Journal], context: Context) -> State:
+    """Estimate the motion; where exposures are not located, from a constant velocity, or with shorter groups.
+
+    `attempts` receives the decisions of each attempt.
+    """
+    in_shots = partial(_in_shots, timeline_of(source, context), plan, source, attempts, context)
+    started = plan.motion.start != "none"
+    try:
+        return in_shots(started, 1)
     except LocationError as unlocated:
         error = unlocated
-    chosen = any(each.what == "group_size" for each in journal[before:])
     others: list[tuple[str, bool, int]] = []
     if not started and plan.motion.prior is None:
         others.append(("motion: {start: constant-velocity}", True, 1))
+    chosen = any(isinstance(each, str) for each in foreseen_groups(plan, source))
     if chosen and isinstance(error, UntiedError) and error.blurred:
         others += [(f"1/{times} of the group size", started, times) for times in _SHORTENED]
     for what, start, shortened in others:
-        del journal[before:]
         try:
-            return _in_shots(timeline, plan, source, journal, context, start, shortened)
+            return in_shots(start, shortened)
         except (LocationError, InputError) as failure:
             tell_attempt(error, what, failure)
     raise error
 
 
 def _in_shots(
-    timeline: Timeline, plan: Plan, source: Source, journal: list[Decision], context: Context, started: bool, shortened: int = 1
+    timeline: Timeline, plan: Plan, source: Source, attempts: list[Journal], context: Context, started: bool, shortened: int
 ) -> State:
     """Estimate the motion of a capture as one, or in shots if its exposures fall into such."""
-    before = len(journal)
     while True:
         try:
-            return _along(timeline, plan, source, journal, context, started, shortened)
+            return _along(timeline, plan, source, attempts, context, started, shortened)
         except ApartError as apart:
             shots = apart.shots
         except UntiedError as unlocated:
             if timeline.shots or not (shots := shots_of(source, unlocated.groups, unlocated.parts)):
                 raise
-        del journal[before:]
         starts = sorted({shot.start for shot in (*timeline.shots, *shots)})
         if len(starts) == len(timeline.shots):
             raise LocationError(
@@ -82,16 +92,21 @@ def _in_shots(
 
 
 def _along(
-    timeline: Timeline, plan: Plan, source: Source, journal: list[Decision], context: Context, started: bool, shortened: int
+    timeline: Timeline, plan: Plan, source: Source, attempts: list[Journal], context: Context, started: bool, shortened: int
 ) -> State:
     """Estimate the motion of the frames that a timeline shows, from a constant velocity if it is `started`."""
+    attempts.append([])
     source = replace(leaving_out(source, timeline.shown), copies=timeline.copies)
     if shortened > 1:
         context = within(context, shortened)
-    reference, levels = _reference_frame(plan, timeline.shot), build_levels(plan, source, journal, shortened)
-    start = _start(plan, source, reference, journal, context) if started else None
-    gyroscope = _gyroscope(plan, source, timeline, journal, context)
-    state = State(plan, source, context, reference, levels, timeline, model_of(plan), start, gyroscope, shortened)
+    reference, levels = _reference_frame(plan, timeline.shot), build_levels(plan, source, attempts[-1], shortened)
+    start, velocity = _start(plan, source, reference, context) if started else (None, None)
+    gyroscope, fitted = _gyroscope(plan, source, timeline, context)
+    findings = Findings(standing_share=capture_of(source).still.share, start=velocity, gyroscope=fitted)
+    attempts[-1] += findings.started
+    state = State(
+        plan, source, context, reference, levels, timeline, model_of(plan), start, gyroscope, shortened, findings=findings
+    )
     state = state.located(levels[:1], start)
     located = state.results[-1].located
     if not timeline.shots and (shots := shots_of(source, located.groups, parts_of(located))):
@@ -100,7 +115,7 @@ def _along(
         passes.through_found_lens,
         passes.without_shading,
         passes.in_changing_light,
-        partial(passes.later_levels, journal=journal),
+        passes.later_levels,
         *[passes.through_found_lens] * _MOST_LENSES,
         passes.again_without_movers,
         passes.cut_at_jumps,
@@ -109,11 +124,22 @@ def _along(
         if context.time_limit.leaves_out("further levels, corrections"):
             break
         state = passes.tried(state, each).state
-    journal += [*state.decisions, *state.timeline.decisions, *_model_decisions(plan, state.results)]
-    if gyroscope is not None:
-        located = state.results[-1].located
-        journal.append(gyroscope.agreement(located.edges, located.solution, float(np.median(located.std_px))))
+    attempts.append(_decisions(state))
     return state
+
+
+def _decisions(state: State) -> Journal:
+    """Return the decisions that hold for a motion."""
+    found, located, light = state.found(), state.results[-1].located, state.light
+    decisions = [*(state.levels[0].recorder.decisions or ()), *([] if state.vignette is None else [state.vignette.decision])]
+    if light is not None:
+        decisions.append(decision_of(light, state.source.info.frame_rate_hz))
+    if found.uncut_jump is not None:
+        decisions.append(Decision("uncut_jump", found.uncut_jump.px, found.uncut_jump.where))
+    decisions += [*found.of_frames, *_model_decisions(state.plan, state.results)]
+    if state.gyroscope is not None:
+        decisions.append(state.gyroscope.agreement(located.edges, located.solution, float(np.median(located.std_px))))
+    return decisions
 
 
 def require_centre(plan: Plan, source: Source) -> None:
@@ -137,7 +163,7 @@ def _reference_frame(plan: Plan, shot: FrameSpan) -> int:
     return frame if shot.start <= frame < shot.stop else middle
 
 
-def _start(plan: Plan, source: Source, reference: int, journal: list[Decision], context: Context) -> ConstantVelocity:
+def _start(plan: Plan, source: Source, reference: int, context: Context) -> tuple[ConstantVelocity, Decision]:
     """Find the constant velocity with which the first level starts; `InputError` or `LocationError` if there is none."""
     found = find_velocity(source, context)
     halves = " and ".join(f"{np.degrees(each.turn):.4g}" for each in found.halves)
@@ -147,19 +173,17 @@ def _start(plan: Plan, source: Source, reference: int, journal: list[Decision], 
     )
     if plan.motion.start == "none":
         reason += "; without it, pairs of exposures could not be located"
-    journal.append(Decision(START, found.text, reason))
-    return ConstantVelocity(found.velocity, reference)
+    return ConstantVelocity(found.velocity, reference), Decision("start", found.text, reason)
 
 
-def _gyroscope(plan: Plan, source: Source, timeline: Timeline, journal: list[Decision], context: Context) -> Gyroscope | None:
+def _gyroscope(
+    plan: Plan, source: Source, timeline: Timeline, context: Context
+) -> tuple[Gyroscope, Decision] | tuple[None, None]:
     """Fit the gyroscope of a spec to its capture; `InputError` or `LocationError` if it was not fixed to its camera."""
     if (prior := plan.motion.prior) is None:
-        return None
+        return None, None
     camera, noise = model_of(plan).camera(source.info.frame_shape), float(np.radians(prior.noise_deg_s_sqrt_hz))
-    given = prior.imu, camera, timeline, context, noise, prior.axes, prior.time_offset_s
-    gyroscope, decision = fit_rates(source, *given)
-    journal.append(decision)
-    return gyroscope
+    return fit_rates(source, prior.imu, camera, timeline, context, noise=noise, axes=prior.axes, offset_s=prior.time_offset_s)
 
 
 def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:

@@ -1,4 +1,7 @@
-"""The passes after the first level of the loop. A pass is accepted if the residuals of the photons do not grow."""
+"""The passes after the first level of the loop, and the refiners after the last one.
+
+A pass is accepted if the residuals of the photons do not grow.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,11 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from photonpano.capture import before, capture_of, in_light, leaving_out
+from photonpano.capture import capture_of, in_light, leaving_out, with_background
+from photonpano.contracts.attribution import label_of
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
 from photonpano.corrections.lighting import (
-    LIGHT_DECISION,
     corrected_light,
     decision_of,
     find_light,
@@ -23,20 +26,31 @@ from photonpano.corrections.lighting import (
 )
 from photonpano.corrections.movers import find_background, without_layers
 from photonpano.errors import CanvasTooLargeError, LocationError
-from photonpano.geometry import Camera, lenses_apart_px
+from photonpano.geometry import (
+    BLOCK_FRAMES,
+    Camera,
+    FrameTrajectory,
+    corner_displacements,
+    inverse,
+    lenses_apart_px,
+    likely_rotations,
+)
 from photonpano.motion.diagnosis import UntiedError
-from photonpano.motion.level import UNCUT_JUMP, Cut
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.level import Cut, Recorder
 from photonpano.motion.loop import TOO_NARROW, converges
 from photonpano.motion.models import SAME_LENS_PX
-from photonpano.pipeline.components import build_levels
-from photonpano.pipeline.shots import ApartError, shots_of
+from photonpano.motion.trajectories import REMAINING_SHARE
+from photonpano.pipeline.components import build_levels, built, stage_context
+from photonpano.pipeline.obstacles import ApartError, shots_of
 from photonpano.pipeline.state import State, within
 from photonpano.plugins.contributions import MergerContribution
 from photonpano.residuals.causes import changing_places
 from photonpano.residuals.cuts import SMALLEST_PX, find_cuts
-from photonpano.residuals.refinement import MotionFit
+from photonpano.residuals.findings import Doubt
+from photonpano.residuals.refinement import Explained, MotionFit, NamedRefiner, Refinement
 from photonpano.specs.plan import Plan
-from photonpano.values import Background, Decision, Light
+from photonpano.values import Background, FloatArray, Journal, Light, Refined
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +58,11 @@ _FAILED = 0.05  # share of the pairs that are not located beyond which the motio
 _SHOWING = 0.5  # share of the exposures that must show something when what hides the background is left out
 _CHANGING = 0.003  # share of the panorama that changes over time beyond which what moves is looked for again
 _EXPLAINED = 0.9  # changing light is accepted if it lowers the reduced chi-square of the photons to this fraction
+MAX_ROUNDS = 6  # maximum number of corrections by one refiner: a tremor blurs the panorama that residuals are taken against
+# A later correction that moves frames by less than this on average needs no new panorama: residuals change in proportion to it.
+_LINEAR_PX = 0.1
+_NOT_RELOCATED = "the motion of the last level along the refined one is not used"
+_BLURRED_PX = 1.0  # mean correction by which the exposures were blurred so that it pays to locate them again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +102,7 @@ def tried(state: State, propose: Pass) -> Trial:
     try:
         if (proposed := proposal.make()) is None:
             return Trial(state)
-        worse = "" if proposal.worse is None else proposal.worse(proposed.fit, state.fit)
+        worse = "" if proposal.worse is None else proposal.worse(proposed.fit(), state.fit())
     except (LocationError, CanvasTooLargeError) as error:
         if proposal.worse is None:
             raise
@@ -122,14 +141,13 @@ def without_shading(state: State) -> Proposal | None:
         return without_movers(state)
 
     def divided(by: Vignette) -> State:
-        corrected = state.corrected(divided_by(state.source, by), by, by.decision)
-        return tried(replace(corrected, vignette=by), without_movers).state
+        return tried(state.corrected(divided_by(state.source, by), by), without_movers).state
 
     def make() -> State:
         first = divided(found)
         if asked or (background := capture_of(first.source).background) is None:
             return first
-        again = vignette_of(plan, before(source, background), state.trajectory)
+        again = vignette_of(plan, with_background(source, background), state.trajectory)
         return first if again is None else divided(again)
 
     return Proposal(make, worse=None)
@@ -168,7 +186,7 @@ def in_changing_light(state: State) -> Proposal | None:
         return None
 
     def lit(light: Light) -> State:
-        return state.corrected(in_light(source, light), light, decision_of(light, source.info.frame_rate_hz))
+        return state.corrected(in_light(source, light), light)
 
     def make() -> State | None:
         first = lit(light).located(levels, state.trajectory)
@@ -176,7 +194,7 @@ def in_changing_light(state: State) -> Proposal | None:
         return None if again is None else lit(again).located(levels, first.trajectory)
 
     def settle(proposed: State) -> State:
-        found, residuals = light_of(proposed.source), proposed.fit.residuals
+        found, residuals = light_of(proposed.source), proposed.fit().residuals
         assert found is not None
         corrected = corrected_light(found, residuals.spans, *residuals.gains())
         return replace(lit(corrected), results=proposed.results, outdated=False)
@@ -194,7 +212,7 @@ def worse_in_light(proposed: MotionFit, before: MotionFit) -> str:
     return "" if proposed.reduced_chi2 < _EXPLAINED * before.reduced_chi2 else proposed.worse_than(before)
 
 
-def later_levels(state: State, journal: list[Decision]) -> Proposal:
+def later_levels(state: State) -> Proposal:
     """Run the levels that are left; a single one again, if the capture was corrected since.
 
     In light that flickers, group sizes that are chosen from the capture are chosen anew: whole periods of the light. What hides
@@ -202,8 +220,7 @@ def later_levels(state: State, journal: list[Decision]) -> Proposal:
     """
     levels, light = state.levels, light_of(state.source)
     if light is not None and light.frequency:
-        journal[:] = [each for each in journal if each.what != "group_size"]
-        levels = build_levels(state.plan, state.source, journal, state.shortened)
+        levels = build_levels(state.plan, state.source, state.findings.started, state.shortened)
     left = levels if state.outdated and len(levels) == 1 else levels[1:]
 
     def make() -> State:
@@ -223,7 +240,7 @@ def without_movers(state: State) -> Proposal | None:
     """Leave out what hides the background by the motion known so far: pairs that show both follow something in between."""
     if _uncertain(state):
         return None
-    last, source = state.results[-1], before(state.view.source, None)
+    last, source = state.results[-1], with_background(state.view.source, None)
     # The motion after a single level is as rough as that after the first of several.
     exact = len(state.levels) > 1 and last.level.number == state.levels[-1].number
     found = find_background(
@@ -243,10 +260,10 @@ def without_movers(state: State) -> Proposal | None:
 
 def without_what_changes(state: State) -> Proposal | None:
     """Leave out what hides the background by the refined motion, too, if parts of the panorama change over time."""
-    share, _ = changing_places(state.fit.residuals)
+    share, _ = changing_places(state.fit().residuals)
     if share < _CHANGING or _uncertain(state):
         return None
-    source, known = before(state.view.source, None), capture_of(state.source).background
+    source, known = with_background(state.view.source, None), capture_of(state.source).background
     found = find_background(source, state.motion.trajectory, state.motion.camera, state.motion.span, state.context, exact=True)
     if found is None:
         return None
@@ -255,7 +272,7 @@ def without_what_changes(state: State) -> Proposal | None:
 
 
 def _with_background(state: State, found: Background) -> State:
-    return replace(state, source=before(state.source, found), context=within(state.context, found), outdated=True)
+    return replace(state, source=with_background(state.source, found), context=within(state.context, found), outdated=True)
 
 
 def _uncertain(state: State) -> bool:
@@ -280,7 +297,7 @@ def _in_lamps(state: State) -> State:
     found = measure_light(_in_steady_light(state.view.source), state.trajectory, state.context)
     if not found.has_lamps:
         return state
-    return state.corrected(in_light(state.source, found), found, decision_of(found, state.source.info.frame_rate_hz))
+    return state.corrected(in_light(state.source, found), found)
 
 
 def cut_at_jumps(state: State) -> Proposal | None:
@@ -289,13 +306,13 @@ def cut_at_jumps(state: State) -> Proposal | None:
     Where the pieces then meet to less than 1 px, there was no jump. Raise `ApartError` where no pair ties them together.
     """
     # Where a motion is wrong, much looks as if it moved by itself: what is left of the photons may not show the jump.
-    every = state if capture_of(state.source).background is None else replace(state, source=before(state.source, None))
-    cuts = find_cuts(every.source, every.fit, state.context)
+    every = state if capture_of(state.source).background is None else replace(state, source=with_background(state.source, None))
+    cuts = find_cuts(every.source, every.fit(), state.context)
     if not cuts:
         return None
 
     def make(cuts: Sequence[Cut] = cuts) -> State | None:
-        levels = build_levels(state.plan, state.source, [], state.shortened)
+        levels = build_levels(state.plan, state.source, state.findings.started, state.shortened)
         try:
             cut = _located_anew(replace(state, timeline=state.timeline.cut_at(cuts), levels=levels))
         except UntiedError as error:
@@ -315,8 +332,8 @@ def cut_at_jumps(state: State) -> Proposal | None:
 
     def refused(state: State) -> State:
         largest = max(cuts, key=lambda each: each.size_px)
-        found = Decision(UNCUT_JUMP, largest.size_px, f"px before frame {largest.frame}; cut there, the motion explains less")
-        return replace(state, decisions=(*state.decisions, found))
+        found = Doubt(largest.size_px, f"px before frame {largest.frame}; cut there, the motion explains less")
+        return replace(state, findings=replace(state.findings, uncut_jump=found))
 
     worse = (lambda *_: "") if dark else MotionFit.worse_than
     return Proposal(make, worse, refused=refused, rejection=rejection, severity=logging.WARNING)
@@ -324,14 +341,12 @@ def cut_at_jumps(state: State) -> Proposal | None:
 
 def _located_anew(state: State) -> State:
     """Locate all levels; light, and what hides the background, are found anew, since that was done along another motion."""
-    decisions = tuple(each for each in state.decisions if each.what != LIGHT_DECISION)
-    changing = len(decisions) < len(state.decisions)
-    if capture_of(state.source).background is None and not changing:
+    if capture_of(state.source).background is None and state.light is None:
         return state.located(state.levels, state.start)
-    anew = replace(state, source=before(_in_steady_light(state.source), None), decisions=decisions, watched=False)
+    anew = replace(state, source=with_background(_in_steady_light(state.source), None), light=None, watched=False)
     anew = anew.located(state.levels[:1], state.start)
-    light = [in_changing_light] if changing else []
-    again: tuple[Pass, ...] = (without_movers, *light, partial(later_levels, journal=[]), again_without_movers)
+    light = [] if state.light is None else [in_changing_light]
+    again: tuple[Pass, ...] = (without_movers, *light, later_levels, again_without_movers)
     for each in again:
         anew = tried(anew, each).state
     return anew
@@ -341,3 +356,83 @@ def _in_steady_light(source: Source) -> Source:
     """Return a capture as if its light were steady; frames that were left out stay so."""
     light = light_of(source)
     return source if light is None else leaving_out(replace(capture_of(source), light=None), light.shown)
+
+
+def build_refiners(plan: Plan, source: Source, decisions: Journal) -> tuple[NamedRefiner, ...]:
+    """Build the refiners of a plan, in order; `decisions` receives their choices."""
+    context = stage_context(plan, source, Recorder(decisions))
+    return tuple(NamedRefiner(choice.contribution.name, built(choice, context, "the refinement")) for choice in plan.refine)
+
+
+def refine(state: State, refiners: Sequence[NamedRefiner], decisions: Journal | None = None) -> tuple[State, Explained]:
+    """Correct the motion by refiners, each until it finds nothing, and measure what is left. For errors, see `run`.
+
+    `decisions` receives those of the refiners.
+
+    Where the first correction moves frames by more than a pixel, that motion had blurred the exposures of the last level, which
+    then runs again along the corrected motion.
+    """
+    refinements = []
+    for place, refiner in enumerate(refiners):
+        before, rounds, kept_out = state.motion, list[str](), ""
+        while len(rounds) < MAX_ROUNDS and not state.context.time_limit.leaves_out("refinements"):
+            each = partial(_corrected, refiner=refiner, place=place, number=len(rounds) + 1, decisions=decisions)
+            state, accepted, summary, worse = tried(state, each)
+            if not accepted:
+                kept_out = " ".join(worse.split())
+                break
+            rounds.append(summary)
+            state.context.progress.note(f"{refiner.name}: {summary}")
+            if len(rounds) == 1 and _change_px(before, state.motion) > _BLURRED_PX:
+                state = tried(state, lambda known: Proposal(known.relocated, rejection=_NOT_RELOCATED)).state
+        refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(before, state.motion), kept_out))
+    state = tried(state, without_what_changes).state
+    return state, state.fit().explained(refinements)
+
+
+def _corrected(state: State, refiner: NamedRefiner, place: int, number: int, decisions: Journal | None) -> Proposal | None:
+    """Propose the motion that a refiner finds at a round, from 1; `place` is its own among those of the run."""
+    once, known = state.view.context.checkpoints.once, state.motion
+    refined = partial(_refined, refiner, state)
+    found = once("refined", refined, place, number, known.homographies, known.noise_px, decisions=decisions)
+    if found is None:
+        return None
+    remaining_px = REMAINING_SHARE * _moved_px(state.motion, found.homographies)
+    std_px = np.hypot(found.std_px, remaining_px)
+    trajectory, homographies = FrameTrajectory(found.homographies), found.homographies
+    motion = replace(state.motion, trajectory=trajectory, homographies=homographies, std_px=std_px, remaining_px=remaining_px)
+    if number > 1 and _change_px(state.motion, motion) < _LINEAR_PX:
+        return Proposal(
+            lambda: replace(state, refined=motion, known_fit=state.fit().moved(motion)), None, summary=found.summary
+        )
+    rejection = f"a correction of {label_of(refiner.component)} is not used"
+    return Proposal(lambda: replace(state, refined=motion, known_fit=None), rejection=rejection, summary=found.summary)
+
+
+def _refined(refiner: NamedRefiner, state: State) -> Refined | None:
+    """Call a refiner, and make the homography of the reference frame the identity."""
+    motion, fit = state.motion, state.fit()
+    source, residuals = state.view.source, fit.residuals.steps()
+    found = refiner.component.refine(source, motion.trajectory, motion.noise_px, residuals, fit.predictions)
+    if found is None:
+        return None
+    homographies = inverse(found.homographies[motion.reference]) @ found.homographies
+    if (rotations := motion.rotations) is not None and (camera := motion.camera) is not None:
+        # Each correction is a small step of its frame, whose homography may be far from any of a plane.
+        steps = likely_rotations(camera, inverse(motion.homographies) @ found.homographies, motion.frame_shape)
+        turned = rotations @ steps
+        return replace(found, homographies=camera.homographies(turned[motion.reference].T @ turned))
+    homographies /= homographies[:, 2:, 2:].copy()
+    return replace(found, homographies=homographies)
+
+
+def _change_px(before: FrameMotion, after: FrameMotion) -> float:
+    """Return the mean displacement of the corners of the located frames."""
+    return float(_moved_px(before, after.homographies)[before.located].mean())
+
+
+def _moved_px(before: FrameMotion, after: FloatArray) -> FloatArray:
+    """Return the displacement of the corners of each frame, (T,), to other homographies, (T, 3, 3)."""
+    blocks = [slice(start, start + BLOCK_FRAMES) for start in range(0, len(after), BLOCK_FRAMES)]
+    steps = (inverse(before.homographies[block]) @ after[block] for block in blocks)
+    return np.concatenate([corner_displacements(step, np.eye(3), before.frame_shape).mean(axis=-1) for step in steps])

@@ -1,48 +1,28 @@
-"""A run with `pose`: find the pose of every frame, write the files, describe the poses for `run.json`, and judge them."""
+"""The poses of a run with `pose`: estimate them, write their files, describe them for `run.json`, and judge them."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from photonpano.contracts.protocols import Source
 from photonpano.errors import OutputError
+from photonpano.execution.context import Progress
 from photonpano.geometry import Camera, positions_of
 from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_pose_estimator
 from photonpano.pipeline.estimate import require_centre
-from photonpano.pipeline.obstacles import naming_obstacles
-from photonpano.pipeline.run_steps import BegunRun
 from photonpano.record.picture_files import png_of
 from photonpano.record.poses import Poses, colmap, in_standard_world, nerfstudio, ply, tum
-from photonpano.record.run_json import verdict_record
-from photonpano.record.schema import PosesRecord, RunRecord
-from photonpano.report import render_pose_report
+from photonpano.record.schema import PosesRecord
 from photonpano.specs.plan import Plan
-from photonpano.values import CameraGuess, FloatArray, FluxImage, PoseEstimate, StreamInfo, Verdict
+from photonpano.values import CameraGuess, FloatArray, FluxImage, Journal, PoseEstimate, StreamInfo, Verdict
 from photonpano.values.verdict import Found, Test, judged
 
 _WHITE_QUANTILE = 0.995  # quantile of the flux of an exposure that is white in its picture
 _SHOWN_LOST = 3  # spans of lost frames that a warning names
-
-
-def find_poses(run: BegunRun) -> None:
-    """Estimate the poses, write their files, and end the run."""
-    plan, source, start = run.plan, run.source, time.perf_counter()
-    with naming_obstacles(source, run.journal):
-        estimate = _estimated(run)
-    run.observers.stage_finished(None, "pose", time.perf_counter() - start, counts_of(estimate))
-    files = write_pose_files(run.folder.staging, estimate, source.info, plan.output.exposures)
-    verdict = judge_poses(estimate)
-    record: RunRecord = {
-        **run.started_record(),
-        "poses": poses_record(estimate, verdict),
-        "verdict": verdict_record(verdict),
-        "warnings": [*poses_warnings(estimate), *files],
-    }
-    run.end(record, lambda record: render_pose_report(record, estimate), verdict)
 
 
 def camera_guess(plan: Plan) -> CameraGuess:
@@ -52,13 +32,11 @@ def camera_guess(plan: Plan) -> CameraGuess:
     return CameraGuess(None if camera.focal_px == "find" else camera.focal_px, camera.centre_px, (k1, k2, p1, p2))
 
 
-def _estimated(run: BegunRun) -> PoseEstimate:
-    """Return the poses, checked, in a world in which the path has the length 1."""
-    plan, source = run.plan, run.source
-    assert plan.pose is not None
+def estimate_poses(plan: Plan, source: Source, journal: Journal, progress: Progress) -> PoseEstimate:
+    """Return the poses, checked, in a world in which the path has the length 1; `journal` receives decisions."""
     require_centre(plan, source)
-    estimator = build_pose_estimator(plan, source, run.journal)
-    return in_standard_world(estimator.estimate(source, camera_guess(plan), run.progress))
+    estimator = build_pose_estimator(plan, source, journal)
+    return in_standard_world(estimator.estimate(source, camera_guess(plan), progress))
 
 
 def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:

@@ -37,20 +37,20 @@ from photonpano.pipeline.run_folder import RunFolder
 from photonpano.plugins.contributions import ExporterContribution, RendererContribution
 from photonpano.record.contents import MAPS
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, FrameSpan, Homography, Panorama, PanoramaRows
+from photonpano.values import FrameSpan, Homography, Journal, Panorama, PanoramaRows
 
 logger = logging.getLogger(__name__)
 
 
 def render_into(
     folder: RunFolder, plan: Plan, source: Source, vignette: Vignette | None, motion: FrameMotion, context: Context
-) -> tuple[RenderedPanorama, list[Decision]]:
+) -> tuple[RenderedPanorama, Journal]:
     """Render the panorama, and write it, its motion, and what its capture was divided by. For errors, see `run`.
 
     `source` is divided by the vignette and in its light. Returns the panorama, and the decisions of renderer and exporters.
     """
     background = capture_of(source).background
-    source, decisions = showing(source, motion.trajectory, motion.camera, plan.render.movers)
+    source, decisions, never_seen_share = showing(source, motion.trajectory, motion.camera, plan.render.movers)
     renderer = build_renderer(plan, source, decisions, context.in_order)
     exporters = build_exporters(plan, source, decisions)
     with naming_key_of_canvas(plan):
@@ -66,7 +66,7 @@ def render_into(
             write_light(folder.staging, light)
         if background is not None:
             write_background(folder.staging, background)
-    return panorama, decisions
+    return replace(panorama, never_seen_share=never_seen_share), decisions
 
 
 def _rendered(
@@ -157,7 +157,7 @@ class ChosenRenderer:
                 raise BrokenContract("no pixel has a positive weight")
 
 
-def build_renderer(plan: Plan, source: Source, decisions: list[Decision], in_order: InOrder | None = None) -> ChosenRenderer:
+def build_renderer(plan: Plan, source: Source, decisions: Journal, in_order: InOrder | None = None) -> ChosenRenderer:
     """Build the renderer of a plan; `decisions` receives its choices. Without `in_order`, threads share the work."""
     choice, contribution = plan.renderer, plan.renderer.contribution
     context = stage_context(plan, source, Recorder(decisions))
@@ -239,7 +239,7 @@ class AttributedExporter:
             require_files({each.name for each in folder.iterdir()} - before, path)
 
 
-def build_exporters(plan: Plan, source: Source, decisions: list[Decision]) -> tuple[AttributedExporter, ...]:
+def build_exporters(plan: Plan, source: Source, decisions: Journal) -> tuple[AttributedExporter, ...]:
     """Build the exporters of a plan, in order; `decisions` receives their choices."""
     context = stage_context(plan, source, Recorder(decisions))
     exporters = []

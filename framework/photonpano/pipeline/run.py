@@ -2,38 +2,53 @@
 
 from __future__ import annotations
 
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 from photonpano.capture import capture_of
-from photonpano.contracts.protocols import light_of
+from photonpano.compiling import notify_on_first_compile
+from photonpano.contracts.protocols import Source, light_of
 from photonpano.corrections.movers import decision_of
-from photonpano.errors import InputError
-from photonpano.execution.context import Progress, Quiet, usual
+from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError, PhotonpanoError, PluginError
+from photonpano.execution.context import Context, Progress, Quiet, TimeLimit, usual
+from photonpano.execution.threads import one_thread_inside
+from photonpano.files.folders import atomic_path
+from photonpano.motion.loop import LevelResult
 from photonpano.pipeline.alternatives import beside_alternatives
-from photonpano.pipeline.checkpoints.work_folder import Continuation
+from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, finished_run, run_fingerprint, work_folder
+from photonpano.pipeline.components import open_source
 from photonpano.pipeline.estimate import estimate
 from photonpano.pipeline.executors import executor_of
 from photonpano.pipeline.follow import followed
-from photonpano.pipeline.obstacles import naming_obstacles
-from photonpano.pipeline.pose_run import find_poses
-from photonpano.pipeline.refiners import build_refiners, refine
+from photonpano.pipeline.observers import Observers
+from photonpano.pipeline.obstacles import naming_obstacles, order_warning, run_others
+from photonpano.pipeline.passes import build_refiners, refine
+from photonpano.pipeline.pose_run import counts_of, estimate_poses, judge_poses, poses_record, poses_warnings, write_pose_files
 from photonpano.pipeline.rendering import render_into
-from photonpano.pipeline.run_folder import write_exposures
-from photonpano.pipeline.run_steps import BegunRun, begun_run
-from photonpano.pipeline.shots import run_others
-from photonpano.record.run_json import record_of
-from photonpano.record.run_warnings import TIME_LIMIT
-from photonpano.record.schema import RunRecord
-from photonpano.report import OpenCapture, render_report
+from photonpano.pipeline.run_folder import RunFolder, run_folder, write_exposures
+from photonpano.pipeline.state import State
+from photonpano.pipeline.summary import require_photons
+from photonpano.record.contents import capture_files, fingerprint
+from photonpano.record.run_json import level_record, peak_memory_bytes, record_of, started_record, verdict_of, verdict_record
+from photonpano.record.schema import CaptureRecord, RunRecord
+from photonpano.report import OpenCapture, render_failure, render_pose_report, render_report
 from photonpano.report.notebook import ShownReport, run_html
+from photonpano.residuals.findings import Findings
 from photonpano.residuals.verdict import judge
 from photonpano.specs.plan import Plan
 from photonpano.text import listed
-from photonpano.values import Decision, Verdict
+from photonpano.values import Decision, Journal, Verdict
 
 END_AFTER_S = 5.0  # default time without a new frame after which a followed capture is complete
+logger = logging.getLogger(__name__)
+
+COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +113,8 @@ def run(
 
     Raises:
         InputError: the capture cannot be used or followed, shows nothing, or does not suit the plan.
-        LocationError: the motion could not be estimated; `report` is a page with the exposures that did not match, beside the
-            run folder. So it is for the next two.
+        LocationError: the motion could not be estimated. `report` of this error and of the next two is a page beside the run
+            folder, with the exposures that did not match.
         CanvasTooLargeError: the panorama would exceed the memory of the spec.
         PluginError: a component failed in its own way, or broke its contract.
         OutputError: the run folder cannot be written, or another process writes it; it is as it was.
@@ -110,17 +125,12 @@ def run(
         so_far = partial(run, progress=Quiet(), overwrite=True)
         with followed(plan, so_far, usual(progress), overwrite=overwrite, end_after=end_after) as complete:
             return run(complete, progress, overwrite=overwrite, keep_work=keep_work)
-    result = _run_one(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite)
-    again = partial(run, progress=progress, overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work)
-    return replace(result, others=tuple(run_others(plan, result.record, again, usual(progress))))
-
-
-def _run_one(plan: Plan, progress: Progress, how: Continuation, overwrite: bool) -> RunResult:
-    """Run a plan, of whose shots the longest is located."""
-    with begun_run(plan, progress, how, overwrite=overwrite) as begun:
+    with begun_run(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite=overwrite) as begun:
         if not begun.was_finished:
             (make_panorama if plan.pose is None else find_poses)(begun)
-        return RunResult(plan.output.directory, begun.record, begun.verdict, begun.was_finished)
+    result = RunResult(plan.output.directory, begun.record, begun.verdict, begun.was_finished)
+    again = partial(run, progress=progress, overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work)
+    return replace(result, others=tuple(run_others(plan, result.record, again, usual(progress))))
 
 
 def make_panorama(run: BegunRun) -> None:
@@ -128,22 +138,198 @@ def make_panorama(run: BegunRun) -> None:
     plan, folder, journal = run.plan, run.folder, run.journal
     with executor_of(plan, run.source) as executor:
         context = replace(run.context, threads=executor.under_way, executor=executor)
-        with naming_obstacles(run.source, journal):
+        with naming_obstacles(run.source):
             state = estimate(plan, run.source, journal, context)
-        state, explained = refine(state, build_refiners(plan, state.view.source, journal))
-        if left_out := context.time_limit.left_out:
-            journal.append(Decision(TIME_LIMIT, listed(left_out), f"left out, since {plan.run.time_limit:g} s were over"))
-        if (background := capture_of(state.source).background) is not None:
-            journal.append(decision_of(background))
-        explained, others = beside_alternatives(state, explained, journal)
-        journal += others
+        state, explained = refine(state, build_refiners(plan, state.view.source, journal), journal)
+        explained, findings = beside_alternatives(state, explained)
+        journal += _last_decisions(state, findings)
         source, context = state.view
         panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context)
-        verdict = judge(explained, state.results, [*journal, *chosen])
+        findings = replace(findings, never_seen_share=panorama.never_seen_share)
+        verdict = judge(explained, state.results, findings)
         run.observers.rendered(panorama.canvas, panorama.seconds)
         if plan.output.keep == "exposures":
             with folder.writing():
                 write_exposures(folder.staging, state.results, panorama.white_flux, context)
-    record = record_of(run.started_record(), plan, state.results, explained, verdict, panorama, chosen)
+    record = record_of(run.started_record(), plan, state.results, explained, verdict, panorama, chosen, findings)
     light, capture = light_of(source), OpenCapture(source, state.results)
     run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)
+
+
+def find_poses(run: BegunRun) -> None:
+    """Estimate the poses, write their files, and end the run."""
+    plan, source, start = run.plan, run.source, time.perf_counter()
+    with naming_obstacles(source):
+        found = estimate_poses(plan, source, run.journal, run.progress)
+    run.observers.stage_finished(None, "pose", time.perf_counter() - start, counts_of(found))
+    files = write_pose_files(run.folder.staging, found, source.info, plan.output.exposures)
+    verdict = judge_poses(found)
+    record: RunRecord = {
+        **run.started_record(),
+        "poses": poses_record(found, verdict),
+        "verdict": verdict_record(verdict),
+        "warnings": [*poses_warnings(found), *files],
+    }
+    run.end(record, lambda record: render_pose_report(record, found), verdict)
+
+
+def _last_decisions(state: State, findings: Findings) -> Iterator[Decision]:
+    """Yield the decisions on what is left out, and on a rival motion."""
+    if findings.left_out:
+        over = f"left out, since {state.plan.run.time_limit:g} s were over"
+        yield Decision("time_limit", listed(findings.left_out), over)
+    if (background := capture_of(state.source).background) is not None:
+        yield decision_of(background)
+    if (rival := findings.rival_motion) is not None:
+        yield Decision("rival_motion", rival.px, rival.where)
+
+
+@dataclass(eq=False)
+class BegunRun:
+    """A run that has begun."""
+
+    plan: Plan
+    source: Source
+    folder: RunFolder
+    observers: Observers
+    progress: Progress
+    start: float  # when the capture was open, in seconds of `time.perf_counter`
+    journal: Journal = field(default_factory=list)  # the decisions so far, in the order in which they were taken
+    # the levels so far; one that was located again is there more than once
+    levels: list[LevelResult] = field(default_factory=list)
+    work: Work | None = None
+    was_finished: bool = False  # whether the run was finished before, so that nothing is left to do
+    record: RunRecord = field(init=False)  # of the finished run
+    verdict: Verdict | None = None  # whether the results explain the photons
+
+    @cached_property
+    def capture(self) -> CaptureRecord:
+        """The fingerprint of the capture."""
+        return fingerprint(self.plan, self.source)
+
+    @property
+    def context(self) -> Context:
+        """How the run computes: with its progress, its checkpoints, and observers of levels."""
+
+        def on_level(result: LevelResult) -> None:
+            self.levels.append(result)
+            self.observers.level_finished(result)
+
+        limit = TimeLimit(self.start + (self.plan.run.time_limit or math.inf))
+        context = Context(progress=self.progress, on_level=on_level, time_limit=limit)
+        return context if self.work is None else replace(context, checkpoints=self.work.checkpoints)
+
+    def started_record(self) -> RunRecord:
+        """Return the record of the run, without its results."""
+        return started_record(self.plan, self.source.info, self.journal, time.perf_counter() - self.start, self.capture)
+
+    def end(self, record: RunRecord, draw: Callable[[RunRecord], str], verdict: Verdict | None = None) -> None:
+        """Put the files of the run into its folder, and then the report that `draw` makes of the record."""
+        record = self.folder.commit(record)
+        if self.work is not None:
+            self.work.finish()
+        self.record, self.verdict = _with_report(self.folder, record, draw), verdict
+
+
+@contextmanager
+def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: bool) -> Iterator[BegunRun]:
+    """Begin a run: tell the observers, open the capture, lock the run folder, and go on with what was kept.
+
+    The block ends the run, unless it was finished before. If the block fails, a report of that lies beside the run folder,
+    which stays as it was.
+    """
+    if plan.pose is not None and (how.keep or how.from_level is not None):
+        raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")
+    observers, read = Observers(plan.observers, plan.output.directory), [*capture_files(plan), *filter(None, [plan.file])]
+    with (
+        observers.watching(plan.document) as finished,
+        notify_on_first_compile(partial(progress.note, COMPILING)),
+        open_source(plan) as source,
+        run_folder(plan.output.directory, overwrite=overwrite, inputs=read) as folder,
+        one_thread_inside(),
+    ):
+        run = BegunRun(plan, source, folder, observers, progress, time.perf_counter())
+        _require_photons(plan, source)
+        if how.resume and (done := finished_run(plan, run.capture)) is not None:
+            run.record, run.was_finished = done, True
+            run.verdict = None if done["verdict"] is None else verdict_of(done["verdict"])
+            yield run
+        else:
+            if warning := order_warning(source):
+                logger.warning(warning)
+            run.journal += [*filter(None, [plan.recognised]), *source.decisions]
+            with _work(run, how) as run.work, _reporting_failure(run):
+                yield run
+        finished(run.record)
+
+
+def failure_path(directory: Path) -> Path:
+    """Return where the report of a failed run lies: `runs/scan.failed.html` for `runs/scan`."""
+    return directory.with_name(f"{directory.name}.failed.html")
+
+
+def _work(run: BegunRun, how: Continuation) -> AbstractContextManager[Work | None]:
+    """Open the work folder of a run; poses are found in one step, of which nothing is kept."""
+    plan = run.plan
+    if plan.pose is not None:
+        if how.resume:
+            run.progress.note("a run with `pose` keeps no work: it begins anew")
+        return nullcontext()
+    depends_on = run_fingerprint(plan, run.capture, run.source.info.frame_shape)
+    return work_folder(plan.output.directory, depends_on, how, run.progress)
+
+
+@contextmanager
+def _reporting_failure(run: BegunRun) -> Iterator[None]:
+    """Write a report if the block raises; its path is the `report` of the error. That of the run before is removed first."""
+    path = failure_path(run.folder.directory)
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        logger.debug("the report of an earlier failure could not be removed: %s", error)
+    try:
+        yield
+    except (LocationError, CanvasTooLargeError, PluginError) as error:
+        levels = {result.level.number: level_record(result) for result in run.levels}
+        record: RunRecord = {
+            **run.started_record(),
+            "status": "failed",
+            "levels": [levels[number] for number in sorted(levels)],
+        }
+        error.report = _written_failure(path, record, error)
+        raise
+
+
+def _written_failure(path: Path, record: RunRecord, error: PhotonpanoError) -> Path | None:
+    """Write the report of a failure; return None if that fails, too: the error of the run is what counts."""
+    try:
+        page = render_failure(record, error)
+        with atomic_path(path) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+    except Exception:
+        logger.debug("the report of the failure could not be written", exc_info=True)
+        return None
+    return path
+
+
+def _with_report(folder: RunFolder, record: RunRecord, draw: Callable[[RunRecord], str]) -> RunRecord:
+    """Add the report to the run folder. The results are there already: what fails now is a warning."""
+    try:
+        try:
+            folder.add_report(draw(record))
+        except Exception as error:
+            logger.debug("the report failed", exc_info=True)
+            warning = f"the report could not be drawn ({type(error).__name__}: {error}); all other files of the run are written"
+            record = {**record, "warnings": [*record["warnings"], warning]}
+        return folder.update({**record, "peak_memory_bytes": peak_memory_bytes()})
+    except OutputError as error:
+        warning = f"the report could not be added ({error}); all other files of the run are written"
+        return {**record, "warnings": [*record["warnings"], warning]}
+
+
+def _require_photons(plan: Plan, source: Source) -> None:
+    """Refuse a capture that is all dark or all lit, at the place of the spec that names it."""
+    try:
+        require_photons(source)
+    except InputError as error:
+        raise plan.error("source", str(error)) from error

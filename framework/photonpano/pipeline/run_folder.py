@@ -24,9 +24,8 @@ from photonpano.merging.panorama import RenderedPanorama, Tile
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.photometry import tone_mapped
-from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
 from photonpano.record.contents import MAPS, RECORD, REPORT, content_of, contents_of, names_of_results, recorded_json
-from photonpano.record.picture_files import png_of
+from photonpano.record.picture_files import photo_sphere, png_of, with_xmp
 from photonpano.record.schema import RunRecord
 from photonpano.values import FluxImage, Panorama
 

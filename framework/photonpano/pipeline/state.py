@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from photonpano.capture import seen_through
+from photonpano.capture import capture_of, seen_through
 from photonpano.contracts.protocols import Source, Trajectory, camera_of_motion
 from photonpano.corrections import Vignette
 from photonpano.execution.context import Context
@@ -20,9 +20,10 @@ from photonpano.motion.locate import LoopSetting
 from photonpano.motion.loop import LevelResult, estimate_motion, through_lens
 from photonpano.motion.models import HOMOGRAPHIES, MotionModel
 from photonpano.motion.rotations import RotationTrajectory
+from photonpano.residuals.findings import NOTHING, Findings
 from photonpano.residuals.refinement import MotionFit
 from photonpano.specs.plan import Plan
-from photonpano.values import Decision, Light
+from photonpano.values import Light
 
 
 class View(NamedTuple):
@@ -50,7 +51,8 @@ class State:
     outdated: bool = False  # whether the source was corrected since these levels were located
     watched: bool = False  # whether what hides the background was looked for
     vignette: Vignette | None = None  # by which the source is divided
-    decisions: tuple[Decision, ...] = ()
+    light: Light | None = None  # in which the source is seen; None for steady light
+    findings: Findings = NOTHING
     refined: FrameMotion | None = None  # the motion corrected by refiners; None for that of the last level
     known_fit: MotionFit | None = None  # how well that explains the photons, if it is known without measuring them
 
@@ -96,14 +98,16 @@ class State:
         noise_px[finite] = np.sqrt(np.maximum(known[finite] ** 2 - before[finite] ** 2, 0))
         return replace(again, refined=replace(again.motion, std_px=np.hypot(again.motion.std_px, noise_px)))
 
-    def corrected(self, source: Source, correction: Vignette | Light, decision: Decision) -> State:
-        """Return the state of a capture with one more correction, on which its checkpoints then depend.
+    def corrected(self, source: Source, correction: Vignette | Light) -> State:
+        """Return the state of a capture with one more correction, on which its checkpoints then depend."""
+        state = replace(self, source=source, context=within(self.context, correction), outdated=True)
+        return replace(state, light=correction) if isinstance(correction, Light) else replace(state, vignette=correction)
 
-        It replaces an earlier one of the same name.
-        """
-        others = (each for each in self.decisions if each.what != decision.what)
-        context, decisions = within(self.context, correction), (*others, decision)
-        return replace(self, source=source, context=context, outdated=True, decisions=decisions)
+    def found(self) -> Findings:
+        """Return the findings so far, with those of the timeline, of the background, and of the time limit."""
+        background, left_out = capture_of(self.source).background, tuple(self.context.time_limit.left_out)
+        hidden_share = None if background is None else round(background.hidden_share, 4)
+        return replace(self.findings.along(self.timeline), hidden_share=hidden_share, left_out=left_out)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -123,10 +127,13 @@ class State:
         """The motion of every frame."""
         return self.refined or motion_of_frames(self.results, self.source.info, self.reference)
 
-    @cached_property
     def fit(self) -> MotionFit:
-        """How well the motion explains the photons; `CanvasTooLargeError` or `LocationError` if the panorama has no canvas."""
-        return self.known_fit or MotionFit(self.view.source, self.motion, int(self.plan.run.memory), self.view.context)
+        """Return how well the motion explains the photons; `CanvasTooLargeError` or `LocationError` if that has no canvas."""
+        return self.known_fit or self._fit
+
+    @cached_property
+    def _fit(self) -> MotionFit:
+        return MotionFit(self.view.source, self.motion, int(self.plan.run.memory), self.view.context)
 
 
 def model_of(plan: Plan) -> MotionModel:

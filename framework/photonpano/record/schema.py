@@ -266,7 +266,8 @@ class RunRecord(TypedDict):
     """The content of `run.json`.
 
     `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none, as one of poses, which has `poses`
-    instead; that is None elsewhere. `peak_memory_bytes` is None where the system does not report it.
+    instead; that is None elsewhere. `findings` are those of a panorama, by the names of the fields of `Findings`.
+    `peak_memory_bytes` is None where the system does not report it.
     `capture` is the fingerprint of what was read; `files` lists the other files of the run folder.
     `rendered_from` is the run folder whose motion was rendered again, None where the motion was estimated.
     """
@@ -281,6 +282,7 @@ class RunRecord(TypedDict):
     plugins: Sequence[PluginRecord]
     libraries: Mapping[str, str]
     decisions: Sequence[DecisionRecord]
+    findings: NotRequired[Mapping[str, Any]]
     levels: Sequence[LevelRecord]
     motion: MotionRecord | None
     refinements: Sequence[RefinementRecord]

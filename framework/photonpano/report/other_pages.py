@@ -1,4 +1,4 @@
-"""Pages beside the report of a run: of a run that failed, of runs of one capture side by side, and of a batch."""
+"""Pages beside the report of a run: of a run that failed or follows a capture, of runs side by side, and of a batch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from time import time_ns
+from typing import TYPE_CHECKING, Any, Literal, cast
 from urllib.parse import quote
 
 import numpy as np
@@ -363,3 +364,24 @@ def _draw(axes: Axes, lines: Mapping[str, tuple[list[float], list[float]]]) -> N
     at = sorted({place for x, _ in lines.values() for place in x})
     medians = [np.median([y[x.index(place)] for x, y in lines.values() if place in x]) for place in at]
     axes.plot(at, medians, "o-", markersize=5, color=INK, linewidth=2.2, label="median")
+
+
+@dataclass(frozen=True, slots=True)
+class LiveFigures:
+    """How far a run is that follows a capture."""
+
+    # finishing: the capture is complete, and the whole of it is run
+    state: Literal["waiting", "following", "finishing", "finished", "stopped"] = "waiting"
+    frames: int = 0  # frames that have arrived
+    promised: int | None = None  # frames that the capture will have; None if it does not say so
+    shown: int = 0  # frames in the picture so far
+    message: str = ""  # why the frames so far gave no panorama, or why the run has stopped; empty if nothing is wrong
+
+
+def render_live(figures: LiveFigures, title: str, so_far: str, whole: str) -> str:
+    """Return the page, which loads itself anew each second as long as the run goes on.
+
+    `so_far` and `whole` are the addresses of the run folders of the frames so far, and of the whole capture.
+    """
+    # Another address each time, so that no browser shows an old picture.
+    return filled("live.html", figures=figures, title=title, so_far=so_far, whole=whole, now=time_ns())

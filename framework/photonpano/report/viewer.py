@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from photonpano.capture import before, capture_of
+from photonpano.capture import capture_of, with_background
 from photonpano.contracts.protocols import Source
 from photonpano.geometry import Canvas, inverse, outline_of, rescaling
 from photonpano.merging.colour import channels_of
@@ -61,7 +61,7 @@ def viewer_data(
         "glimpses": glimpses(source, int(np.median(spans)), white),
         "tint": None if background is None else TINT,
         "instant": instant,
-        "views": views_of_instant(instant, motion, panorama, before(source, None), levels),
+        "views": views_of_instant(instant, motion, panorama, with_background(source, None), levels),
     }
 
 
@@ -169,7 +169,7 @@ def _rounded(points: FloatArray) -> Any:
 
 def glimpses(source: Source, n_frames: int, white: float) -> list[dict[str, Any]]:
     """Return short sums of frames, all over the capture, of all photons; and what hides the background, if anything does."""
-    total, background, source = source.info.n_frames, capture_of(source).background, before(source, None)
+    total, background, source = source.info.n_frames, capture_of(source).background, with_background(source, None)
     n_frames = min(n_frames, total)
     most = COLOURED_GLIMPSES if channels_of(source) > 1 else GLIMPSES
     found = []

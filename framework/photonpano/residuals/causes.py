@@ -1,19 +1,63 @@
-"""What may be wrong beside the motion: names for what the judges of a verdict doubt, and notes on a run that they trust."""
+"""What may be wrong beside the motion, and the tables that the tests of a verdict are listed in."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
 import numpy as np
 
+from photonpano.motion.loop import LevelResult
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
-from photonpano.residuals.lens import LensDistortion, deformation_px, lens_distortion
+from photonpano.residuals.findings import Findings
 from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
+from photonpano.residuals.patterns import LensDistortion, deformation_px, lens_distortion
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
-from photonpano.residuals.tested_run import TestedRun, Tests
 from photonpano.values import BoolArray
-from photonpano.values.verdict import Found
+from photonpano.values.verdict import Found, Test
 
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
+
+FREE = "write motion: {model: homography}"  # what a spec says of a motion that may be any
+FIND_LENS = "camera: {distortion: {k1: find}}"  # what a spec says to measure the lens
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TestedRun:
+    """Data of a run that is tested: see `judge`."""
+
+    explained: Explained
+    levels: Sequence[LevelResult]
+    findings: Findings
+
+    @property
+    def freer_model(self) -> str:
+        """What to do if a planar model that was written may hold less than the motion; "" for those that hold any."""
+        kind = self.levels[-1].located.solution.model.kind if self.levels else "homography"
+        return "" if kind in ("homography", "rotation") else f"{FREE}, as {kind} may hold less than the motion"
+
+
+_Finder: TypeAlias = Callable[[TestedRun], Found | None]
+
+
+class Tests(list[Test[TestedRun]]):
+    """A table of tests; those that are added first are listed first."""
+
+    def __init__(self, *, decides: bool = True) -> None:
+        super().__init__()
+        self._decides = decides
+
+    def doubtful_above(self, threshold: float, what: str, what_to_do: str) -> Callable[[_Finder], Test[TestedRun]]:
+        """Add the decorated function as a test."""
+
+        def added(find: _Finder) -> Test[TestedRun]:
+            self.append(Test(what, threshold, what_to_do, find, self._decides))
+            return self[-1]
+
+        return added
+
 
 CAUSES = Tests(decides=False)
 
@@ -23,8 +67,8 @@ CAUSES = Tests(decides=False)
     "the background of much of the panorama was never seen, as where one thing fills the middle of all frames",
     "record so that each place is seen without what hides it; the motion may be that of what fills the frames",
 )
-def _never_seen(run: TestedRun) -> Found | None:
-    return run.decided("background_never_seen", "share of the panorama")
+def _never_seen(run: TestedRun) -> Found:
+    return Found(run.findings.never_seen_share, "share of the panorama")
 
 
 @CAUSES.doubtful_above(

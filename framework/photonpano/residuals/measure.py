@@ -28,8 +28,8 @@ from photonpano.residuals.block_sums import (
     fold,
     n_blocks,
 )
+from photonpano.residuals.patterns import Shaking, find_shaking
 from photonpano.residuals.prediction import Prediction, Predictions
-from photonpano.residuals.shaking import Shaking, find_shaking
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, SpanResiduals
 
 N_STEPS = 4  # steps of the motion: shift along x and y, roll, zoom. The gain of the light is the fifth unknown of a span

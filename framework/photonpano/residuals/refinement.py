@@ -175,8 +175,8 @@ class MotionFit:
         """
         self.motion = motion
         self._source, self._memory, self._context = source, memory, context
-        given = motion.homographies, motion.span
-        self.residuals: Residuals = context.checkpoints.once("residuals", self._measured, *given)
+        once = context.checkpoints.once
+        self.residuals: Residuals = once("residuals", self._measured, motion.homographies, motion.span)
         self.ratio = residual_ratio(self.residuals)
 
     @cached_property

@@ -13,14 +13,14 @@ import numpy as np
 from scipy import ndimage
 
 from photonpano.geometry import corners, transform_points
-from photonpano.motion.level import DARK_JUMP, SHOTS, UNCUT_JUMP
 from photonpano.motion.loop import TOO_NARROW, LevelResult
 from photonpano.residuals.block_sums import M, V
-from photonpano.residuals.causes import CAUSES, changing_places, distorting_lens
+from photonpano.residuals.causes import CAUSES, FIND_LENS, FREE, TestedRun, Tests, changing_places, distorting_lens
+from photonpano.residuals.findings import NOTHING, Findings
 from photonpano.residuals.measure import FEWEST_FRAMES
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
-from photonpano.residuals.tested_run import FIND_LENS, FREE, RIVAL, TestedRun, Tests
-from photonpano.values import Decision, Verdict
+from photonpano.text import listed
+from photonpano.values import Verdict
 from photonpano.values.verdict import Found, Test, judged
 
 NARROW = "the camera moves by more than the model of its motion holds"
@@ -38,11 +38,11 @@ _FINE, _COARSE = (0.35, 0.5), (0.1, 0.17)  # cycles per pixel
 FACTS, AGREEMENT = Tests(), Tests()
 
 
-def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequence[Decision] = ()) -> Verdict:
-    """Test the result of a run; `levels` are empty if they are not known, `decisions` hold the share that stands still."""
+def judge(explained: Explained, levels: Sequence[LevelResult], findings: Findings = NOTHING) -> Verdict:
+    """Test the result of a run; `levels` are empty if they are not known."""
     figures = explained.ratio, float(explained.residuals.reduced_chi2.mean())
     ratio, reduced_chi2 = (each if np.isfinite(each) else None for each in figures)
-    return replace(judged(TESTS, TestedRun(explained, levels, decisions), ratio), reduced_chi2=reduced_chi2)
+    return replace(judged(TESTS, TestedRun(explained, levels, findings), ratio), reduced_chi2=reduced_chi2)
 
 
 @FACTS.doubtful_above(
@@ -51,8 +51,8 @@ def judge(explained: Explained, levels: Sequence[LevelResult], decisions: Sequen
     "look at the panoramas of the others beside the run folder: DIR.panorama-2 and so on",
 )
 def _shots(run: TestedRun) -> Found | None:
-    shots = next((str(each.value) for each in run.decisions if each.what == SHOTS), "")
-    return Found(shots.count("frame"), shots) if shots else None
+    shots = run.findings.shots
+    return Found(len(shots), listed(map(str, shots))) if shots else None
 
 
 @FACTS.doubtful_above(
@@ -61,7 +61,7 @@ def _shots(run: TestedRun) -> Found | None:
     "leave these frames out, or keep the light on",
 )
 def _jump_in_the_dark(run: TestedRun) -> Found:
-    found = [str(each.value) for each in run.decisions if each.what == DARK_JUMP]
+    found = [str(cut.dark) for cut in run.findings.cuts if cut.dark is not None]
     return Found(len(found), ", ".join(found))
 
 
@@ -149,13 +149,15 @@ def _uncertain(run: TestedRun) -> Found | None:
 def _two_motions(run: TestedRun) -> Found | None:
     what = "parts of the frame follow another motion than the one that was found"
     what_to_do = "mask what does not belong to the scene (corrections: mask); the motion may be that of either part"
-    return run.decided(RIVAL, what=what, what_to_do=what_to_do)
+    rival = run.findings.rival_motion
+    return None if rival is None else Found(rival.px, rival.where, what=what, what_to_do=what_to_do)
 
 
 def _uncut_jump(run: TestedRun) -> Found | None:
     what = "the image seems to jump, but the photons contradict a cut of the motion there"
     what_to_do = "look at the path in the report around this frame; use a slower motion, or smaller groups"
-    return run.decided(UNCUT_JUMP, what=what, what_to_do=what_to_do)
+    jump = run.findings.uncut_jump
+    return None if jump is None else Found(jump.px, jump.where, what=what, what_to_do=what_to_do)
 
 
 def _ambiguous(run: TestedRun) -> Found | None:
@@ -222,8 +224,8 @@ def _grain(run: TestedRun) -> Found | None:
     "more than half of the frame stands still while the rest moves",
     "mask what stands in the frame (corrections: mask); the motion may be that of either part",
 )
-def _standing(run: TestedRun) -> Found | None:
-    return run.decided("standing_share", "share of the parts that show motion or rest")
+def _standing(run: TestedRun) -> Found:
+    return Found(run.findings.standing_share, "share of the parts that show motion or rest")
 
 
 @FACTS.doubtful_above(
@@ -237,8 +239,9 @@ def _layers(run: TestedRun) -> Found | None:
     where = "share of the frames that is left out, on average"
     if parallax:
         where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
-    if (found := run.decided("movers", where)) is None:
+    if run.findings.hidden_share is None:
         return None
+    found = Found(run.findings.hidden_share, where)
     # Where little is left out, but much changes that is not, what is left out may be the scene.
     changing_share, _ = changing_places(run.explained.residuals)
     if min(found.figure, changing_share) <= MUCH:

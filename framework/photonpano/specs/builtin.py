@@ -223,7 +223,7 @@ def recognised_source(section: Written, spec: Spec) -> Written | None:
     found = from_python(answer.keys, replace(written.place, where=keys.place.where), spec.problems)
     spec.remark = f" ({path.name} was recognised as {entry.name}: {answer.because})"
     reason = f"{path.name} was recognised: {answer.because}"
-    spec.decisions.append(Decision(section.place.where, entry.name, reason))
+    spec.recognised = Decision(section.place.where, entry.name, reason)
     together = Written(found.data | keys.without(*AutoConfig.model_fields).data, keys.place)
     return section.having({"use": Written(entry.name, section.at("use").place), "with": together})
 

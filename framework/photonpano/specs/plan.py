@@ -51,7 +51,7 @@ class Spec:
     directory: Path = Path()  # what relative paths count from
     arriving: bool = False  # whether the capture is still being written, so that its files are not checked
     problems: list[Problem] = field(default_factory=list)
-    decisions: list[Decision] = field(default_factory=list)  # choices that the spec leaves open and that reading it made
+    recognised: Decision | None = None  # the source that recognised the capture, where the spec leaves it open
     remark: str = ""  # added to the message of every problem
 
     def wrong(self, value: Written, message: str) -> None:
@@ -219,8 +219,7 @@ class Plan:
     written: Written = field(default=Written({}), repr=False)
     file: Path | None = None  # the spec file, None for a spec that was built in Python
     observers: tuple[Observer, ...] = ()  # the plugins that watch the run
-    # choices that the spec leaves open and that reading it made: the source that recognises the capture
-    decisions: tuple[Decision, ...] = ()
+    recognised: Decision | None = None  # the source that recognised the capture, where the spec leaves it open
     corrects_itself: bool = False  # `corrections` is `auto`: the run masks what stands still, and divides by a vignette
     # the pose estimator, which takes the place of the levels, of refiners and of the panorama; None for a panorama
     pose: Choice | None = None

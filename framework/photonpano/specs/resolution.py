@@ -103,7 +103,7 @@ class _Resolver:
             written=written.having(sections),
             file=root.place.file,
             observers=spec.catalog.observers,
-            decisions=tuple(spec.decisions),
+            recognised=spec.recognised,
             corrects_itself=corrections is None,
             pose=poser,
         )

@@ -18,7 +18,9 @@ from .frames import Frames as Frames
 from .frames import FrameSpan as FrameSpan
 from .frames import Group as Group
 from .frames import Homography as Homography
+from .frames import Journal as Journal
 from .frames import Light as Light
+from .frames import Still as Still
 from .frames import StreamInfo as StreamInfo
 from .frames import true_spans as true_spans
 from .motion import Ambiguity as Ambiguity

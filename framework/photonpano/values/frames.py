@@ -176,6 +176,17 @@ class Decision:
     reason: str  # a clause with the numbers that decided
 
 
+Journal: TypeAlias = list[Decision]  # decisions in the order in which they were taken
+
+
+@dataclass(frozen=True, slots=True)
+class Still:
+    """What stands still in the frame."""
+
+    share: float = 0.0  # share of the frame that stands still, of the parts that show motion or rest; 0 if none moves
+    how: str = "not measured"  # what is masked for it, a clause
+
+
 CELL_PX = 8  # side of the cells of a frame that are told from the background, in px
 
 
@@ -202,6 +213,11 @@ class Background:
             return None
         height, width = self.frame_shape
         return cells.view(np.uint8).repeat(CELL_PX, axis=0)[:height].repeat(CELL_PX, axis=1)[:, :width]
+
+    @property
+    def hidden_share(self) -> float:
+        """The share of the frames that does not show the background."""
+        return float((1 - self.shown.mean(axis=(1, 2))).mean())
 
     def without(self, other: Background) -> Background:
         """Return what both show of the background."""

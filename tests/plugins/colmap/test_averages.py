@@ -5,25 +5,24 @@ from __future__ import annotations
 import resource
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from photonpano import CameraGuess, CaptureSummary, FrameSpan, LocationError, OutputError, StageContext, StreamInfo, discover
+from photonpano import CameraGuess, FrameSpan, LocationError, OutputError, StageContext, StreamInfo, discover
 from photonpano.evaluation import pose_errors
 from photonpano.execution.context import Quiet
-from photonpano.geometry import camera_matrix, positions_of
+from photonpano.geometry import camera_matrix
 from photonpano.testing import MemorySource
 from photonpano.testing.motions import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
 
 pytest.importorskip("pycolmap")
 
-from photonpano_colmap.averages import AveragesEstimator, chosen_size, tilt
-from photonpano_colmap.exposures import PoseSpline
+from photonpano_colmap.averages import AveragesEstimator
 from photonpano_colmap.hooks import ColmapAveragesConfig
-from photonpano_colmap.reconstruction import Halves, Piece, Readings, Reconstruction, _apart, pose_noise, reconstruct
+from photonpano_colmap.reconstruction import Halves, Piece, Readings, Reconstruction, pose_noise, reconstruct
 
 SIZE = 20
 MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
@@ -66,23 +65,6 @@ def test_full_disk_ends_the_run_before_colmap_reads_half_of_a_picture() -> None:
             reconstruct([(picture, picture)], CameraGuess(FOCAL_PX), ColmapAveragesConfig(), 0)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-def test_noise_that_hides_the_scene_is_not_taken_for_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = Reconstruction((), np.full(16, 300), np.full(16, 40))
-    monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
-    with pytest.raises(
-        LocationError, match=r"40 match another average, so noise or blur hides the scene; choose a larger pose"
-    ):
-        estimated(MemorySource(np.zeros((N_POSES, *POSES_SHAPE))))
-
-
-def test_model_whose_images_belong_to_a_larger_one_is_no_piece() -> None:
-    whole, part, other = (
-        SimpleNamespace(num_reg_images=images.__len__, reg_image_ids=lambda images=images: images)
-        for images in ([1, 2, 3, 4], [2, 3], [4, 5])
-    )
-    assert _apart([part, other, whole]) == [whole, other]
 
 
 def test_scene_without_texture_is_refused() -> None:
@@ -129,12 +111,6 @@ def test_pieces_are_named_or_the_largest_is_kept() -> None:
 
 
 @pytest.mark.usefixtures("pieces")
-def test_little_parallax_is_refused() -> None:
-    with pytest.raises(LocationError, match=r"the camera travels too little: the views of a point differ by .* less than 60"):
-        estimated(MemorySource(np.zeros((N_POSES, *POSES_SHAPE))), disconnected="largest", min_parallax_deg=60)
-
-
-@pytest.mark.usefixtures("pieces")
 @pytest.mark.parametrize("is_unsure", [True, False])
 def test_reversed_depth_is_recorded_and_an_undecided_one_is_doubted(is_unsure: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     from photonpano_colmap import averages
@@ -165,13 +141,6 @@ def test_errors_are_no_smaller_than_those_of_half_of_the_points(monkeypatch: pyt
         assert 0.9 * least < larger
 
 
-@pytest.mark.usefixtures("pieces")
-def test_focal_length_that_was_found_is_a_decision() -> None:
-    estimate, [decision] = estimated(MemorySource(np.zeros((N_POSES, *POSES_SHAPE))), CameraGuess(), disconnected="largest")
-    assert decision[:2] == ("focal_px", FOCAL_PX)
-    assert estimate.std_focal_px == pytest.approx(0.01 * FOCAL_PX, rel=0.1)
-
-
 def test_few_averages_are_refused() -> None:
     contribution = discover().find("pose-estimator", "colmap-averages").contribution
     config = ColmapAveragesConfig(group_size=40)
@@ -180,56 +149,6 @@ def test_few_averages_are_refused() -> None:
     assert problem == words
     with pytest.raises(LocationError, match=words):
         AveragesEstimator(config, SimpleNamespace()).estimate(MemorySource(np.zeros((160, 8, 8))), CameraGuess(), Quiet())
-
-
-@pytest.mark.parametrize(
-    ("n_frames", "step", "refused"),
-    [
-        (1000, "auto", True),
-        (1001, "auto", False),
-        (1150, "auto", False),
-        (1249, 250, True),
-        (1250, 250, False),
-        (100, 50, True),
-    ],
-)
-def test_the_check_counts_the_averages_that_the_run_makes(n_frames: int, step: int | Literal["auto"], refused: bool) -> None:
-    config, stream = ColmapAveragesConfig(group_size=250, step=step), StreamInfo(n_frames, 8, 8, None)
-    assert bool(discover().find("pose-estimator", "colmap-averages").contribution.check(config, stream)) == refused
-    with pytest.raises(LocationError, match="at least 5 are needed" if refused else "keypoints"):
-        AveragesEstimator(config, SimpleNamespace(seed=0)).estimate(
-            MemorySource(np.zeros((n_frames, 8, 8))), CameraGuess(), Quiet()
-        )
-
-
-@pytest.mark.parametrize(
-    ("flux", "speed_px", "n_frames", "size"), [(0.3, 0.01, 10_000, 200), (0.3, 0.1, 8000, 60), (0.01, None, 2400, 100)]
-)
-def test_size_is_chosen_by_light_and_motion(flux: float, speed_px: float | None, n_frames: int, size: int) -> None:
-    chosen, reason = chosen_size(CaptureSummary(flux, speed_px, "measured"), n_frames)
-    assert chosen == size
-    assert f"averages of {size} frames hold" in reason
-
-
-def test_spline_is_exact_for_a_smooth_path_and_keeps_its_velocity_beyond() -> None:
-    instants, poses = np.arange(5.0, N_POSES, 20), true_poses()
-    spline = PoseSpline(instants, poses[instants.astype(int)])
-    found = spline.at(np.arange(N_POSES, dtype=float))
-    np.testing.assert_allclose(found, poses, atol=7e-3)
-    np.testing.assert_allclose(found[instants.astype(int)], poses[instants.astype(int)], atol=1e-12)
-    places = positions_of(spline.at(np.array([310.0, 314, 318])))
-    np.testing.assert_allclose(places[2] - places[1], places[1] - places[0], atol=1e-12)
-    turns = Rotation.from_matrix(found[1:5, :, :3] @ np.swapaxes(found[:4, :, :3], 1, 2)).magnitude()
-    np.testing.assert_allclose(turns, turns[0], rtol=1e-6)
-
-
-def test_errors_of_positions_tilt_a_path_the_less_the_more_it_bends() -> None:
-    times = np.linspace(-1, 1, 21)
-    bent, straight = np.tile(np.eye(3, 4), (2, 21, 1, 1))
-    bent[:, 0, 3] = straight[:, 0, 3] = times
-    bent[:, 1, 3] = 0.1 * np.sqrt(2) * np.cos(np.pi * times)
-    assert tilt(bent, np.full(21, 0.01)) == pytest.approx(0.5 * 0.01 / 0.1, rel=0.1)
-    assert tilt(straight, np.full(21, 0.01)) == 0
 
 
 def seen(x: np.ndarray, n_poses: int) -> np.ndarray:

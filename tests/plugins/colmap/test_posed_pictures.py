@@ -10,7 +10,6 @@ import pytest
 from photonpano import (
     Config,
     FrameSpan,
-    InputError,
     PosedView,
     PoseEstimate,
     PoseEstimatorContribution,
@@ -63,6 +62,7 @@ def posed(folder: Path, exposures: bool = True) -> Path:
     return run(parse_spec(spec, output=folder / "run", catalog=discover().including(toy))).directory
 
 
+@pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("undistorted", [False, True])
 def test_features_of_pictures_are_triangulated_with_the_poses(tmp_path: Path, undistorted: bool) -> None:
     scene = tmp_path / "scene"
@@ -83,15 +83,3 @@ def test_features_of_pictures_are_triangulated_with_the_poses(tmp_path: Path, un
     points = pycolmap.triangulate_points(model, database, scene / "images", tmp_path / "found", clear_points=True).points3D
     assert len(points) > 50
     assert np.mean([point.error for point in points.values()]) < 0.3
-
-
-def test_pictures_that_the_run_has_not_are_asked_for(tmp_path: Path) -> None:
-    folder = posed(tmp_path, exposures=False)
-    with pytest.raises(InputError) as caught:
-        export(folder, "colmap", tmp_path / "scene", images=True)
-    assert (
-        str(caught.value) == f"{folder} has no pictures of its exposures; run its spec again with --set output.exposures=true"
-    )
-    with pytest.raises(InputError) as caught:
-        export(folder, "colmap", tmp_path / "scene", images=True, bits=16)
-    assert str(caught.value).startswith(f"{folder}: the pictures of a run with pose are those that it has written, with 8 bits")

@@ -80,16 +80,6 @@ def test_halves_of_the_points_err_by_the_square_root_of_two_more() -> None:
     assert 0.8 < ratio < 2.2, ratio
 
 
-def test_points_that_err_as_their_neighbours_do_belong_to_one_half() -> None:
-    rng, poses = np.random.default_rng(5), orbit(4.5)
-    points = np.random.default_rng(6).uniform([-1.5, -1.5, 3], [1.5, 1.5, 6], (SEEN, 3))
-    seen = np.einsum("nij,mj->nmi", poses[:, :, :3], points) + poses[:, None, :, 3]
-    pixels = 150 * seen[..., :2] / seen[..., 2:] + (79.5, 63.5) + rng.normal(0, 0.1, (len(poses), SEEN, 2))
-    once = compared_halves(model(poses, points, pixels, 150.0), finds_focal=False)
-    twice = compared_halves(model(poses, points.repeat(2, axis=0), pixels.repeat(2, axis=1), 150.0), finds_focal=False)
-    assert twice.std_position == pytest.approx(once.std_position, rel=0.05)
-
-
 @pytest.fixture(autouse=True)
 def quiet() -> None:
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -32,12 +30,6 @@ def locator(seed: int = 0, **config: object) -> TwoViewLocator:
 
 def register(moving: VirtualExposure, fixed: Features, initial: np.ndarray | None = None) -> Located | NotLocated:
     return locator().register(locator().describe(moving), fixed, initial)
-
-
-@pytest.fixture(scope="module")
-def still(seen_from: Callable) -> Features:
-    """The street at 0.5 photons per pixel per frame, 250 frames."""
-    return locator().describe(seen_from(STILL, 2))
 
 
 def located(motion: Located | NotLocated) -> Located:
@@ -94,38 +86,6 @@ def test_result_is_independent_of_threads_and_order(seen_from: Callable) -> None
         assert [each.points.tobytes() for each in pool.map(two_view.describe, exposures)] == [
             each.points.tobytes() for each in features
         ]
-
-
-def test_describe_keeps_the_largest_keypoints(seen_from: Callable, still: Features) -> None:
-    best = locator(max_keypoints=50).describe(seen_from(STILL, 2))
-    assert len(still.points) > 300
-    assert len(best.points) == len(best.descriptors) == 50
-    assert best.sizes.min() > np.quantile(still.sizes, 0.9)
-    assert np.all(np.diff(best.sizes) <= 0)
-
-
-LIBRARIES = [name for name in ("torch", "cv2", "pycolmap") if importlib.util.find_spec(name)]
-REGISTER = """
-import numpy as np
-from photonpano import FrameSpan, Group, VirtualExposure
-from photonpano.photometry import BinaryResponse
-from photonpano_colmap.hooks import PycolmapTwoViewConfig
-from photonpano_colmap.reconstruction import TwoViewLocator
-
-flux = np.random.default_rng(0).random((12, 16), np.float32).repeat(8, axis=0).repeat(8, axis=1)
-exposure = VirtualExposure(flux, np.full(flux.shape, 250, np.float32), Group(FrameSpan(0, 250), 0), 1.0, BinaryResponse())
-locator = TwoViewLocator(PycolmapTwoViewConfig(), 0)
-features = locator.describe(exposure)
-print(type(locator.register(features, features, np.eye(3))).__name__)
-"""
-
-
-@pytest.mark.parametrize("order", [LIBRARIES, LIBRARIES[::-1]], ids=" ".join)
-def test_libraries_can_be_imported_in_any_order_without_stderr(order: list[str]) -> None:
-    """An order and its reverse include each pair of libraries in both orders."""
-    code = "".join(f"import {name}\n" for name in order) + REGISTER
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "Located\n", "")
 
 
 @pytest.mark.parametrize(("kind", "name"), [("locator", "pycolmap-two-view"), ("pose-estimator", "colmap-averages")])

@@ -14,7 +14,6 @@ from photonpano.testing import MemorySource
 from photonpano_core.configs import LocalFlowConfig, PhotonMleConfig
 from photonpano_core.local_flow import LocalFlowMerger, number_of
 from photonpano_core.mergers import PhotonMleMerger
-from photonpano_core.motion_fields import MotionField, blurred, fit_each, noise_area_px2
 
 N, HEIGHT, WIDTH = 270, 80, 112
 GROUP = Group(FrameSpan(0, N), (N - 1) / 2)
@@ -124,31 +123,12 @@ def test_too_dark_group_is_merged_as_by_photon_mle(motion: Trajectory) -> None:
     assert as_exact(*(merger.merge(source, GROUP, motion, 1.0) for merger in (local_flow(), plain())))
 
 
-def test_without_trajectory_frames_are_summed(crossed: Source) -> None:
-    assert as_exact(*(merger.merge(crossed, GROUP, None, 1.0) for merger in (local_flow(), plain())))
-
-
-@pytest.mark.parametrize("frames", [2, 4])
-def test_short_groups_are_merged_as_by_photon_mle(crossed: Source, motion: Trajectory, frames: int) -> None:
-    group = Group(FrameSpan(5, 5 + frames), 5.0)
-    assert as_exact(*(merger.merge(crossed, group, motion, 1.0) for merger in (local_flow(), plain())))
-
-
 def test_ghost_map_shows_what_moves(crossed: Source, motion: Trajectory) -> None:
     found = local_flow().ghost_map(crossed, GROUP, motion)
     both = (found.moving & swept()).sum()
     assert both > 0.85 * found.moving.sum()
     assert both > 0.85 * swept().sum()
     assert (found.significance >= 0).all()
-
-
-def test_ghost_map_of_still_scene_is_empty(motion: Trajectory) -> None:
-    """Also with masked pixels, and at the borders that few frames show."""
-    valid = np.random.default_rng(3).random((HEIGHT, WIDTH)) > 0.02
-    for seed in range(3):
-        found = local_flow().ghost_map(capture(crossed=False, seed=seed, valid=valid), GROUP, motion)
-        assert not found.moving.any()
-        assert (found.significance > 3).mean() < 5e-3
 
 
 def test_significance_of_photon_noise_is_normal(pan: Callable) -> None:
@@ -168,68 +148,3 @@ def test_motion_beyond_the_global_one_is_found_from_any_reference(motion: Trajec
         np.mean((merger.merge(crossed, group, motion, 1.0).flux - true)[inside] ** 2) for merger in (local_flow(), plain())
     ]
     assert errors[0] < 0.3 * errors[1]
-
-
-def test_motion_that_turns_back_is_followed(pan: Callable) -> None:
-    """As parallax does when the camera trembles; here everything moves to and fro, and the global motion stands still."""
-    way = 3 * np.sin(np.linspace(0, 2 * np.pi, N))
-    rng = np.random.default_rng(0)
-    frames = [rng.random((HEIGHT, WIDTH)) < -np.expm1(-shifted(SCENE, 20 + each, (HEIGHT, WIDTH))) for each in way]
-    true, inside = shifted(SCENE, 20 + way[N // 2], (HEIGHT, WIDTH)), (slice(8, -8), slice(8, -8))
-    group, source = Group(GROUP.span, float(N // 2)), MemorySource(np.array(frames, np.uint8))
-    errors = [np.mean((each.merge(source, group, pan(0.0), 1.0).flux - true)[inside] ** 2) for each in (local_flow(), plain())]
-    assert errors[0] < 0.45 * errors[1]
-
-
-def test_field_is_a_polynomial_of_time() -> None:
-    coefficients = np.zeros((2, 3, 4, 2), np.float32)
-    coefficients[0, ..., 0], coefficients[1, ..., 1] = 2, -4
-    field = MotionField(coefficients)
-    np.testing.assert_allclose(field.at(0.5)[1, 2], [1, -1])
-    # A parabola from -1 to 1: its length is measured along 8 straight lines.
-    times = np.linspace(-1, 1, 9)
-    np.testing.assert_allclose(field.way_px, np.hypot(2 * np.diff(times), 4 * np.diff(times**2)).sum() / 2, rtol=1e-5)
-
-
-def test_filled_field_takes_the_nearest_known_motion() -> None:
-    coefficients = np.arange(2 * 5 * 6, dtype=np.float32).reshape(1, 5, 6, 2)
-    known = np.zeros((5, 6), bool)
-    known[2, 0] = known[2, 5] = True
-    filled = MotionField(coefficients).filled(known).coefficients
-    np.testing.assert_array_equal(filled[:, 0, 1], coefficients[:, 2, 0])
-    np.testing.assert_array_equal(filled[:, 4, 4], coefficients[:, 2, 5])
-
-
-def test_polynomials_are_fitted_at_each_pixel() -> None:
-    rng = np.random.default_rng(0)
-    wanted = rng.standard_normal((3, 2, 4, 2))
-    times, trusts = np.linspace(-1, 1, 9), rng.uniform(0.5, 1, (9, 2, 4))
-    powers = times ** np.arange(1, 7)[:, None]
-    flows = np.tensordot(powers[:3].T, wanted, axes=1)
-    moments = np.tensordot(powers[1:], trusts, axes=1).astype(np.float32)
-    right = np.tensordot(powers[:3], trusts[..., None] * flows, axes=1).astype(np.float32)
-    where = np.ones((2, 4), bool)
-    where[1, 2] = False
-    found = np.zeros((3, 2, 4, 2), np.float32)
-    fit_each(moments, right, 1e-9, where, found)
-    np.testing.assert_allclose(found[:, where], wanted[:, where], atol=1e-4)
-    assert not found[:, ~where].any()
-
-
-@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.5])
-def test_noise_of_halved_frames_is_that_of_its_area(fraction: float) -> None:
-    """Halved, interpolated at a fraction of a pixel, and blurred."""
-    noise = np.random.default_rng(0).standard_normal((600, 600)).astype(np.float32)
-    half = cv2.resize(noise, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    for axis in range(2):
-        half = (1 - fraction) * half + fraction * np.roll(half, 1, axis)
-    std = blurred(half.astype(np.float32), 1.2 * 0.5)[5:-5, 5:-5].std()
-    area = noise_area_px2(1.2, 0.5, fraction * (1 - fraction))
-    assert std == pytest.approx(area**-0.5, rel=0.03)
-
-
-def test_frames_of_odd_size_are_merged_to_their_border(motion: Trajectory) -> None:
-    crossed = capture(crossed=True).frames(FrameSpan(0, N))[:, :-1, :-1]
-    found, other = (merger.merge(MemorySource(crossed), GROUP, motion, 1.0) for merger in (local_flow(), plain()))
-    assert found.flux.shape == (HEIGHT - 1, WIDTH - 1)
-    np.testing.assert_allclose(found.flux[-1, 10:-10], other.flux[-1, 10:-10], rtol=0.05)

@@ -6,14 +6,13 @@ import gzip
 import os
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from photonpano import FrameSpan, InputError, OutputError, PackedSource, Piped, Source, SourceContext
+from photonpano import FrameSpan, InputError, PackedSource, Source, SourceContext
 from photonpano.photometry import BinarySumResponse
 from photonpano_core.sources import NPY, PACKED_NPY, PACKED_RAW, NpyConfig, PackedNpyConfig, PackedRawConfig
 
@@ -91,12 +90,6 @@ def test_frames_are_read_in_any_layout(tmp_path: Path, layout: str) -> None:
             np.testing.assert_array_equal(source.packed(span), np.packbits(part, axis=-1))
 
 
-def test_lit_padding_bits_are_ignored(tmp_path: Path) -> None:
-    with opened(saved(tmp_path / "cube.npy", np.full((3, 2, 2), 255, np.uint8)), width=11) as source:
-        np.testing.assert_array_equal(source.counts(FrameSpan(0, 3)), np.full((2, 11), 3))
-        assert source.frames(FrameSpan(0, 3)).shape == (3, 2, 11)
-
-
 @pytest.fixture
 def gzipped(tmp_path: Path) -> Path:
     path = tmp_path / "cube.npy.gz"
@@ -126,17 +119,6 @@ def test_compressed_captures_are_unpacked_once(gzipped: Path, caplog: pytest.Log
     assert read() == [message]
 
 
-def test_full_disk_is_reported_before_unpacking(gzipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=847))
-    with pytest.raises(OutputError) as caught:
-        opened(gzipped)
-    beside = gzipped.with_name("cube.npy.gz.unpacked.npy")
-    assert str(caught.value) == (
-        f"cannot write {beside}: it takes 848 B, and its disk has 847 B free; free some space or choose another folder"
-    )
-    assert list(gzipped.parent.iterdir()) == [gzipped]
-
-
 def problem_of(path: Path, array: np.ndarray, **config: Any) -> str | None:
     """Return what the check says of an array."""
     problems = PACKED_NPY.check(PackedNpyConfig(path=saved(path, array), **config))
@@ -144,28 +126,10 @@ def problem_of(path: Path, array: np.ndarray, **config: Any) -> str | None:
     return problems[0] if problems else None
 
 
-def test_path_in_the_line_to_write_is_quoted_where_yaml_needs_it(tmp_path: Path, clouds: Callable) -> None:
-    message = problem_of(tmp_path / "scan: 2, {a}.npy", clouds(n_frames=16))
-    assert str(message).endswith(f'write source: {{use: npy, with: {{path: "{tmp_path}/scan: 2, {{a}}.npy", holds: bits}}}}')
-
-
 @pytest.mark.parametrize("keys", [{"bit_order": "big"}, {"bit_order": "little"}, {"packed_along": "width"}])
 def test_layout_that_the_spec_states_is_believed(tmp_path: Path, clouds: Callable, keys: dict[str, Any]) -> None:
     for packed in (np.packbits(clouds(), axis=2, bitorder="little"), clouds()):
         assert problem_of(tmp_path / "cube.npy", packed, **keys) is None
-
-
-def test_layout_of_each_channel_is_checked(tmp_path: Path, clouds: Callable) -> None:
-    stored = np.packbits(np.repeat(clouds(n_frames=128)[..., None], 3, axis=-1), axis=2, bitorder="little")
-    assert "write bit_order: little" in str(problem_of(tmp_path / "cube.npy", stored, channel=2))
-
-
-def test_layout_of_a_compressed_capture_is_checked(tmp_path: Path, clouds: Callable) -> None:
-    path = tmp_path / "cube.npy.gz"
-    with gzip.open(path, "wb") as file:
-        np.save(file, np.packbits(clouds(), axis=2, bitorder="little"))
-    (problem,) = PACKED_NPY.check(PackedNpyConfig(path=path))
-    assert problem.endswith("write bit_order: little, or bit_order: big if it is right")
 
 
 @pytest.mark.parametrize("dtype", [bool, np.uint8, np.int64, ">u2"])
@@ -196,13 +160,6 @@ def test_sums_have_the_response_of_their_number(tmp_path: Path, dtype: Any, last
         np.testing.assert_array_equal(source.counts(FrameSpan(3, 30)), SUMS[3:30].sum(axis=0))
 
 
-def test_long_span_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.reading.sources._READ_BYTES", 7 * 6 * 19)
-    with unpacked(saved(tmp_path / "cube.npy", BITS), holds="bits") as source:
-        np.testing.assert_array_equal(source.frames(source.info.span), BITS)
-        np.testing.assert_array_equal(source.counts(FrameSpan(1, 40)), BITS[1:].sum(axis=0))
-
-
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
@@ -213,22 +170,6 @@ def test_long_span_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_frames_per_sum_belongs_to_sums(keys: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         NpyConfig(path=Path("cube.npy"), **keys)
-
-
-def test_axis_of_frames_that_the_spec_states_is_believed(tmp_path: Path, clouds: Callable) -> None:
-    path = saved(tmp_path / "cube.npy", frames_last(clouds()))
-    for frames in ("first", "last"):
-        assert list(NPY.check(NpyConfig(path=path, holds="bits", frame_axis=frames))) == []
-
-
-def test_frames_before_a_wrong_value_are_read(tmp_path: Path) -> None:
-    array = BITS.copy()
-    array[21, 4, 17] = 2
-    with unpacked(saved(tmp_path / "cube.npy", array), holds="bits") as source:
-        source.counts(FrameSpan(0, 21))
-        for read in (source.counts, source.frames):
-            with pytest.raises(InputError, match="holds the value 2 in frame 21, row 4, column 17"):
-                read(FrameSpan(10, 30))
 
 
 @pytest.mark.parametrize(
@@ -254,12 +195,3 @@ def test_file_without_whole_frames_is_refused(tmp_path: Path, n_bytes: int, keys
     with pytest.raises(InputError) as caught:
         PACKED_RAW.build(PackedRawConfig(path=path, height=5, width=20, **keys), SourceContext())
     assert str(caught.value) == message.format(path=path)
-
-
-def test_standard_input_is_for_following() -> None:
-    config = PackedRawConfig(path="-", height=5, width=20, header_bytes=7)
-    assert PACKED_RAW.arrived is not None
-    assert PACKED_RAW.arrived(config) == Piped(header_bytes=7, frame_bytes=15)
-    assert PACKED_RAW.check(config) == ()
-    with pytest.raises(InputError, match="run with --follow, or name a file"):
-        PACKED_RAW.build(config, SourceContext())

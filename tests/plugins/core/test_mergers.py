@@ -60,14 +60,6 @@ def test_splat_equals_photon_mle_without_trajectory(scale: float) -> None:
     np.testing.assert_array_equal(exposure.weight, other.weight)
 
 
-@pytest.mark.parametrize("name", ["photon-mle", "local-flow"])
-def test_group_of_one_frame_is_that_frame(name: str, motion: Trajectory) -> None:
-    source = capture()
-    exposure = built(name).merge(source, Group(FrameSpan(3, 4), 3.0), motion, 1.0)
-    np.testing.assert_allclose(exposure.weight, 1, rtol=1e-4)
-    np.testing.assert_array_equal(exposure.flux > 0.3, source.frames(FrameSpan(3, 4))[0] > 0)
-
-
 @pytest.mark.parametrize("moves", [False, True])
 @pytest.mark.parametrize("name", ["photon-mle", "local-flow"])
 def test_what_a_mask_of_some_frames_leaves_out_is_not_merged(name: str, moves: bool, motion: Trajectory) -> None:

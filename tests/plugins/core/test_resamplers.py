@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonpano import CaptureSummary, CaptureUnreadError, FrameSpan, Group, InputError, StageContext, StreamInfo
+from photonpano import CaptureSummary, FrameSpan, Group, InputError, StageContext, StreamInfo
 from photonpano_core.configs import MidpointConfig
 from photonpano_core.hooks import photonpano_resamplers
 from photonpano_core.resamplers import MidpointResampler, choose_group_size, whole_periods
@@ -79,46 +79,11 @@ def test_midpoint_adds_group_between_every_two_and_shorter_ones_at_ends(
     assert midpoint(n_frames, level) == tuple(Group(span, (span.start + span.stop - 1) / 2) for span in found)
 
 
-def test_midpoint_end_groups_get_shorter_down_to_four_frames() -> None:
-    ends = midpoint(400, 3)
-    assert [group.span for group in ends[:2]] == [FrameSpan(0, 25), FrameSpan(0, 50)]
-    assert [group.span for group in ends[-2:]] == [FrameSpan(350, 400), FrameSpan(375, 400)]
-    assert min(len(group.span) for group in midpoint(400, 9)) == 6
-
-
 @pytest.mark.parametrize(("level", "count"), [(1, 10), (2, 19), (3, 37), (4, 73)])
 def test_midpoint_has_as_many_groups_as_the_paper(level: int, count: int) -> None:
     ends = 2 * (level - 1)
     assert len(midpoint(1000, level)) == count + ends
     assert len(midpoint(1000, level, endpoints=False)) == count
-
-
-@given(group_size=st.integers(1, 300), more=st.integers(0, 1500), level=st.integers(1, 4))
-def test_midpoint_covers_any_capture_evenly(group_size: int, more: int, level: int) -> None:
-    n_frames = group_size + more
-    found = midpoint(n_frames, level, group_size)
-    assert all(min(4, group_size) <= len(group.span) <= group_size and group.span.stop <= n_frames for group in found)
-    assert all(group.reference == group.span.centre for group in found)
-    references = [group.reference for group in found]
-    assert all(earlier < later for earlier, later in pairwise(references))
-    if level > 1 and group_size >= 8:
-        assert (found[0].span.start, found[-1].span.stop) == (0, n_frames)
-    centred = midpoint(n_frames, level, group_size, endpoints=False)
-    assert all(len(group.span) == group_size for group in centred)
-    count = n_frames // group_size
-    distance = (n_frames - group_size) / max(1, (count - 1) * 2 ** (level - 1))
-    if distance >= 1:
-        assert len(centred) == (count - 1) * 2 ** (level - 1) + 1
-        assert all(abs(later.reference - earlier.reference - distance) <= 1 for earlier, later in pairwise(centred))
-    if count > 1:
-        assert (centred[0].span.start, centred[-1].span.stop) == (0, n_frames)
-
-
-@given(group_size=st.integers(1, 300), count=st.integers(1, 20), rest=st.integers(0, 299))
-def test_midpoint_level_1_has_as_many_disjoint_groups_as_fit(group_size: int, count: int, rest: int) -> None:
-    found = midpoint(group_size * count + rest % group_size, 1, group_size)
-    assert len(found) == count
-    assert all(earlier.span.stop <= later.span.start for earlier, later in pairwise(found))
 
 
 @pytest.mark.parametrize("level", [1, 2, 5])
@@ -127,23 +92,10 @@ def test_constant_groups_equal_midpoint_level_1_at_every_level(n_frames: int, le
     assert groups("constant-groups", n_frames, level) == midpoint(n_frames, 1)
 
 
-def test_sliding_window_steps_by_half_a_group_by_default() -> None:
-    assert starts(groups("sliding-window", 400)) == [0, 50, 100, 150, 200, 250, 300]
-    assert groups("sliding-window", 400, 3) == groups("sliding-window", 400, 1)
-
-
 def test_sliding_window_steps_by_step_frames_or_slightly_less() -> None:
     assert starts(groups("sliding-window", 400, step_frames=100)) == [0, 100, 200, 300]
     assert starts(groups("sliding-window", 430, step_frames=100)) == [0, 82, 165, 248, 330]
     assert starts(groups("sliding-window", 105, step_frames=1)) == [0, 1, 2, 3, 4, 5]
-
-
-def test_sliding_window_step_shrink_adds_groups_per_level() -> None:
-    """With half the step at each level, they equal those of midpoint without its ends."""
-    for level in (1, 2, 3, 4):
-        found = groups("sliding-window", 1000, level, step_frames=100, step_shrink=2)
-        assert found == midpoint(1000, level, endpoints=False)
-    assert starts(groups("sliding-window", 110, 9, step_frames=100, step_shrink=4)) == list(range(11))
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
@@ -159,26 +111,12 @@ def test_stratified_puts_one_group_in_each_stratum(level: int) -> None:
     assert [len(group.span) for group in found] == [len(group.span) for group in even]
 
 
-def test_stratified_starts_and_ends_with_the_capture() -> None:
-    assert [group.span for group in groups("stratified", 4000)[::39]] == [FrameSpan(0, 100), FrameSpan(3900, 4000)]
-
-
 def test_stratified_depends_on_seed_and_level_only() -> None:
     assert groups("stratified", 4000, 2, seed=1) == groups("stratified", 4000, 2, seed=1)
     assert groups("stratified", 4000, 2, seed=1) != groups("stratified", 4000, 2, seed=2)
     # Other chance at another level, and not the same places again.
     first, second = starts(groups("stratified", 4000, 1)), starts(groups("stratified", 4000, 2, endpoints=False))
     assert len({*first[1:-1]} & {*second[2:-2:2]}) < 10
-
-
-@pytest.mark.parametrize("level", [1, 2, 3])
-def test_stratified_without_jitter_equals_midpoint(level: int) -> None:
-    for n_frames in (100, 160, 460, 1000):
-        assert groups("stratified", n_frames, level, jitter=0) == midpoint(n_frames, level)
-
-
-def test_stratified_has_one_group_per_stratum_of_one_frame() -> None:
-    assert starts(groups("stratified", 104, 4, group_size=2, endpoints=False)) == list(range(103))
 
 
 HOW = "the second fastest of 12 places, from sums of 64 frames"
@@ -236,25 +174,6 @@ def test_group_size_weighs_light_against_motion_blur(capture: tuple[Any, ...], s
     assert why.endswith(reason), why
 
 
-def test_auto_resampler_allows_single_grey_frames() -> None:
-    resampler = built(StreamInfo(80, 254, 496, None, "intensity", 8), capture=lambda: CaptureSummary(2000, 38.0, HOW))
-    assert {len(group.span) for group in resampler.groups(80, 1)} == {1}
-
-
-@given(
-    flux=st.floats(0, 10),
-    speed_px=st.none() | st.floats(0, 100),
-    n_frames=st.integers(16, 100_000),
-    side=st.integers(8, 1024),
-)
-def test_choose_group_size_keeps_bounds_for_any_capture(flux: float, speed_px: float | None, n_frames: int, side: int) -> None:
-    size, reason = choose_group_size(CaptureSummary(flux, speed_px, HOW), n_frames, side, 16)
-    assert 16 <= size <= max(16, n_frames // 8)
-    assert "\n" not in reason
-    if speed_px and size > 16:
-        assert (size - 1) * speed_px <= 0.3 * side
-
-
 def test_auto_resampler_chooses_and_records_size_once() -> None:
     measured, decided = [], []
 
@@ -283,30 +202,6 @@ def test_auto_resampler_doubles_groups_of_dim_capture_from_level_3() -> None:
     assert resampler.groups(2000, 3) == long.groups(2000, 4)
     assert decided[0][:2] == ("group_size", 100)
     assert decided[0][2].endswith("; from level 3 on, where the motion is known, groups are twice as long for more light")
-
-
-@pytest.mark.parametrize("name", ["constant-groups", "sliding-window"])
-def test_auto_resampler_never_doubles_groups_that_get_no_denser(name: str) -> None:
-    """Their number, or their positions, would differ from those of the levels before."""
-    resampler = built(StreamInfo(2000, 254, 496, None), name, capture=lambda: CaptureSummary(0.05, 0.381, HOW))
-    assert resampler.groups(2000, 3) == resampler.groups(2000, 1)
-    assert {len(group.span) for group in resampler.groups(2000, 3)} == {100}
-
-
-def test_auto_resampler_raises_where_no_frames_are_read() -> None:
-    resampler = built(StreamInfo(1000, 254, 496, None))
-    with pytest.raises(CaptureUnreadError, match=r"^chosen from flux and speed when the capture is read$"):
-        resampler.groups(1000, 1)
-
-
-def test_check_refuses_capture_shorter_than_shortest_group() -> None:
-    for contribution in photonpano_resamplers():
-        config = contribution.config(group_size="auto")
-        assert contribution.check(config, StreamInfo(16, 8, 8, None)) == []
-        assert contribution.check(config, StreamInfo(15, 8, 8, None)) == [
-            "the capture has 15 frames, fewer than one group of 16; set group_size to 3 or less, so that at least four groups "
-            "fit"
-        ]
 
 
 @pytest.mark.parametrize(

@@ -72,17 +72,3 @@ def test_refine_names_frequencies() -> None:
     corrected = "motion of 0.5 px within groups was corrected; the image trembles"
     assert refine(residuals(0, 0.5), 96_800).summary == f"{corrected} at 1,276 Hz"
     assert refine(residuals(0, 0.5)).summary == f"{corrected} with periods of 76 frames"
-
-
-def test_refine_names_the_tremor_and_not_what_is_left_of_it() -> None:
-    known = STILL.copy()
-    known[:, 0, 2] = 5 * np.sin(2 * np.pi * np.arange(N_FRAMES) / 128)
-    assert refine(residuals(0, 0.1), 96_800, known).summary.endswith("; the image trembles at 756 Hz")
-
-
-def test_refine_ignores_spans_without_information() -> None:
-    noisy = residuals(0, 0.5)
-    steps, information = noisy.steps.copy(), noisy.information.copy()
-    steps[100:110], information[100:110] = 0, 0
-    refined = refine(SpanResiduals(noisy.spans, steps, information))
-    assert np.isfinite(refined.homographies).all()

@@ -97,19 +97,6 @@ def test_splat_equals_adjoint_of_interpolation(
     assert (exposure.group, exposure.scale) == (GROUP, scale)
 
 
-def test_splat_skips_weights_for_nearly_rigid_motion(memory_source: type, frames: np.ndarray, known_motion: type) -> None:
-    """The error of the shortcut is below 0.01 of 20 frames, and only at the border."""
-    motion = known_motion(
-        lambda t: np.array([[1 + 2e-4 * t, -3e-4 * t, 0.3 * t], [3e-4 * t, 1 + 1e-4 * t, 0.2 * t], [1e-6 * t, 0, 1]])
-    )
-    valid = some_masked()
-    exposure = SplatMerger().merge(memory_source(frames, valid), GROUP, motion, 1.0)
-    _, weight = expected(frames, valid, motion, 1.0)
-    error = np.abs(exposure.weight - weight)[exposure.weight > 0]
-    assert error.max() < 0.05
-    assert np.median(error) < 1e-3
-
-
 class Intensities:
     """A camera that counts photons."""
 
@@ -118,17 +105,6 @@ class Intensities:
 
     def flux(self, mean_count: np.ndarray, frames: Any) -> np.ndarray:
         return mean_count
-
-
-@pytest.mark.parametrize(("motion", "scale"), [("rigid", 2.0), ("rigid", 0.6), ("turning", 1.0), ("turning", 2.0)])
-def test_splat_keeps_flat_scene_flat(memory_source: type, motion: str, scale: float, request: pytest.FixtureRequest) -> None:
-    """For any density of pixels, also beside masks and at the border."""
-    source = memory_source(np.ones((N, HEIGHT, WIDTH), np.uint8), some_masked())
-    source.response = Intensities()
-    exposure = SplatMerger().merge(source, GROUP, request.getfixturevalue(motion), scale)
-    known = exposure.weight > 0
-    assert known.mean() > 0.9
-    np.testing.assert_allclose(exposure.flux[known], 1, rtol=1e-5)
 
 
 def test_splat_is_unbiased(memory_source: type, rigid: Trajectory) -> None:
@@ -152,28 +128,6 @@ def test_splat_takes_counts_above_1(memory_source: type, rigid: Trajectory, dtyp
     total, weight = expected(counts, np.ones((HEIGHT, WIDTH)), rigid, 1.0)
     known = exposure.weight > 0
     np.testing.assert_allclose(exposure.flux[known], (total / np.maximum(weight, 1))[known], rtol=1e-3, atol=1e-3)
-
-
-def test_splat_reads_frames_in_blocks(memory_source: type, frames: np.ndarray, rigid: Trajectory, monkeypatch) -> None:
-    whole = SplatMerger().merge(memory_source(frames), GROUP, rigid, 1.0)
-    spans: list[FrameSpan] = []
-
-    class Told(memory_source):
-        def frames(self, span: FrameSpan) -> np.ndarray:
-            spans.append(span)
-            return super().frames(span)
-
-    monkeypatch.setattr("photonpano_core.mergers._READ_BYTES", 7 * HEIGHT * WIDTH)
-    parts = SplatMerger().merge(Told(frames), GROUP, rigid, 1.0)
-    assert spans == [FrameSpan(2, 9), FrameSpan(9, 16), FrameSpan(16, 22)]
-    np.testing.assert_array_equal(parts.flux, whole.flux)
-
-
-def test_splat_ignores_frames_behind_camera_or_off_grid(memory_source: type, frames: np.ndarray, known_motion: type) -> None:
-    motion = known_motion(lambda frame: np.array([[1, 0, 1e4 * (frame != 10)], [0, 1, 0], [0, 0, 1.0]]))
-    group = Group(FrameSpan(9, 12), 10.0)
-    exposure = SplatMerger().merge(memory_source(frames), group, motion, 1.0)
-    np.testing.assert_allclose(exposure.weight, 1, atol=1e-5)
 
 
 def test_splat_refuses_source_with_corrected_sums() -> None:

@@ -17,18 +17,9 @@ from photonpano.merging import Chunk, MergeRenderer, PhotonSum
 from photonpano.photometry import BinaryResponse, BinarySumResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano_core.configs import SuperResolutionConfig
-from photonpano_core.fine_grid import (
-    Observations,
-    Patches,
-    counts_in_light,
-    expected,
-    filter_groups,
-    find_similar,
-    pixel_area,
-    rounds_of,
-)
-from photonpano_core.motion_fields import count_variance, sharpened
-from photonpano_core.super_resolution import SuperResolutionRenderer, add_observations, sums_on
+from photonpano_core.fine_grid import expected, pixel_area
+from photonpano_core.motion_fields import sharpened
+from photonpano_core.super_resolution import SuperResolutionRenderer, sums_on
 
 SIDE, CHUNKS, FRAMES, FINE = 40, 96, 40, 8
 """Pixels of a side of a frame, its stops, the frames of each, and the samples of the scene along the side of a pixel."""
@@ -132,14 +123,6 @@ def test_flux_in_light_that_flickers_and_drifts_is_that_of_mean_light() -> None:
     assert "nan" not in "".join(reason for _, _, reason in decisions)
 
 
-def test_expected_counts_in_changing_light_are_sums_over_classes() -> None:
-    frames, sums = np.float32([[[60]], [[40]], [[0]]]), np.float32([[[30]], [[80]], [[0]]])
-    lit, dark = np.empty((2, 1, 1), np.float32)
-    counts_in_light(np.float32([[0.7]]), frames, sums, lit, dark)
-    wanted = 60 * -np.expm1(-0.35) + 40 * -np.expm1(-1.4)
-    np.testing.assert_allclose([lit[0, 0], dark[0, 0]], [wanted, 100 - wanted], rtol=1e-5)
-
-
 def test_scale_beyond_the_photons_is_said_with_the_figure_and_done(caplog: pytest.LogCaptureFixture) -> None:
     source, motion = capture(np.full_like(fine_scene(), 0.02))
     decisions: list = []
@@ -162,17 +145,6 @@ def test_panorama_keeps_fine_detail_of_pixels_with_a_small_area() -> None:
     assert right > wrong + 1
 
 
-@pytest.mark.parametrize("width", [0.3, 1.0, 2.0, 3.3])
-def test_pixel_area_is_the_convolution_of_pixel_cell_and_flux(width: float) -> None:
-    """Integrate over random places of the middle of a pixel in a cell, and of a photon in the pixel."""
-    weights = pixel_area(width).astype(np.float64)
-    radius = len(weights) // 2
-    middles, photons = np.random.default_rng(0).random((2, 400_000)) - 0.5
-    drawn = np.rint(middles + width * photons).astype(int)
-    shares = np.bincount(drawn + radius, minlength=len(weights)) / len(drawn)
-    np.testing.assert_allclose(weights, shares, atol=5e-3)
-
-
 def test_expected_equals_a_filter_and_is_its_own_adjoint_inside() -> None:
     rng, kernel = np.random.default_rng(0), pixel_area(2.0)
     image = rng.random((17, 23)).astype(np.float32)
@@ -180,19 +152,6 @@ def test_expected_equals_a_filter_and_is_its_own_adjoint_inside() -> None:
     expected(image, kernel, np.empty_like(image), found)
     wanted = cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
     np.testing.assert_allclose(found, wanted, rtol=1e-5)
-
-
-def test_add_observations_sorts_pixels_into_the_nearest_cells_and_leaves_masked_ones_out() -> None:
-    counts, usable = np.arange(6, dtype=np.float32).reshape(2, 3), np.ones((2, 3), bool)
-    usable[1, 2] = False
-    lit, seen = np.zeros((4, 8), np.float32), np.zeros((2, 4, 8), np.float32)
-    to_grid = np.array([[2.0, 0, 0.4], [0, 2.0, 0.7], [0, 0, 1]])
-    add_observations(counts, usable, np.float32([5, 2]), to_grid, 0, lit, seen)
-    wanted = np.zeros((4, 8))
-    wanted[1, [0, 2, 4]], wanted[3, [0, 2]] = [0, 1, 2], [3, 4]
-    np.testing.assert_array_equal(lit, wanted)
-    assert (seen > 0).sum(axis=(1, 2)).tolist() == [5, 5]
-    assert seen.sum(axis=(1, 2)).tolist() == [25, 10]
 
 
 def test_what_a_mask_of_some_frames_leaves_out_is_not_summed() -> None:
@@ -204,40 +163,6 @@ def test_what_a_mask_of_some_frames_leaves_out_is_not_summed() -> None:
         sums = sums_on(source, chunks, Canvas(SIDE, SIDE, np.eye(3)), lambda _: None, pool)
     for image in (sums.lit, sums.seen):
         np.testing.assert_array_equal(image, np.where(left, 20, 40))
-
-
-def test_likelihood_rises_from_round_to_round_until_the_prior_is_weak() -> None:
-    """The photons of other frames are predicted better by each of the first rounds."""
-    truth = true_panorama(fine_scene()).astype(np.float32)
-    rng, kernel = np.random.default_rng(1), pixel_area(2.0)
-    mean = np.empty_like(truth)
-    expected(truth, kernel, np.empty_like(truth), mean)
-    seen = np.full_like(truth, 200)
-    fitted, tested = (
-        Observations(rng.binomial(200, -np.expm1(-mean)).astype(np.float32), seen, kernel, True) for _ in range(2)
-    )
-    likely = [float(tested.log_likelihood(flux).sum(dtype=float)) for flux in rounds_of(fitted, 6)]
-    assert likely[0] < likely[1] < likely[2]
-    assert likely[2] < float(tested.log_likelihood(truth).sum(dtype=float))
-
-
-def test_cells_of_few_photons_keep_their_mean_flux() -> None:
-    """The denoiser averages a stabilised scale, whose mean is lower by what the noise spreads."""
-    rng, seen = np.random.default_rng(3), np.full((96, 96), 40, np.float32)
-    lit = rng.binomial(40, -np.expm1(-0.05), seen.shape).astype(np.float32)
-    flux = rounds_of(Observations(lit, seen, pixel_area(2.0), True), 4)[-1]
-    assert float(flux[8:-8, 8:-8].mean()) == pytest.approx(0.05, rel=0.03)
-
-
-def test_denoiser_keeps_edges_and_removes_noise() -> None:
-    clean = np.zeros((64, 64), np.float32)
-    clean[:, 32:] = 1
-    noisy = clean + 0.1 * np.random.default_rng(2).standard_normal(clean.shape).astype(np.float32)
-    patches = Patches.over(noisy.shape)
-    find_similar(noisy, patches)
-    total, weights = np.zeros_like(clean), np.zeros_like(clean)
-    filter_groups(noisy, np.full_like(clean, 0.1), patches, total, weights)
-    assert np.sqrt(np.mean((total / weights - clean) ** 2)) < 0.03
 
 
 def test_sums_of_binary_frames_give_the_flux_of_a_sum() -> None:
@@ -253,30 +178,6 @@ def test_sums_of_binary_frames_give_the_flux_of_a_sum() -> None:
     single = rendered(binary, motion)
     assert isinstance(binary.response, BinaryResponse)
     np.testing.assert_allclose(np.median(summed.flux[INNER] / single.flux[INNER]), 4, rtol=0.02)
-
-
-def test_canvas_beside_the_frames_is_unseen() -> None:
-    source, motion = capture(fine_scene())
-    canvas = Canvas(30, 40, translation(4000, 0))
-    decisions: list = []
-    renderer = SuperResolutionRenderer(SuperResolutionConfig(), 1, lambda *given: decisions.append(given))
-    done: list[int] = []
-    panorama = renderer.render(source, motion, source.info.span, canvas, 0.125, done.append)
-    assert (panorama.weight == 0).all()
-    assert (sum(done), decisions) == (source.info.n_frames, [])
-
-
-def test_black_parts_of_a_scene_are_estimated_and_predicted(caplog: pytest.LogCaptureFixture) -> None:
-    """Where no photon falls, likelihoods stay finite: the smallest flux is below the precision of 1 - exp(-flux)."""
-    scene = fine_scene().copy()
-    scene[:, : 28 * FINE] = 0
-    source, motion = capture(scene)
-    decisions: list = []
-    panorama = rendered(source, motion, decisions)
-    assert np.isfinite(panorama.flux[INNER]).all()
-    assert panorama.flux[INNER][:, :20].max() < 1e-3
-    assert "nan" not in "".join(reason for _, _, reason in decisions)
-    assert decisions[0][1] > 1
 
 
 SHAPE, N = (96, 128), 5000
@@ -324,26 +225,3 @@ def test_photon_noise_of_a_plain_surface_is_not_amplified() -> None:
     plain = np.full(SHAPE, 0.3)
     before, after = errors(plain, interpolated(plain, FRACTIONS))
     assert after < 1.05 * before
-
-
-def test_what_was_not_interpolated_is_not_sharpened() -> None:
-    counts = interpolated(texture(), np.zeros((1, 2)))
-    weight = np.full(SHAPE, N, np.float32)
-    found = sharpened(PhotonSum(counts, weight), np.zeros(SHAPE, np.float32), EVERYWHERE, RESPONSE)
-    np.testing.assert_allclose(found.counts, counts, rtol=1e-5)
-
-
-def test_pixels_beside_unseen_ones_and_outside_are_kept() -> None:
-    counts, weight = interpolated(texture(), FRACTIONS), np.full(SHAPE, N, np.float32)
-    counts[40, 50] = weight[40, 50] = 0
-    where = EVERYWHERE.copy()
-    where[:20] = False
-    found = sharpened(PhotonSum(counts, weight), BLUR, where, RESPONSE).counts
-    np.testing.assert_array_equal(found[39:42, 49:52], counts[39:42, 49:52])
-    np.testing.assert_array_equal(found[:20], counts[:20])
-    assert (found[60:80] != counts[60:80]).any()
-
-
-def test_variance_of_binary_counts_is_that_of_a_coin() -> None:
-    mean = np.linspace(0.05, 0.8, 16, dtype=np.float32)
-    assert count_variance(mean, RESPONSE) == pytest.approx(mean * (1 - mean), rel=0.03)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,9 +17,7 @@ from photonpano.execution.context import Quiet
 
 pytest.importorskip("distributed")
 
-import dask
 import psutil
-from distributed import Client
 
 from photonpano_dask import workers
 from photonpano_dask.configs import DaskConfig
@@ -97,41 +93,10 @@ def test_same_bytes_and_decisions_as_on_threads_though_workers_are_killed(spec: 
     assert not worker_pids()
 
 
-def test_what_is_shared_may_be_large_without_a_warning() -> None:
-    before = dask.config.get("distributed.admin.large-graph-warning-threshold")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        client = Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None)
-        mine = workers.DaskWorkers(client)
-        assert mine.submit(len, bytes(11_000_000)).result() == 11_000_000
-        mine.close()
-    assert not [each for each in caught if "large graph" in str(each.message)]
-    assert dask.config.get("distributed.admin.large-graph-warning-threshold") == before
-
-
 def test_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_PATIENCE_S", 0.5)
     with pytest.raises(InputError, match=r"no dask scheduler answers at tcp://127.0.0.1:9 .*start one with `dask scheduler`"):
         workers.workers_of(DaskConfig(address="tcp://127.0.0.1:9"), CONTEXT)
-
-
-@pytest.mark.parametrize(
-    ("found", "message"),
-    [
-        ({}, "the dask scheduler at tcp://a:1 has no workers; start some with `dask worker tcp://a:1`"),
-        (
-            {"tcp://b:2": {"photonpano": "0.2.0", "numpy": "missing"}},
-            "the dask worker tcp://b:2 differs from this process: photonpano 0.2.0 (here 0.1.0), numpy missing (here 2.4.6); "
-            "it needs the same versions, and must find the same capture at its path, since results must not depend on "
-            "the worker",
-        ),
-    ],
-)
-def test_workers_that_cannot_do_the_run_are_named(found: dict[str, Any], message: str) -> None:
-    client: Any = SimpleNamespace(run=lambda _: found)
-    with pytest.raises(InputError) as caught:
-        workers._require_alike(client, CONTEXT, "tcp://a:1")
-    assert str(caught.value) == message
 
 
 @pytest.mark.parametrize(

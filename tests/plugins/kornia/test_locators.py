@@ -10,18 +10,16 @@ import numpy as np
 import pytest
 
 from photonpano import InputError, Located, NotLocated, StageContext, StreamInfo
-from photonpano.geometry import corner_displacements, inverse, rescaling, transform_points, translation
+from photonpano.geometry import corner_displacements, translation
 from photonpano.photometry import BinaryResponse
 from photonpano_kornia.hooks import photonpano_locators
 
 pytest.importorskip("torch")
 pytest.importorskip("kornia")
 
-import kornia
 import torch
 
-from photonpano_kornia.hooks import KorniaRegistratorConfig
-from photonpano_kornia.locators import RegistratorLocator, device_of, image_on, one_thread, seeded, unit_square
+from photonpano_kornia.locators import device_of, one_thread
 
 SHAPE = (120, 176)
 STILL = np.eye(3)
@@ -84,14 +82,6 @@ def test_exposure_registered_to_itself_gives_identity(backend: str, shot: Callab
     assert corner_displacements(found.homography, STILL, SHAPE).mean() < 1e-3
 
 
-def test_description_takes_less_memory_than_four_images(backend: str, shot: Callable) -> None:
-    """Images of float32."""
-    described = built(backend).describe(shot(STILL))
-    kept = [described] if backend == "smnn" else described
-    arrays = [getattr(each, name) for each in kept for name in type(each).__dataclass_fields__]
-    assert sum(each.nbytes for each in arrays if isinstance(each, np.ndarray)) < 4 * 4 * SHAPE[0] * SHAPE[1]
-
-
 @pytest.mark.parametrize("sigma_px", [2.5, 7.0])
 def test_keypoints_lie_at_centres_of_blobs(photograph: Callable, sigma_px: float) -> None:
     """To less than half a pixel, also in octaves of kornia's pyramid that are finer and coarser than the image."""
@@ -101,31 +91,6 @@ def test_keypoints_lie_at_centres_of_blobs(photograph: Callable, sigma_px: float
     found = built("smnn", max_keypoints=16).describe(photograph(0.2 + 2 * blob, 0))
     strongest = found.points[np.argmin(np.linalg.norm(found.points - middle, axis=1))]
     np.testing.assert_allclose(strongest, middle, atol=0.15)
-
-
-def test_unit_square_matches_pixel_centres_of_kornia_warper() -> None:
-    """Warping an image of coordinates by a homography gives the mapped coordinates."""
-    height, width = 20, 30
-    homography = translation(2.25, 1.5) @ np.diag([0.8, 0.7, 1]) + np.array([[0, 0.02, 0], [0.01, 0, 0], [1e-4, 2e-4, 0]])
-    y, x = np.mgrid[:height, :width].astype(float)
-    unit = unit_square((height, width))
-    warper = kornia.geometry.HomographyWarper(height, width, align_corners=False)
-    coordinates = torch.tensor(np.stack([x, y])[None], dtype=torch.float64)
-    to_image = torch.tensor(unit @ homography @ inverse(unit))[None]
-    seen = warper(coordinates, to_image)[0].numpy().reshape(2, -1).T
-    np.testing.assert_allclose(seen, transform_points(homography, np.stack([x.ravel(), y.ravel()], axis=1)), atol=1e-4)
-
-
-def test_unit_square_keeps_edges_of_halved_image() -> None:
-    """So all layers of a pyramid have the same coordinates in kornia."""
-    halved = unit_square((40, 60)) @ rescaling(0.5) @ inverse(unit_square((80, 120)))
-    np.testing.assert_allclose(halved, STILL, atol=1e-12)
-
-
-def test_pyramid_is_finest_first_and_ends_above_smallest_side(shot: Callable) -> None:
-    views = RegistratorLocator(KorniaRegistratorConfig()).describe(shot(STILL))
-    assert [view.shape for view in views] == [(120, 176), (60, 88), (30, 44)]
-    assert len(RegistratorLocator(KorniaRegistratorConfig(pyramid_levels=1)).describe(shot(STILL))) == 1
 
 
 def test_one_thread_limits_torch_and_restores_its_number() -> None:
@@ -146,17 +111,6 @@ def test_one_thread_limits_torch_and_restores_its_number() -> None:
         torch.set_num_threads(before)
 
 
-def test_seeded_restores_the_generator_state() -> None:
-    before = torch.get_rng_state()
-    drawn = []
-    for seed in (1, 1, 2):
-        with seeded(seed, torch.device("cpu")):
-            drawn.append(torch.rand(3))
-    assert torch.equal(drawn[0], drawn[1])
-    assert not torch.equal(drawn[0], drawn[2])
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_device_of_missing_gpu_raises_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
     assert device_of("cpu") == torch.device("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -166,12 +120,3 @@ def test_device_of_missing_gpu_raises_input_error(monkeypatch: pytest.MonkeyPatc
         f"device: cuda is not available: torch {torch.__version__} finds no GPU; use device: cpu, or install a "
         "torch for the GPU and its driver"
     )
-
-
-def test_image_on_copies_the_image() -> None:
-    image = np.zeros((2, 3), np.float32)
-    image.flags.writeable = False
-    tensor = image_on(torch.device("cpu"), image)
-    assert tensor.shape == (1, 1, 2, 3)
-    tensor += 1
-    assert not image.any()

@@ -58,13 +58,6 @@ def test_loftr_from_loads_weights_and_keeps_generator_state(
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_corrected_positions_switch_the_positional_encoding(file: Path) -> None:
-    encodings = [
-        loftr_from(file, CPU, corrected_positions=corrected, min_confidence=0.2).pos_encoding.pe for corrected in (False, True)
-    ]
-    assert not torch.equal(*encodings)
-
-
 def refused(path: Path) -> str:
     with pytest.raises(InputError) as caught:
         loftr_from(path, CPU, corrected_positions=False, min_confidence=0.2)
@@ -141,26 +134,6 @@ def test_matches_are_converted_to_pixel_centres(
     assert 40 < motion.evidence["inliers"] <= motion.evidence["matches"]
 
 
-def test_matches_in_masked_areas_are_dropped(build: Callable, shot: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    knows(STILL, monkeypatch)
-    locator, half = build(), shot(STILL)
-    half.flux[:, :88], half.weight[:, :88] = np.nan, 0
-    moving, fixed = locator.describe(half), locator.describe(shot(STILL, 1))
-    assert np.ptp(moving.image[:, :88]) == 0
-    motion = locator.register(moving, fixed, None)
-    assert isinstance(motion, Located)
-    assert motion.evidence["matches"] == 15 * 11
-    half.flux[:], half.weight[:] = np.nan, 0
-    assert locator.register(fixed, locator.describe(half), None) == NotLocated("all pixels are masked")
-
-
-def test_images_below_32_px_are_rejected(build: Callable, photograph: Callable) -> None:
-    locator = build()
-    tiny = locator.describe(photograph(np.full((20, 40), 0.5)))
-    assert locator.register(tiny, tiny, None).reason == "the images have 20x40 px, LoFTR needs at least 32 along each side"
-    assert sum(each.nbytes for each in tiny) == 2 * 20 * 40
-
-
 def test_missing_weights_are_a_problem_of_the_spec(tmp_path: Path) -> None:
     contribution = discover().find("locator", "kornia-loftr").contribution
     stream = StreamInfo(100, 64, 96, frame_rate_hz=None)
@@ -171,8 +144,3 @@ def test_missing_weights_are_a_problem_of_the_spec(tmp_path: Path) -> None:
     )
     weights.touch()
     assert contribution.check(config, stream) == ()
-
-
-def test_path_of_weights_is_relative_to_folder_of_spec(tmp_path: Path) -> None:
-    config = KorniaLoftrConfig.model_validate({"weights": "loftr.ckpt"}, context={"directory": tmp_path})
-    assert config.weights == tmp_path / "loftr.ckpt"

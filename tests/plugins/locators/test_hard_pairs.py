@@ -146,18 +146,6 @@ def test_turning_locates_pairs_in_the_dark_that_homographies_lose(
         assert motion.evidence["degrees_of_freedom"] == 3
 
 
-@pytest.mark.parametrize("name", KEYPOINTS)
-def test_describe_keeps_the_best_keypoints_outside_of_masked_areas(name: str, seen_from: Callable) -> None:
-    exposure = seen_from(STILL)
-    exposure.flux[:, :100], exposure.weight[:, :100] = np.nan, 0
-    every, best = built(name).describe(exposure), built(name, max_keypoints=50).describe(exposure)
-    assert len(every.points) > 300
-    assert every.points[:, 0].min() > 98
-    assert 30 < len(best.points) <= 50
-    assert len(best.points) == len(best.sizes) == len(best.descriptors)
-    assert best.shape == SHAPE
-
-
 @pytest.mark.parametrize("flux", [0.0, np.nan, 50.0], ids=["dark", "unseen", "lit"])
 @pytest.mark.parametrize("name", KEYPOINTS)
 def test_exposure_without_keypoints_is_rejected_with_their_numbers(
@@ -227,20 +215,6 @@ def few(motion: Located | NotLocated) -> tuple[str, dict[str, float]]:
 
 def uniform(count: int, *, sets: int = 1) -> Any:
     return np.random.default_rng(0).uniform((0, 0), (239, 159), (sets, count, 2)).squeeze()
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 11])
-def test_too_few_keypoints_are_rejected_with_their_numbers(backend: str, count: int) -> None:
-    points = uniform(count).reshape(-1, 2)
-    for initial in (None, np.eye(3)):
-        reason, evidence = few(matched(backend, points, points, initial))
-        assert reason.endswith(f" matches, fewer than min_inliers = 12 ({count} and {count} keypoints)")
-        assert evidence == {"keypoints_moving": count, "keypoints_fixed": count, "matches": evidence["matches"]}
-
-
-def test_keypoints_on_a_line_are_rejected(backend: str) -> None:
-    line = np.stack([np.linspace(10, 230, 40), np.full(40, 80.0)], axis=1)
-    few(matched(backend, line, line + np.random.default_rng(0).normal(scale=0.3, size=line.shape)))
 
 
 @pytest.mark.parametrize("backend", ["opencv-sift", "kornia-features"], indirect=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,8 +20,6 @@ from photonpano_opencv.locators import (
     OrbLocator,
     PhaseCorrelationLocator,
     match_everywhere,
-    match_nearby,
-    unit_bits,
     unit_descriptors,
 )
 
@@ -38,12 +35,6 @@ def register(
     return locator.register(locator.describe(moving), locator.describe(fixed), None)
 
 
-def test_pyramid_is_finest_first_and_ends_above_smallest_side(seen_from: Callable) -> None:
-    views = ECC.describe(seen_from(STILL))
-    assert [view.shape for view in views] == [(160, 240), (80, 120), (40, 60)]
-    assert len(EccLocator(OpencvEccConfig(pyramid_levels=1)).describe(seen_from(STILL))) == 1
-
-
 def test_ecc_locates_pair_of_different_brightness_with_less_certainty(seen_from: Callable) -> None:
     """The correlation coefficient does not depend on brightness; the expected error does."""
     true = translation(10, -3)
@@ -52,22 +43,6 @@ def test_ecc_locates_pair_of_different_brightness_with_less_certainty(seen_from:
         assert isinstance(motion, Located), motion
         assert corner_displacements(motion.homography, true, SHAPE).mean() < 0.15
     assert dimmed.residual_px > 2 * equal.residual_px
-
-
-def test_ecc_skips_layers_that_fail(seen_from: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    find = cv2.findTransformECCWithMask
-
-    def on_fine_levels_only(moving: np.ndarray, *rest: object) -> object:
-        if moving.shape != SHAPE:
-            raise cv2.error("the coarse levels see nothing")
-        return find(moving, *rest)
-
-    monkeypatch.setattr(cv2, "findTransformECCWithMask", on_fine_levels_only)
-    true = translation(10.5, -3.25)
-    motion = register(ECC, seen_from(true, 1), seen_from(STILL, 2))
-    assert isinstance(motion, Located), motion
-    assert motion.evidence["aligned_levels"] == 1
-    assert corner_displacements(motion.homography, true, SHAPE).mean() < 0.15
 
 
 def test_ecc_reports_error_of_opencv_as_reason(seen_from: Callable) -> None:
@@ -99,15 +74,6 @@ def test_keypoints_of_coarse_levels_are_not_off_by_half_a_pixel(seen_from: Calla
     assert np.abs(np.mean(offsets, axis=0)).max() < 0.1
 
 
-def test_information_accounts_for_common_rounding_of_keypoints(seen_from: Callable) -> None:
-    """A shift of a third of a pixel, which rounding to whole pixels hides."""
-    locator, true = OrbLocator(OpencvOrbConfig(), seed=0), translation(0.3, -0.2)
-    motion = locator.register(locator.describe(seen_from(true, 1)), locator.describe(seen_from(np.eye(3), 2)), None)
-    assert isinstance(motion, Located)
-    assert 0.1 < corner_displacements(motion.homography, true, SHAPE).mean() < 0.6
-    assert np.diag(np.linalg.inv(motion.information)[4:6, 4:6]).min() > 1 / 12
-
-
 def waves(x_px: float, y_px: float) -> View:
     """A sum of 40 plane waves, shifted: band-limited, so that the shift is exact."""
     rng = np.random.default_rng(0)
@@ -124,18 +90,6 @@ def test_phase_correlation_finds_sub_pixel_shifts(x_px: float, y_px: float) -> N
     motion = PHASE.register(waves(0, 0), waves(x_px, y_px), None)
     assert isinstance(motion, Located), motion
     np.testing.assert_allclose(motion.homography, translation(x_px, y_px), atol=0.2)
-
-
-def test_phase_correlation_drops_roll_and_perspective_of_initial_motion(seen_from: Callable) -> None:
-    """Otherwise their errors, which no pair measures, would be fed back from level to level."""
-    true = translation(37, -11)
-    known = true @ from_parameters([0.01, 0.004, -0.006, 0.02, 2, -3, 2e-5, -3e-5])
-    exposures = PHASE.describe(seen_from(true, 1)), PHASE.describe(seen_from(STILL, 2))
-    for initial in (known / known[2, 2], None):
-        motion = PHASE.register(*exposures, initial)
-        assert isinstance(motion, Located)
-        np.testing.assert_array_equal(motion.homography[:, :2], STILL[:, :2])
-        np.testing.assert_allclose(motion.homography, true, atol=0.1)
 
 
 def test_information_predicts_errors_if_camera_also_rolls(seen_from: Callable) -> None:
@@ -202,21 +156,6 @@ def chosen(moving: np.ndarray, fixed: np.ndarray, allowed: np.ndarray, ratio: fl
     return pairs
 
 
-def test_unit_descriptors_are_square_roots_of_length_1() -> None:
-    unit = unit_descriptors(np.array([[1, 4, 4] + [0] * 125, [0] * 128], np.uint8))
-    np.testing.assert_allclose(unit[0, :3], [1 / 3, 2 / 3, 2 / 3], rtol=1e-6)
-    np.testing.assert_array_equal(unit[1], 0)
-
-
-@given(seed=seeds)
-def test_unit_bits_have_hamming_distance_as_squared_distance(seed: int) -> None:
-    raw = np.random.default_rng(seed).integers(0, 256, (2, 32), dtype=np.uint8)
-    first, second = unit_bits(raw)
-    differing = np.count_nonzero(np.unpackbits(raw[0]) != np.unpackbits(raw[1]))
-    np.testing.assert_allclose(np.sum((first - second) ** 2), 4 / 256 * differing, rtol=1e-5)
-    np.testing.assert_allclose(first @ first, 1, rtol=1e-6)
-
-
 @given(n_moving=counts, n_fixed=counts, seed=seeds)
 def test_match_everywhere_keeps_mutual_distinct_matches(n_moving: int, n_fixed: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -227,15 +166,3 @@ def test_match_everywhere_keeps_mutual_distinct_matches(n_moving: int, n_fixed: 
         assert len(pairs) == 0
     else:
         assert {tuple(pair) for pair in pairs} == chosen(moving, fixed, np.ones((n_moving, n_fixed), bool), 0.95)
-
-
-@given(n_moving=counts, n_fixed=counts, seed=seeds, radius_px=st.floats(1, 200))
-def test_match_nearby_keeps_mutual_distinct_matches_within_radius(
-    n_moving: int, n_fixed: int, seed: int, radius_px: float
-) -> None:
-    rng = np.random.default_rng(seed)
-    moving, fixed = descriptors(rng, n_moving), descriptors(rng, n_fixed)
-    predicted, points = rng.uniform(0, 100, (n_moving, 2)), rng.uniform(0, 100, (n_fixed, 2)).astype(np.float32)
-    pairs = match_nearby(moving, fixed, predicted, points, radius_px, 0.95)
-    near = np.linalg.norm(predicted[:, None] - points[None], axis=-1) <= radius_px
-    assert {tuple(pair) for pair in pairs} == chosen(moving, fixed, near, 0.95)

@@ -8,7 +8,6 @@ import pytest
 from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError
-from photonpano.contracts.requirements import require_response
 from photonpano.photometry import srgb_to_linear
 from photonpano_sensors.intensity.contributions import FastcamMrawConfig, ResponseConfig
 from photonpano_sensors.intensity.pictures import FastcamMrawSource
@@ -25,14 +24,6 @@ def flux_of_levels(linear: LinearLevels) -> np.ndarray:
     """Return the flux of each level of the file."""
     table = np.arange(256) if linear.table is None else linear.table
     return linear.response.flux(table.astype(np.float32), 1)
-
-
-def test_linear_levels_stay_as_they_are() -> None:
-    linear = levels(saturation_photons=219.0, read_noise=3.0)
-    assert (linear.bits, linear.table) == (8, None)
-    np.testing.assert_allclose(flux_of_levels(linear)[[0, 16, 17, 235]], [-16, 0, 1, 219])
-    # Rounding to whole levels has the variance of 1/12.
-    assert linear.response.read_noise == pytest.approx(np.sqrt(9 + 1 / 12))
 
 
 @pytest.mark.parametrize(
@@ -83,27 +74,9 @@ def test_invalid_curve_file_is_refused(tmp_path: Path, content: str, golden: str
     assert str(raised.value) == golden.replace("FILE", str(file))
 
 
-def test_missing_curve_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^there is no file .*curve.txt; check the path$"):
-        levels(curve_file=tmp_path / "curve.txt")
-
-
-@pytest.mark.parametrize(("black", "white"), [(235, 235), (0, 256), (300, 310)])
-def test_black_and_white_levels_outside_the_bits_are_refused(black: float, white: float) -> None:
-    with pytest.raises(InputError, match="do not suit levels of 8 bits: black must be below white, and white at most 255"):
-        levels(black_level=black, white_level=white)
-
-
 def test_curve_and_curve_file_together_are_refused() -> None:
     with pytest.raises(ValidationError, match="curve_file takes the place of the curve srgb; leave out one of them"):
         ResponseConfig(curve="srgb", curve_file="curve.txt")
-
-
-@pytest.mark.parametrize("curve", ["linear", "srgb"])
-def test_response_of_the_fewest_photons_is_one_that_captures_may_have(curve: Any) -> None:
-    require_response(levels(saturation_photons=1.0, curve=curve).response)
-    with pytest.raises(ValidationError, match="greater than or equal to 1"):
-        ResponseConfig(saturation_photons=0.2)
 
 
 @pytest.mark.parametrize("curve", ["linear", "srgb"])

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-import tifffile
 from scipy.io import savemat
 
-from photonpano import Arrived, FrameSpan, InputError, PackedSource, Source, SourceContext, Url, discover
+from photonpano import Arrived, InputError, PackedSource, Source, SourceContext, Url, discover
 from photonpano_sensors.intensity.pictures import read_header
 from photonpano_sensors.intensity.source import Encoding
 
@@ -27,28 +24,6 @@ def opened(name: str, path: Path) -> Source:
     return contribution.build(contribution.config(path=path), SourceContext())
 
 
-def test_sparse_addresses_may_be_unordered_and_repeated(tmp_path: Path) -> None:
-    path = tmp_path / "sparse.bin"
-    path.write_bytes(np.array([700, 5, 700, 262144, 262144, 5, 262144], "<u4").tobytes())
-    with opened("spad512-sparse", path) as source:
-        counts = source.counts(FrameSpan(0, 3))
-        assert (counts[0, 5], counts[1, 700 - 512], counts.sum()) == (2, 1, 3)
-        np.testing.assert_array_equal(source.frames(FrameSpan(0, 3)).sum(axis=0), counts)
-
-
-@pytest.mark.parametrize("name", ["swissspad-half", "packed-npy"])
-def test_file_that_shrinks_while_read_is_refused(tmp_path: Path, name: str) -> None:
-    path, header = tmp_path / "frames.npy", 128 * (name == "packed-npy")
-    np.save(path, np.zeros((10, 256, 64), np.uint8))
-    path.write_bytes(path.read_bytes()[128 - header :])
-    with opened(name, path) as source:
-        os.truncate(path, header + 5 * 16384)
-        assert not source.counts(FrameSpan(0, 5)).any()
-        with pytest.raises(InputError) as caught:
-            source.counts(FrameSpan(0, 6))
-    assert str(caught.value) == f"{path} has become shorter while it was read; copy or record it again"
-
-
 @pytest.mark.parametrize("n_frames", [18, 6])
 def test_info_json_counts_frames_of_the_capture_or_of_a_part(tmp_path: Path, n_frames: int) -> None:
     for number in (1, 2, 3):
@@ -56,37 +31,6 @@ def test_info_json_counts_frames_of_the_capture_or_of_a_part(tmp_path: Path, n_f
     (tmp_path / "info.json").write_text(json.dumps({"no_parts": 3, "no_frames": n_frames}))
     with opened("mat-parts", tmp_path) as source:
         assert source.info.n_frames == 18
-
-
-def test_pictures_are_in_natural_order_without_other_files(tmp_path: Path) -> None:
-    for number in (10, 2, 9, 100):
-        cv2.imwrite(str(tmp_path / f"shot_7_{number}.PNG"), np.full((4, 6), number, np.uint8))
-    (tmp_path / "notes.txt").write_text("of the day")
-    with opened("image-folder", tmp_path) as source:
-        assert source.frames(source.info.span)[:, 0, 0].tolist() == [2, 9, 10, 100]
-
-
-def test_compressed_tiff_pages_are_read(tmp_path: Path) -> None:
-    frames = np.random.default_rng(0).integers(0, 4096, (20, 8, 6)).astype(np.uint16)
-    with tifffile.TiffWriter(tmp_path / "a.tif") as writer:
-        for frame in frames:
-            writer.write(frame, compression="zlib", contiguous=False)
-    with opened("image-folder", tmp_path / "a.tif") as source:
-        assert (source.info.n_frames, source.info.bit_depth) == (20, 16)
-        np.testing.assert_array_equal(source.frames(source.info.span), frames)
-
-
-def test_picture_damaged_or_replaced_while_open_is_refused(tmp_path: Path) -> None:
-    for number in range(3):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.random.default_rng(number).integers(0, 255, (40, 60), np.uint8))
-    with opened("image-folder", tmp_path) as source:
-        whole = (tmp_path / "1.png").read_bytes()
-        (tmp_path / "1.png").write_bytes(whole[: len(whole) // 2])
-        with pytest.raises(InputError, match=r"1.png is damaged: frame 1 cannot be read; copy it again$"):
-            source.counts(source.info.span)
-        cv2.imwrite(str(tmp_path / "1.png"), np.zeros((40, 61), np.uint8))
-        with pytest.raises(InputError, match=r"1.png has changed: it had 40x60 pixels of 8 bits when the capture was opened$"):
-            source.counts(source.info.span)
 
 
 @pytest.mark.parametrize(("name", "shape"), [("swissspad-half", (256, 512)), ("swissspad-full", (512, 512))])
@@ -127,22 +71,6 @@ def test_header_of_fastcam_gives_size_bits_and_rate(tmp_path: Path) -> None:
     lower = (PHOTRON / "sample_60k_16bit.cih").read_bytes()
     (tmp_path / "a.cih").write_bytes(lower.replace(b"EffectiveBit Side : Lower", b"EffectiveBit Side : Higher"))
     assert read_header(tmp_path / "a.cih").encoding == Encoding(16, 0, 0xFFF0)
-
-
-@pytest.mark.parametrize("bits", [12, 16])
-def test_8_effective_bits_of_fastcam_in_16_bit_pixels_are_read(tmp_path: Path, bits: int) -> None:
-    levels = np.random.default_rng(0).integers(0, 256, (3, 4, 6), dtype=np.uint16)
-    stored = levels.astype("<u2").tobytes()
-    if bits == 12:
-        first, second = levels.reshape(-1, 2).T
-        stored = np.stack([first >> 4, (first & 15) << 4 | second >> 8, second & 255], axis=1).astype(np.uint8).tobytes()
-    keys = {"Image Width": 6, "Image Height": 4, "Total Frame": 3, "Color Bit": bits, "File Format": "MRaw"}
-    keys |= {"EffectiveBit Depth": 8, "EffectiveBit Side": "Lower"}
-    (tmp_path / "a.cih").write_text("".join(f"{key} : {value}\n" for key, value in keys.items()))
-    (tmp_path / "a.mraw").write_bytes(stored)
-    with opened("fastcam-mraw", tmp_path / "a.mraw") as source:
-        np.testing.assert_array_equal(source.frames(source.info.span), levels)
-        assert source.response.saturation_level == 255
 
 
 def arrived(name: str, **keys: Any) -> Arrived:

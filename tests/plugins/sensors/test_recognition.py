@@ -66,19 +66,6 @@ def test_swissspad_arrays_are_distinguished_by_correlation(
             np.testing.assert_array_equal(source.frames(FrameSpan(0, 3)), frames[:3])
 
 
-@pytest.mark.parametrize("scene", ["noise", "stripes", "nothing"])
-def test_both_swissspad_arrays_are_named_if_frames_do_not_decide(tmp_path: Path, bin_file: Callable, scene: str) -> None:
-    rng = np.random.default_rng(0)
-    stripes = np.tile(np.sin(np.arange(512) / 9) ** 2, (256, 1))
-    share = {"noise": 0.3, "stripes": stripes, "nothing": 0.0}[scene]
-    frames = (rng.random((512, 256, 512), np.float32) < share).astype(np.uint8)
-    path = tmp_path / "frames.bin"
-    path.write_bytes(bin_file("swissspad-half", frames))
-    found = recognised(path)
-    assert set(found) == {"swissspad-half", "swissspad-full"}
-    assert all(answer.because.endswith("do not decide it") for answer in found.values())
-
-
 @pytest.mark.parametrize("n_frames", [256, 1000])
 def test_spad512_is_recognised_by_file_size(tmp_path: Path, n_frames: int) -> None:
     path = tmp_path / "frames.bin"
@@ -138,17 +125,6 @@ def test_unpacked_bits_are_recognised_by_their_values(tmp_path: Path, dtype: Any
     assert set(recognised(tmp_path / "cube.npy.gz")) == {"npy"}
 
 
-def test_unpacked_bits_with_frames_last_are_recognised(tmp_path: Path, clouds: Callable[..., np.ndarray]) -> None:
-    np.save(tmp_path / "cube.npy", np.ascontiguousarray(np.moveaxis(clouds() * np.uint8(255), 0, -1)))
-    found = recognised(tmp_path / "cube.npy")
-    assert set(found) == {"npy"}
-    assert found["npy"].keys == {"path": str(tmp_path / "cube.npy"), "holds": "bits", "frame_axis": "last"}
-    assert found["npy"].because == (
-        "uint8 of shape (64, 96, 384) in a .npy file, with the values 0 and 255 only, and values are most alike along the last "
-        "axis"
-    )
-
-
 @pytest.mark.parametrize(
     ("axis", "bit_order", "keys"),
     [
@@ -198,12 +174,6 @@ def test_visionsim_is_recognised_by_transforms_json(tmp_path: Path) -> None:
     assert recognised(tmp_path / "other.npy") == {}
 
 
-def test_grey_visionsim_frames_are_not_recognised(tmp_path: Path) -> None:
-    np.save(tmp_path / "frames.npy", FRAMES * 100)
-    (tmp_path / "transforms.json").write_text(json.dumps({"h": 10, "w": 16, "file_path": "frames.npy", "frames": [{}] * 6}))
-    assert recognised(tmp_path) == {}
-
-
 def test_mat_parts_and_ubicept_are_recognised_by_name(tmp_path: Path) -> None:
     (tmp_path / "part_1.mat").write_bytes(b"anything")
     assert set(recognised(tmp_path)) == {"mat-parts"}
@@ -244,17 +214,3 @@ def test_pictures_and_infinicam_files_are_recognised(tmp_path: Path) -> None:
     assert reasons(tmp_path / "c.cih") == {"fastcam-mraw": "c.mdat beside it holds the frames"}
     (tmp_path / "b.tif").unlink()
     assert reasons(tmp_path) == {"image-folder": "it holds 1 .png file"}
-
-
-def test_other_files_are_not_recognised(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    for name, content in {
-        "empty.bin": b"",
-        "text.bin": b"some text of no length in particular",
-        "capture.ubi.h5": b"no HDF5",
-        "a.npy": b"\x93NUMPY",
-        "lonely.cih": b"",
-    }.items():
-        (tmp_path / name).write_bytes(content)
-    for path in (*tmp_path.iterdir(), tmp_path / "nothing", tmp_path / "missing.mp4"):
-        assert recognised(path) == {}

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import weakref
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -12,10 +11,10 @@ from photonpano_sensors.intensity.contributions import ResponseConfig, VideoConf
 
 pytest.importorskip("av")
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
-from photonpano_sensors.intensity.video import DecodedFrames, VideoSource, index_of, open_video
+from photonpano_sensors.intensity.video import DecodedFrames, VideoSource, index_of
 
 
 def opened(path: Path, threads: int = 1, **keys: Any) -> VideoSource:
@@ -53,34 +52,6 @@ def test_frames_are_decoded_in_any_order(
     decoded.close()
 
 
-def test_index_keeps_no_packets(moving: Callable, write_video: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are the film itself, which may be larger than the memory."""
-    alive: weakref.WeakSet[Any] = weakref.WeakSet()
-    most = 0
-
-    class Packet:
-        def __init__(self, packet: Any) -> None:
-            self.pts, self.dts, self.size = packet.pts, packet.dts, packet.size
-            self.is_keyframe, self.is_discard = packet.is_keyframe, packet.is_discard
-
-    class Container:
-        def __init__(self, path: Path) -> None:
-            self._container = open_video(path)
-            self.streams, self.close = self._container.streams, self._container.close
-
-        def demux(self, stream: Any) -> Iterator[Packet]:
-            nonlocal most
-            for packet in map(Packet, self._container.demux(stream)):
-                alive.add(packet)
-                most = max(most, len(alive))
-                yield packet
-
-    monkeypatch.setattr("photonpano_sensors.intensity.video.open_video", Container)
-    index = index_of(write_video(moving(), "a.mp4", "libx264", "yuvj420p"))
-    assert len(index.times) == 40
-    assert most <= 2
-
-
 @pytest.mark.parametrize(
     ("name", "codec", "pixels", "black", "white"),
     [
@@ -110,12 +81,6 @@ def test_encoding_has_range_and_bits_of_the_file(
         assert (source.response.black_level, source.response.saturation_level) == (2, 200)
 
 
-def test_frame_rate_of_spec_overrides_playback_rate(moving: Callable, write_video: Callable) -> None:
-    path = write_video(moving(3), "a.avi", "mjpeg", "yuvj420p")
-    assert opened(path).info.frame_rate_hz == 30
-    assert opened(path, frame_rate_hz=500).info.frame_rate_hz == 500
-
-
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_overlapping_groups_decode_each_frame_about_once(moving: Callable, write_video: Callable, threads: int) -> None:
     """Groups of 20 frames, each beginning at the middle of the one before, merged side by side."""
@@ -132,19 +97,6 @@ def test_overlapping_groups_decode_each_frame_about_once(moving: Callable, write
     decoded.close()
     # A thread that falls behind finds what it needs forgotten; each of two groups decoded by itself would be 380 and more.
     assert 200 <= decoded.n_decoded <= (200 if threads == 1 else 360)
-
-
-def test_cache_stays_within_its_capacity(moving: Callable, write_video: Callable) -> None:
-    index = index_of(write_video(moving(), "a.avi", "mjpeg", "yuvj420p"))
-    decoded = DecodedFrames(index, 1, 5 * index.height * index.width)
-    for frame in range(40):
-        decoded[frame]
-    for frame in range(35, 40):
-        decoded[frame]
-    assert decoded.n_decoded == 40
-    decoded[34]
-    assert decoded.n_decoded == 41
-    decoded.close()
 
 
 def test_truncated_frame_is_refused_when_read(moving: Callable, write_video: Callable) -> None:

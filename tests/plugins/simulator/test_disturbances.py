@@ -113,16 +113,6 @@ def test_object_covers_its_share_of_the_frame(size: tuple[float, float], share: 
     assert lit.mean() == pytest.approx(2 * 0.5, rel=1e-3)
 
 
-def test_object_that_stands_in_the_frame_looks_the_same_wherever_the_camera_points(simulated: Simulated) -> None:
-    source = simulated(n_frames=2000, path={"kind": "pan", "length_px": 60}, objects=[{"size": (0.6, 0.6)}])
-    early, late = (source.counts(span).astype(float) for span in (FrameSpan(0, 500), FrameSpan(1500, 2000)))
-    difference = (early - late) / np.sqrt(np.maximum(early + late, 1))
-    inside = np.zeros(SHAPE, bool)
-    inside[9:31, 12:40] = True
-    assert difference[inside].var() < 1.1
-    assert difference[~inside].var() > 2
-
-
 @pytest.mark.parametrize(
     ("settings", "moved"),
     [({"moves_px": (0.01, -0.005)}, (20, -10)), ({"follows": 1.0}, (-40, 0)), ({"follows": 0.5}, (-20, 0))],
@@ -140,12 +130,6 @@ def test_object_moves_through_the_frame(simulated: Simulated, settings: dict[str
         np.testing.assert_allclose(middles[1], expected, atol=0.5)
     else:
         assert np.isnan(middles[1]).all()
-
-
-def test_object_is_there_in_its_frames_only(simulated: Simulated) -> None:
-    source = simulated(**STILL | {"n_frames": 30}, flux=5, objects=[{"size": (2, 2), "flux": 0, "first": 10, "frames": 5}])
-    lit = source.frames(source.info.span).any(axis=(1, 2))
-    assert np.flatnonzero(~lit).tolist() == [10, 11, 12, 13, 14]
 
 
 def test_dropped_and_repeated_frames_have_the_truth_of_the_frames_that_are_there(simulated: Simulated) -> None:
@@ -178,37 +162,3 @@ def test_lamp_flickers_by_its_depth_at_its_phase(simulated: Simulated) -> None:
     lit = source.frames(FrameSpan(0, 2000)).mean(axis=(1, 2)).reshape(100, 20).mean(axis=0)
     steady = simulated(**STILL, flux=0.3).frames(FrameSpan(0, 2000)).mean()
     np.testing.assert_allclose(-np.log1p(-lit), -np.log1p(-steady) * light[:20], atol=0.02)
-
-
-def test_lamp_lights_its_place_of_the_scene(simulated: Simulated) -> None:
-    spot = {"depth": 1.0, "at": [0.2, 0.5], "radius": 0.1}
-    truth = simulated(lamps=[spot, {**spot, "at": [0.8, 0.5]}]).truth()
-    assert truth["lamps"].shape == (2, 150, 200)
-    assert truth["lamps"][0, 75, 40] > 0.95
-    assert truth["lamps"][0, 75, 160] < 0.01
-    assert truth["lamps"].sum(axis=0).max() <= 1 + 1e-6
-
-
-def covered(**settings: object) -> np.ndarray:
-    """Return the share of each pixel that an object covers: it is dark, and drawn over light."""
-    config = FrameObject.model_validate({"flux": 0.0, **settings})
-    view = np.ones(WIDE, np.float32)
-    DrawnObject(config, WIDE, 1.0, np.zeros((10, 2))).draw(view, 4)
-    return 1 - view
-
-
-@pytest.mark.parametrize("size", [(0.5, 0.5), (0.2, 0.9), (0.31, 0.47)])
-def test_a_disc_is_the_largest_in_its_rectangle(size: tuple[float, float]) -> None:
-    disc, rectangle = covered(shape="disc", size=size), covered(size=size)
-    diameter = min(size[0] * WIDE[1], size[1] * WIDE[0])
-    assert disc.sum() == pytest.approx(np.pi / 4 * diameter**2, rel=0.005)
-    assert not disc[rectangle == 0].any()
-    y, x = np.nonzero(disc > 0.5)
-    assert (x.mean(), y.mean()) == pytest.approx((29.5, 19.5), abs=1e-9)
-    assert max(np.ptp(x), np.ptp(y)) + 1 == pytest.approx(diameter, abs=1.01)
-
-
-def test_a_disc_moves_as_its_rectangle() -> None:
-    disc = covered(shape="disc", size=(0.3, 0.3), at=(0.25, 0.5), moves_px=(1.5, -0.5))
-    y, x = np.mgrid[: WIDE[0], : WIDE[1]]
-    assert ((disc * x).sum() / disc.sum(), (disc * y).sum() / disc.sum()) == pytest.approx((14.5 + 6, 19.5 - 2), abs=0.01)

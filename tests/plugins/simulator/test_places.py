@@ -14,7 +14,7 @@ from photonpano.geometry import Camera
 from photonpano_simulator import scenes
 from photonpano_simulator.camera import SpadSensor
 from photonpano_simulator.config import Sensor, SimulatorConfig
-from photonpano_simulator.paths import camera_path, pace
+from photonpano_simulator.paths import pace
 from photonpano_simulator.scenes import street
 from photonpano_simulator.source import SimulatorSource
 
@@ -79,23 +79,6 @@ def test_boards_are_where_a_camera_that_travels_sees_them(path: dict[str, Any]) 
     assert np.isinf(truth["depth"][truth["labels"] == 0]).all()
 
 
-def test_people_and_clutter_cover_their_share() -> None:
-    truth = simulated(
-        path=TURN | {"travel_m": STEP},
-        people={"share": 0.2, "number": 4, "speed_px": 0.3, "nearest_m": 1.0, "farthest_m": 1.2},
-        clutter={"share": 0.3, "nearest_m": 2.0},
-        objects=[{"size": (0.1, 0.1)}],
-        shutter=[(0.9, 1.0)],
-    ).truth()
-    kinds = truth["label_kinds"][truth["labels"]]
-    assert np.mean(kinds == "person") == pytest.approx(0.2, abs=0.02)
-    assert np.mean(kinds == "board") == pytest.approx(0.3 * 0.8, abs=0.04)
-    assert np.isnan(truth["depth"][kinds == "object"]).all()
-    is_open = truth["shutter_open"][truth["labelled_frames"], None, None]
-    background = np.unpackbits(truth["background"], axis=-1, count=SHAPE[1]).astype(bool)
-    np.testing.assert_array_equal(background, (kinds == "scene") & is_open)
-
-
 def test_people_walk_both_ways_come_again_and_stand_still() -> None:
     source = simulated(n_frames=6000, path={"kind": "hand-shake", "shake": {"rms_px": 1e-9}}, scene={"kind": "street"},
                        people={"share": 0.1, "number": 2, "speed_px": 0.2, "pauses": 0.5})  # fmt: skip
@@ -109,27 +92,6 @@ def test_people_walk_both_ways_come_again_and_stand_still() -> None:
         assert np.sum(side * np.diff(x) < -40) + np.sum(np.diff(inside.astype(int)) == 1) >= 2  # enters more than once
         assert 0.25 < np.mean(abs(steps) < 0.05) < 0.75
     assert np.mean(pace([(0.2, 0.7)], 1001) == 0) == pytest.approx(0.5, abs=0.002)
-
-
-@pytest.mark.parametrize("path", [TURN, {"kind": "pan", "length_px": 60}, {"kind": "random-spline", "length_px": 60}])
-def test_camera_rests_and_jumps_on_the_same_path(path: dict[str, Any]) -> None:
-    moved, way = (camera_path(config(path=path | each), (256, 512), 0) for each in ({"rests": [(0.2, 0.5)]}, {}))
-    np.testing.assert_allclose(moved[201:500], moved[[201] * 299], atol=1e-12)
-    np.testing.assert_allclose(moved[[0, -1]], way[[0, -1]], atol=1e-9)
-    steps = abs(np.diff(moved, axis=0)).max(axis=(1, 2))
-    assert 0 < steps[197] < steps.max() / 4
-    nearest = abs(moved[:, None] - way[None]).max(axis=(2, 3)).min(axis=1)
-    assert nearest.max() < steps.max()
-    cut = camera_path(config(path=path | {"jumps": [{"at": 0.5, "by": -0.3}]}), (256, 512), 0)
-    np.testing.assert_allclose(cut[[0, -1]], way[[0, -1]], atol=1e-9)
-    np.testing.assert_allclose(cut[[499, 500]], way[[649, 350]], atol=0.01 * abs(way).max())
-
-
-def test_closed_shutter_leaves_dark_counts() -> None:
-    source = simulated(shutter=[(0.1, 0.2)], sensor={"dark_rate": 0.05}, n_frames=100)
-    lit = np.array([source.frame(index).mean() for index in range(100)])
-    assert lit[10:20].mean() == pytest.approx(-np.expm1(-0.05), abs=0.002)
-    assert np.delete(lit, np.s_[10:20]).min() > 0.2
 
 
 def fired(rate: float, n_frames: int = 100, **keys: float) -> np.ndarray:
@@ -165,15 +127,6 @@ def test_dead_time_is_that_of_a_renewal_process(rate: float, dead: float) -> Non
     expected = expected[:, 10:]
     after = expected[:, 1:][expected[:, :-1]].mean()
     assert found[1:][found[:-1]].mean() == pytest.approx(after, abs=0.015)
-
-
-def test_frames_of_a_sensor_that_remembers_depend_on_their_index_alone() -> None:
-    faulty = {"afterpulsing": 0.05, "crosstalk": 0.02, "dead_time": 0.3}
-    one, other = simulated(sensor=faulty), simulated(sensor=faulty)
-    frames = [one.frame(index) for index in range(6)]
-    np.testing.assert_array_equal(other.frame(5), frames[5])
-    np.testing.assert_array_equal(other.frame(2), frames[2])
-    np.testing.assert_array_equal(simulated(sensor=dict.fromkeys(faulty, 0)).frame(2), simulated().frame(2))
 
 
 def test_wrong_keys_are_refused() -> None:

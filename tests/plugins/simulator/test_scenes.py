@@ -15,7 +15,7 @@ import pytest
 from photonpano import InputError
 from photonpano_simulator import scenes
 from photonpano_simulator.config import NightScene, PhotoScene, StreetScene
-from photonpano_simulator.scenes import Chance, Drawing, pictures_of, read_scene, scene_flux, street
+from photonpano_simulator.scenes import Chance, Drawing, pictures_of, read_scene, scene_flux
 from photonpano_simulator.travel import stage
 
 
@@ -46,27 +46,12 @@ def test_night_has_the_given_range_and_most_of_it_is_dark(range_db: float) -> No
     assert np.median(flux) < 1e-2 * flux.max()
 
 
-@pytest.mark.parametrize(("bits", "step"), [(np.uint8, 1), (np.uint16, 257)])
-def test_tone_curve_is_inverted(tmp_path: Path, bits: type, step: int) -> None:
-    """The encoded grey 188 has 0.502886 of the light of white (IEC 61966-2-1)."""
-    image = np.zeros((10, 30), bits)
-    image[:, 10:20], image[:, 20:] = 188 * step, 255 * step
-    flux = scene_flux(PhotoScene(file=written(tmp_path / "steps.png", image)), 1.502886 / 3)
-    np.testing.assert_allclose(flux[0, [0, 10, 20]], [0, 0.502886, 1.0], rtol=1e-5)
-
-
 def test_colours_are_converted_to_luminance(tmp_path: Path) -> None:
     image = np.zeros((10, 30, 3), np.uint8)
     for channel in range(3):
         image[:, 10 * channel : 10 * channel + 10, channel] = 255
     flux = scene_flux(PhotoScene(file=written(tmp_path / "bgr.png", image)), 1 / 3)
     np.testing.assert_allclose(flux[0, [0, 10, 20]], [0.0722, 0.7152, 0.2126], rtol=1e-4)
-
-
-def test_photograph_is_resized(photo: Path) -> None:
-    assert scene_flux(PhotoScene(file=photo), 1.0).shape == (150, 200)
-    assert scene_flux(PhotoScene(file=photo, width=100), 1.0).shape == (75, 100)
-    assert scene_flux(PhotoScene(file=photo, width=400), 1.0).shape == (300, 400)
 
 
 def assert_refused(message: str, path: Path) -> None:
@@ -88,33 +73,6 @@ def test_wrong_photographs_are_refused(tmp_path: Path) -> None:
     assert_refused(f"{wide} is 1x20000 px; set scene.width so that no side exceeds 16384 px", wide)
     floats = written(tmp_path / "floats.tiff", np.ones((9, 9, 3), np.float32))
     assert_refused(f"{floats} holds float32 values; a photograph has 8 or 16 bits: save it as PNG", floats)
-
-
-@pytest.mark.parametrize("shape", [(240, 320), (333, 500), (64, 160), (300, 64)])
-def test_street_is_drawn_at_any_size(shape: tuple[int, int]) -> None:
-    image = street(shape, seed=0)
-    assert (image.shape, image.dtype) == (shape, np.float32)
-    assert image.min() >= 0
-    assert image.max() <= 1
-    assert image.std() > 0.1
-
-
-def test_street_depends_on_the_seed() -> None:
-    first = street((240, 320), seed=1)
-    np.testing.assert_array_equal(first, street((240, 320), seed=1))
-    assert np.abs(first - street((240, 320), seed=2)).mean() > 0.05
-
-
-def test_every_frame_has_features() -> None:
-    """Wherever a frame of 254x496 lies, SIFT finds more than a hundred keypoints, blurred as a first level sees them."""
-    image = (street((1365, 2048), seed=0) * 255).astype(np.uint8)
-    keypoints = cv2.SIFT_create().detect(cv2.GaussianBlur(image, (0, 0), 2), None)
-    places = np.array([keypoint.pt for keypoint in keypoints]).astype(int)
-    density = np.zeros(image.shape, np.float32)
-    np.add.at(density, (places[:, 1], places[:, 0]), 1)
-    sums = cv2.integral(density)
-    in_frame = sums[254:, 496:] - sums[:-254, 496:] - sums[254:, :-496] + sums[:-254, :-496]
-    assert in_frame.min() > 100
 
 
 def documented(module: ModuleType) -> set[str]:

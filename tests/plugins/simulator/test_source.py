@@ -35,16 +35,6 @@ def test_defaults_are_small_demos() -> None:
     assert CAMERA.check(camera) == []
 
 
-def test_relative_paths_are_relative_to_the_spec(tmp_path: Path) -> None:
-    config = SimulatorConfig.model_validate(
-        {"scene": {"kind": "photo", "file": "a.png"}, "sensor": {"dark_rates": "b.npy"}}, context={"directory": tmp_path}
-    )
-    assert list(SIMULATOR.check(config)) == [
-        f"there is no file {tmp_path / 'b.npy'}; check the path",
-        f"there is no file {tmp_path / 'a.png'}; check the path",
-    ]
-
-
 def test_check_refuses_path_that_leaves_the_street() -> None:
     scene = {"kind": "street", "width": 800, "height": 600}
     assert problems(scene=scene, path={"kind": "pan", "length_px": 400, "shake": {}}, n_frames=1_000_000) == [
@@ -53,14 +43,6 @@ def test_check_refuses_path_that_leaves_the_street() -> None:
     ]
     (problem,) = problems(path={"kind": "file", "file": "nowhere.npy"})
     assert problem == "there is no file nowhere.npy; check the path"
-
-
-def test_check_refuses_dropped_frames_that_do_not_exist() -> None:
-    assert problems(drops=[{"at": 1990, "frames": 20}], repeats=[{"at": 2000}]) == [
-        "drops names the frames 1990 to 2009, but the camera takes 2000 frames (0 to 1999); shorten the range, "
-        "or raise n_frames",
-    ]
-    assert problems(drops=[{"at": 0, "frames": 2000}]) == ["drops leaves none of the 2000 frames; drop fewer of them"]
 
 
 @pytest.mark.parametrize(
@@ -110,13 +92,6 @@ def test_frames_do_not_depend_on_the_threads_of_opencv(simulated: Simulated) -> 
     np.testing.assert_array_equal(frames[0], frames[2])
 
 
-def test_frames_depend_on_the_seed(simulated: Simulated) -> None:
-    span = FrameSpan(0, 5)
-    first = simulated(run_seed=1).frames(span)
-    assert (first != simulated(run_seed=2).frames(span)).any()
-    np.testing.assert_array_equal(first, simulated(run_seed=2, seed=1).frames(span))
-
-
 def test_frames_are_independent(simulated: Simulated) -> None:
     """Neither in time nor in space does a pixel tell of another, beyond the scene."""
     source = simulated(n_frames=4000, path={"kind": "pan", "length_px": 1e-6}, flux=0.5)
@@ -144,17 +119,6 @@ def test_frames_agree_with_the_truth(simulated: Simulated) -> None:
     z = z_scores(source.counts(source.info.span), 3000, flux)
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
     assert abs(z.var() - 1) < 5 * np.sqrt(2 / z.size)
-
-
-def test_hot_pixels_do_not_change_the_others(simulated: Simulated) -> None:
-    clean = simulated(flux=0.2)
-    hot = simulated(flux=0.2, sensor={"hot_fraction": 0.1, "mask_hot_pixels": True})
-    assert clean.valid.all()
-    assert simulated(sensor={"hot_fraction": 0.1}).valid.all()
-    assert 0.07 < 1 - hot.valid.mean() < 0.13
-    span = clean.info.span
-    np.testing.assert_array_equal(clean.frames(span)[:, hot.valid], hot.frames(span)[:, hot.valid])
-    assert hot.counts(span)[~hot.valid].mean() > 1.5 * clean.counts(span)[~hot.valid].mean()
 
 
 def test_written_capture_has_the_same_frames(simulated: Simulated, tmp_path: Path) -> None:
@@ -194,18 +158,6 @@ def test_pixels_before_a_finer_scene_average_it_over_their_areas(simulated: Simu
     assert np.corrcoef(lit.ravel(), -np.expm1(-expected).ravel())[0, 1] > 0.97
 
 
-def test_path_of_a_finer_scene_is_in_pixels_of_a_frame(simulated: Simulated) -> None:
-    keys = {"path": {"kind": "pan", "length_px": 40}}
-    with simulated(**keys) as coarse, simulated(scene_scale=2, **keys) as fine:
-        middles = [
-            np.array([h @ (25.5, 19.5, 1) / (h @ (25.5, 19.5, 1))[2] for h in source.truth()["homographies"]])
-            for source in (coarse, fine)
-        ]
-    moved, moved_fine = (np.linalg.norm(each[-1] - each[0]) for each in middles)
-    assert (moved, moved_fine) == (pytest.approx(40, rel=1e-3), pytest.approx(80, rel=1e-3))
-    np.testing.assert_allclose(middles[0].mean(axis=0), middles[1].mean(axis=0), atol=0.1)
-
-
 SHAPE = (60, 81)
 CAMERA_SHAPE = (200, 301)
 
@@ -228,20 +180,6 @@ def test_pixel_is_lit_with_probability_of_equation_2(flux: float, dark: float) -
     assert abs(z.var() - 1) < 5 * np.sqrt(kurtosis / z.size)
 
 
-def test_zero_flux_lights_no_pixel_and_high_flux_all() -> None:
-    sensor = SpadSensor(Sensor(), SHAPE, 0)
-    assert counts(sensor, 0.0, 200).max() == 0
-    assert counts(sensor, 1e6, 200).min() == 200
-
-
-def test_small_probabilities_are_not_rounded() -> None:
-    """At 8 bits a chance of 1 / 1000 would be 0 or 1 / 256."""
-    n = 1000
-    lit = counts(SpadSensor(Sensor(), SHAPE, 0), 1e-3, n).sum()
-    expected = n * SHAPE[0] * SHAPE[1] * -np.expm1(-1e-3)
-    assert abs(lit - expected) < 5 * np.sqrt(expected)
-
-
 def test_hot_pixels_have_fraction_and_rates_of_the_config() -> None:
     sensor = SpadSensor(Sensor(hot_fraction=0.3, hot_rate=(0.01, 1.0), dark_rate=0.5), (200, 200), seed=3)
     share = sensor.hot.mean()
@@ -252,20 +190,6 @@ def test_hot_pixels_have_fraction_and_rates_of_the_config() -> None:
     assert -0.05 < logarithms.max() < 0.001
     assert abs(logarithms.mean() + 1) < 5 * 2 / np.sqrt(12 * logarithms.size)
     assert (SpadSensor(Sensor(hot_fraction=0.3), (200, 200), seed=4).hot != sensor.hot).any()
-
-
-def test_files_of_rates_and_hot_pixels_are_added(tmp_path: Path) -> None:
-    rates, hot = np.zeros(SHAPE), np.zeros(SHAPE, bool)
-    rates[3, 4], hot[5, 6] = 0.25, True
-    np.save(tmp_path / "rates.npy", rates)
-    np.save(tmp_path / "hot.npy", hot)
-    config = Sensor(dark_rate=0.01, dark_rates=tmp_path / "rates.npy", hot_pixels=tmp_path / "hot.npy", hot_rate=(0.5, 0.5))
-    sensor = SpadSensor(config, SHAPE, 0)
-    expected = np.full(SHAPE, 0.01)
-    expected[3, 4] += 0.25
-    expected[5, 6] += 0.5
-    np.testing.assert_allclose(sensor.dark_rates, expected, rtol=1e-6)
-    np.testing.assert_array_equal(sensor.hot, hot)
 
 
 @pytest.mark.parametrize(
@@ -292,14 +216,6 @@ def test_wrong_rate_and_mask_files_are_refused(tmp_path: Path, field: str, array
     assert str(caught.value) == message.format(path=path)
 
 
-def test_archive_is_refused_as_a_mask(tmp_path: Path) -> None:
-    path = tmp_path / "truth.npz"
-    np.savez(path, hot=np.zeros(SHAPE, bool))
-    with pytest.raises(InputError) as caught:
-        SpadSensor(Sensor(hot_pixels=path), SHAPE, 0)
-    assert str(caught.value) == f"{path} is an archive; name a .npy file"
-
-
 def exposed(flux: float, **keys: float) -> tuple[IntensityCamera, np.ndarray]:
     camera = IntensityCamera(IntensitySensor(**keys), CAMERA_SHAPE, seed=0)
     return camera, camera.expose(np.full(CAMERA_SHAPE, flux, np.float32), generator(0, Draw.PHOTONS))
@@ -313,11 +229,6 @@ def test_levels_have_mean_and_noise_of_the_response(bits: int, read_noise: float
     variance = flux + camera.response.read_noise**2
     assert estimate.mean(dtype=np.float64) == pytest.approx(flux, abs=5 * np.sqrt(variance / levels.size))
     assert estimate.var(dtype=np.float64) == pytest.approx(variance, rel=0.05)
-
-
-def test_pixel_saturates_at_full_well() -> None:
-    _, levels = exposed(20_000, bits=12)
-    assert (levels == 4095).all()
 
 
 def test_open_shutter_blurs_along_the_motion_and_keeps_the_flux() -> None:

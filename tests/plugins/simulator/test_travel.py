@@ -9,14 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
 from photonpano.geometry import Camera, camera_matrix, corners, positions_of, rotation_matrices, transform_points
 from photonpano_simulator.config import SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
 from photonpano_simulator.paths import camera_path
-from photonpano_simulator.travel import TravelSource, TravelTruth, depth, flow, read_truth, sharp_view, truth_of
+from photonpano_simulator.travel import TravelSource, TravelTruth, depth, flow, sharp_view, truth_of
 from photonpano_simulator.travel_config import TravelConfig
 from photonpano_simulator.travel_planes import Planes, Scene, View, atlas_of, trace
 
@@ -73,14 +72,6 @@ def test_two_views_of_a_plane_differ_by_its_homography(truth) -> None:
     np.testing.assert_allclose(found.vectors[at[:, 1], at[:, 0]], expected, atol=1e-9)
 
 
-def test_depth_of_a_frontal_plane_is_its_distance(truth) -> None:
-    found = depth(truth(planes(wall(1.04, 20, 4.0)), AHEAD), 0)
-    # It is 15.6 px wide, around pixel 31.5.
-    assert found[:, 24:40] == pytest.approx(4.0)
-    assert np.isinf(found[:, :24]).all()
-    assert np.isinf(found[:, 40:]).all()
-
-
 def test_lens_images_points_as_opencv_does(truth) -> None:
     poses, lens = (
         (pose((0.02, -0.03, 0.05), (0.1, 0, 0)), pose((-0.05, 0.04, -0.02), (-0.1, 0.05, 0.2))),
@@ -93,16 +84,6 @@ def test_lens_images_points_as_opencv_does(truth) -> None:
         world = poses[0][:, :3].T @ (far[y, x] * np.array([a, b, 1]) - poses[0][:, 3])
         there, _ = cv2.projectPoints(world, poses[1][:, :3], poses[1][:, 3], K, np.array(lens))
         np.testing.assert_allclose(found.vectors[y, x] + (x, y), there.ravel(), atol=1e-3)
-
-
-def test_lens_bends_the_image(truth) -> None:
-    scene, here = planes(wall(20, 20, 4.0)), pose((0.02, -0.03, 0.05), (0.1, 0, 0))
-    straight, bent = sharp_view(truth(scene, here), 0), truth(scene, here, distortion=(0.2, 0, 0, 0))
-    ideal = bent.camera.ideal(np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), axis=-1)).astype(np.float32)
-    expected, seen = cv2.remap(straight, ideal, None, cv2.INTER_LINEAR), sharp_view(bent, 0)
-    assert np.std(seen - expected) < 0.1 * np.std(seen - straight)
-    with pytest.raises(InputError, match="distortion folds the image of 48x64 px"):
-        sharp_view(truth(scene, here, distortion=(-2, 0, 0, 0)), 0)
 
 
 def test_flow_hides_what_a_nearer_plane_covers(truth) -> None:
@@ -122,48 +103,6 @@ def test_flow_follows_what_moves_on_its_own(truth) -> None:
     np.testing.assert_allclose(found.vectors[23, 31], (3, 0), atol=1e-9)
     assert np.abs(found.vectors[2]).max() < 1e-9
     assert np.flatnonzero(~found.visible[23]).tolist() == [47, 48, 49]
-
-
-def test_flow_to_the_same_frame_is_zero_and_all_is_seen(truth) -> None:
-    scene = planes(wall(20, 20, 6.0), wall(1.0, 1.0, 2.0), ((-1, 1, 6), (4, 0, -3), (0, -0.5, 0.2)))
-    found = flow(truth(scene, pose((0.1, 0.2, 0.3), (0.1, 0.2, 0.3))), 0, 0)
-    assert np.abs(found.vectors).max() < 1e-9
-    assert found.visible.all()
-
-
-def test_planes_are_seen_from_one_side() -> None:
-    there, along, down = wall(20, 20, 4.0)
-    turned = (np.add(there, along), np.negative(along), down)
-    texture = np.ones((2, 2))
-    assert view(planes((there, along, down)), texture).flux(AHEAD, 0).min() == 1
-    assert not view(planes(turned), texture).flux(AHEAD, 0).any()
-
-
-def test_pixels_at_an_edge_mix_what_they_see() -> None:
-    # The near plane begins at pixel 40: it covers columns from 40, and half of column 40 is 0.5 of it.
-    near = (0.5 * 8.5 / 15, -5, 2.0), (5, 0, 0), (0, 10, 0)
-    seen = view(planes(wall(20, 20, 6.0), near), np.full((2, 2), 0.25), np.ones((2, 2))).flux(AHEAD, 0)
-    assert seen[:, :40] == pytest.approx(0.25)
-    assert seen[:, 40] == pytest.approx(0.625)
-    assert seen[:, 41:] == pytest.approx(1.0)
-
-
-def test_a_disc_covers_its_area() -> None:
-    scene = planes(wall(20, 20, 6.0), wall(1.4, 1.0, 2.0, x=0.06, y=-0.03), is_disc=True)
-    seen = view(scene, np.zeros((2, 2)), np.ones((2, 2))).flux(pose((0, 0, 0.4), (0, 0, 0)), 0)
-    # Its diameter is 1 m, the shorter side: 30 px.
-    assert seen.sum() == pytest.approx(np.pi * 15**2, rel=2e-3)
-
-
-def test_a_texture_finer_than_pixels_is_averaged() -> None:
-    rng = np.random.default_rng(1)
-    fine = rng.integers(0, 2, (960, 1280)).astype(float)
-    scene = planes(((-2, -1, 1.5), (6.4, 0, 6.4), (0, 4.8, 0)))
-    seen = view(scene, fine).flux(AHEAD, 0)
-    whole = seen[12:40, 20:50]
-    assert whole.mean() == pytest.approx(0.5, abs=0.01)
-    # A sample of one texel would have the standard deviation 0.5.
-    assert whole.std() < 0.06
 
 
 def test_flux_of_a_pixel_is_the_mean_over_its_area() -> None:
@@ -201,12 +140,6 @@ def test_rendering_agrees_with_the_nearest_plane_of_each_ray() -> None:
     assert agrees.reshape(SHAPE)[1:-1, 1:-1][inside].mean() > 0.995
 
 
-def test_sharp_views_do_not_depend_on_the_threads_that_render(truth) -> None:
-    made = truth(planes(wall(20, 20, 6.0), wall(1.0, 1.0, 2.0)), AHEAD, pose((0, 0, 0.1), (0, 0.1, 0)))
-    np.testing.assert_array_equal(sharp_view(made, 1), sharp_view(made, 1))
-    assert sharp_view(made, 0).mean() == pytest.approx(0.25, abs=0.02)
-
-
 (TRAVEL,) = (each for each in photonpano_sources() if each.name == "travel-simulator")
 SMALL = {"scene": {"kind": "planes"}, "n_frames": 400, "frame_shape": (40, 52), "focal_px": 40.0}
 
@@ -237,12 +170,6 @@ def test_frames_are_draws_of_their_sharp_views(travelling) -> None:
     assert abs((standard[1:] * standard[:-1]).mean()) < 4 / np.sqrt(standard[1:].size)
 
 
-def test_flux_is_the_mean_along_the_path(travelling) -> None:
-    made = truth_of(travelling(flux=0.7, sensor={"quantum_efficiency": 0.5}).truth())
-    views = [sharp_view(made, k).mean() for k in np.linspace(0, 399, 9).astype(int)]
-    assert np.mean(views) == pytest.approx(0.35, rel=1e-5)
-
-
 def test_a_frame_depends_on_seed_and_index_alone(travelling) -> None:
     source, again, other = travelling(run_seed=5), travelling(seed=5), travelling(run_seed=6)
     backwards = [again.frames(FrameSpan(k, k + 1))[0] for k in (9, 3, 0)]
@@ -251,12 +178,6 @@ def test_a_frame_depends_on_seed_and_index_alone(travelling) -> None:
     kept = travelling(run_seed=5, drops=[{"at": 2, "frames": 3}])
     np.testing.assert_array_equal(kept.frames(FrameSpan(2, 3)), source.frames(FrameSpan(5, 6)))
     assert kept.truth()["taken"][:4].tolist() == [0, 1, 5, 6]
-
-
-def test_scenes_depend_on_their_seeds(travelling) -> None:
-    views = [sharp_view(truth_of(travelling(scene={"kind": "planes", "seed": seed}).truth()), 0) for seed in (0, 0, 1)]
-    np.testing.assert_array_equal(views[0], views[1])
-    assert np.abs(views[0] - views[2]).mean() > 0.02
 
 
 def test_path_has_its_length_and_tremor(travelling) -> None:
@@ -274,59 +195,6 @@ def test_path_has_its_length_and_tremor(travelling) -> None:
     small = shaken[:, :, :3] @ np.swapaxes(still[:, :, :3], 1, 2)
     assert np.sqrt((small[:, 0, 2] ** 2).mean()) == pytest.approx(2 / 40, rel=0.05)
     assert np.sqrt((small[:, 0, 1] ** 2).mean()) == pytest.approx(np.deg2rad(0.5), rel=0.1)
-
-
-def test_turn_only_has_no_parallax(travelling) -> None:
-    made = truth_of(travelling(path={"kind": "turn-only", "degrees": 20}).truth())
-    assert np.ptp(positions_of(made.camera_from_world), axis=0).max() < 1e-12
-    first, last = made.camera_from_world[[0, -1], :, :3]
-    turn = last @ first.T
-    homography = made.camera.matrix @ turn @ np.linalg.inv(made.camera.matrix)
-    x, y, w = homography @ (30, 20, 1)
-    np.testing.assert_allclose(flow(made, 0, 399).vectors[20, 30], (x / w - 30, y / w - 20), atol=1e-9)
-    # To the right: what is seen goes left, by 20 degrees.
-    assert x / w < 30 - 10
-    assert np.arccos((np.trace(turn) - 1) / 2) == pytest.approx(np.deg2rad(20))
-
-
-def test_objects_are_where_they_should_be(travelling) -> None:
-    thing = {"shape": "disc", "size": (0.5, 0.5), "at": (0.5, 0.5), "distance_m": 1.0, "moves_px": (0.02, -0.01), "flux": 2.0}
-    made = truth_of(travelling(path={"kind": "turn-only", "degrees": 0}, objects=[thing]).truth())
-    near = depth(made, 0) < 1.5
-    assert np.allclose(depth(made, 0)[near], 1.0)
-    # A disc as high as half the frame.
-    assert near.sum() == pytest.approx(np.pi * 10**2, rel=0.05)
-    np.testing.assert_allclose(flow(made, 0, 300).vectors[20, 26], (6, -3), atol=1e-9)
-    view = sharp_view(made, 0)
-    assert view[near].mean() == pytest.approx(2 * 0.3, rel=0.25)
-
-
-def test_truth_files_are_read(travelling, tmp_path: Path) -> None:
-    source = travelling(drops=[{"at": 0, "frames": 100}])
-    np.savez(tmp_path / "a.truth.npz", **source.truth())
-    made = read_truth(tmp_path / "a.truth.npz")
-    np.testing.assert_array_equal(sharp_view(made, 7), sharp_view(truth_of(source.truth()), 7))
-    assert depth(made, 7).shape == (40, 52)
-    with pytest.raises(InputError, match=r"there is no frame 300; the capture has the frames 0 to 299"):
-        depth(made, 300)
-    np.savez(tmp_path / "b.npz", homographies=np.eye(3)[None])
-    with pytest.raises(InputError, match=r"b\.npz is the truth of a scene without depth: it lacks camera_from_world"):
-        read_truth(tmp_path / "b.npz")
-
-
-@pytest.mark.parametrize("kind", ["room", "facade"])
-def test_other_scenes_are_placed_around_the_camera(kind: str) -> None:
-    for seed in range(3):
-        assert TRAVEL.check(config(scene={"kind": kind, "seed": seed})) == []
-
-
-def test_photograph_is_hung_in_the_scene(travelling, tmp_path: Path) -> None:
-    image = np.zeros((60, 90), np.uint8)
-    image[:, 45:] = 200
-    cv2.imwrite(str(tmp_path / "a.png"), image)
-    texels = travelling(scene={"kind": "planes", "photo": tmp_path / "a.png"}).truth()["textures"]
-    _, counts = np.unique(texels, return_counts=True)
-    assert counts[np.argsort(counts)[-2:]].sum() > 0.9 * texels.size
 
 
 @pytest.mark.parametrize(
@@ -361,22 +229,6 @@ def test_photograph_is_hung_in_the_scene(travelling, tmp_path: Path) -> None:
 )
 def test_wrong_paths_are_refused_before_anything_is_drawn(settings: dict[str, Any], expected: str) -> None:
     assert list(TRAVEL.check(config(**settings))) == [expected]
-
-
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        ({"focal_px": 5}, "focal_px of 5 does not fit frames 52 px wide; take 13 to 5200 px"),
-        ({"focal_px": 9000}, "focal_px of 9000 does not fit frames 52 px wide; take 13 to 5200 px"),
-        ({"centre_px": (60, 20)}, "lies outside the frame of 40x52 px"),
-        ({"sensor": {"filters": "rggb"}}, "scenes with depth are grey"),
-        ({"path": {"kind": "travel", "degrees": 3}}, "Extra inputs"),
-        ({"objects": [{"distance_m": 0}]}, "greater than or equal to 0.2"),
-    ],
-)
-def test_values_out_of_range_are_refused(settings: dict[str, Any], expected: str) -> None:
-    with pytest.raises(ValidationError, match=expected):
-        config(**settings)
 
 
 def test_homographies_of_a_scene_with_depth_are_refused(travelling, tmp_path: Path) -> None:

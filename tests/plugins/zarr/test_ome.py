@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import OutputError, PanoramaRows
+from photonpano import OutputError
 from photonpano.geometry import rescaling, translation
 from photonpano.pipeline.rendering import AttributedExporter
 from photonpano.testing.images import PANORAMA_SHAPE, panorama
@@ -81,12 +80,6 @@ def test_std_of_merged_pixels_is_that_of_their_flux() -> None:
     assert np.mean(spread**2) == pytest.approx(1, abs=5 * np.sqrt(2 / spread.size))
 
 
-def test_colour_that_was_filled_stays_known() -> None:
-    """Where no frame saw a colour, its flux comes from the others, and its weight is 0."""
-    maps = np.stack([np.full((2, 2), 0.3), np.zeros((2, 2)), np.full((2, 2), 0.05), np.zeros((2, 2))]).astype(np.float32)
-    assert ome.halved(maps)[:, 0, 0].tolist() == pytest.approx([0.3, 0, 0.025, 0])
-
-
 @pytest.mark.usefixtures("small_chunks")
 @pytest.mark.parametrize(("projection", "per_unit"), [("planar", 1.0), ("spherical", np.pi / 180)])
 def test_coordinates_are_those_of_the_reference_frame(tmp_path: Path, projection: str, per_unit: float) -> None:
@@ -103,29 +96,6 @@ def test_coordinates_are_those_of_the_reference_frame(tmp_path: Path, projection
         x, y = 5 * 2**level + covered.mean(), 3 * 2**level + covered.mean()
         assert canvas @ [at[2] * per_unit, at[1] * per_unit, 1] == pytest.approx([x, y, 1])
     assert attributes["photonpano"]["unit"] == ("degree" if projection == "spherical" else "pixel of the reference frame")
-
-
-class Tall:
-    """A panorama of many rows, which are the same."""
-
-    in_colour, canvas, projection, white_flux = False, np.eye(3), "planar", 1.0
-
-    def __init__(self, height: int) -> None:
-        self.shape = height, 300
-
-    def rows(self, start: int, stop: int) -> PanoramaRows:
-        row = np.ones((stop - start, self.shape[1]), np.float32)
-        return PanoramaRows(row, row, row, row > 2)
-
-
-def test_memory_does_not_grow_with_the_rows(tmp_path: Path) -> None:
-    peaks = []
-    for height in (512, 512, 8192):  # the first one imports codecs
-        tracemalloc.start()
-        ome.OmeZarrExporter().export(Tall(height), tmp_path / f"{len(peaks)}.ome.zarr")
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[2] < 1.2 * peaks[1] < 4 * 4 * 8192 * 300 / 2  # half of the panorama
 
 
 def test_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

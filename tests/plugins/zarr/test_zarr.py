@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -80,26 +79,6 @@ def test_arrays_of_zarr_python_are_read(tmp_path: Path, chunks: tuple[int, ...],
     with opened(tmp_path / "cube.zarr", width=19, frame_rate_hz=1000) as source:
         assert source.info == StreamInfo(53, 6, 19, 1000)
         np.testing.assert_array_equal(source.frames(FrameSpan(5, 53)), FRAMES[5:])
-
-
-def test_no_library_is_needed_without_compression(written: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain, compressed = written(), written(compressed=True)
-    monkeypatch.setitem(sys.modules, "numcodecs", None)
-    with opened(plain) as source:
-        assert source.counts(FrameSpan(0, 53)).sum() == FRAMES.sum()
-    with pytest.raises(
-        InputError, match=r'compressed with zstd, needs numcodecs, which is not installed: pip install "photonpano\[zarr\]"'
-    ):
-        opened(compressed)
-    with pytest.raises(
-        InputError, match=r'compressing cube.zarr needs numcodecs, which is not installed: pip install "photonpano\['
-    ):
-        ZARR.write(plain, StreamInfo(53, 6, 19, None), [PACKED], compressed=True)
-
-
-def test_keys_of_a_spec_override_the_attributes(written: Any) -> None:
-    with opened(written(), width=20, frame_rate_hz=5.0, bit_order="little") as source:
-        assert (source.info.width, source.info.frame_rate_hz) == (20, 5)
 
 
 def test_damaged_chunk_is_named_when_it_is_read(written: Any) -> None:

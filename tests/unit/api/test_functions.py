@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import photonpano
-from photonpano import Config, Plan, RefinerContribution, capture_plan, convert, discover, explain, info, parse_spec, simulate
+from photonpano import Config, Plan, RefinerContribution, capture_plan, convert, discover, explain, parse_spec
 from photonpano.api.cli.app import commands
 from photonpano.record.run_json import plugin_records
 
@@ -29,37 +29,12 @@ def test_function_has_defaults_of_command(name: str) -> None:
     assert {key: options[key] for key in defaults} == defaults
 
 
-def test_capture_plan_takes_keys_and_corrections_as_data(capture: Plan) -> None:
-    plan = capture_plan("cube.npy", {"width": 13}, source="packed-npy", corrections=["rot90", {"crop": {"rows": [2, None]}}])
-    assert plan.source.config.width == 13
-    assert plan.document["corrections"] == ["rot90", {"crop": {"rows": [2, None], "columns": [None, None]}}]
-
-
 def test_convert_returns_spec_section_that_reads_the_file(capture: Plan) -> None:
     written = convert(capture, "copy.npy")
     assert (written.path, written.truth, written.n_masked) == (Path("copy.npy"), None, 0)
     assert str(written.info) == "40 binary frames of 8x13 at 100 Hz"
     plan = parse_spec({"version": 1, "source": written.source})
     assert (plan.source.config.width, plan.source.config.frame_rate_hz) == (13, 100)
-
-
-def test_simulate_returns_truth_of_simulated_capture(capture: Plan) -> None:
-    keys = {"n_frames": 4, "frame_shape": [8, 16], "path": {"kind": "pan", "length_px": 1}}
-    plan = parse_spec({"version": 1, "source": {"use": "simulator", "with": keys}})
-    assert simulate(plan, "simulated.npy").truth == Path("simulated.truth.npz")
-    assert simulate(capture, "recorded.npy").truth is None
-
-
-def test_info_finds_group_size_without_that_of_the_plan(capture: Plan) -> None:
-    plan = parse_spec({**capture.document, "resample": {"with": {"group_size": 39}}})
-    assert info(plan).group_size == info(capture).group_size == 16
-
-
-def test_explain_of_plan_from_python_is_a_spec(capture: Plan) -> None:
-    plan = parse_spec({**capture.document, "resample": {"with": {"group_size": 8}}})
-    text = explain(plan)
-    assert text.startswith("# the spec as it will run, on 40 binary frames of 8x13 at 100 Hz\n")
-    assert parse_spec(text).document == plan.document
 
 
 def test_refiners_are_explained_and_recorded_with_their_plugins(capture: Plan) -> None:

@@ -122,14 +122,6 @@ def test_run_without_poses_or_times_is_refused(
         export(folder, "colmap", tmp_path / "poses")
 
 
-def test_frame_rate_that_the_run_does_not_know_is_given(folder: Path, tmp_path: Path) -> None:
-    without_rate(folder)
-    export(folder, "tum", tmp_path / "poses", frame_rate_hz=500)
-    np.testing.assert_allclose(np.array(rows(tmp_path / "poses" / "trajectory.txt"), float)[:, 0], np.arange(3, N_FRAMES) / 500)
-    with pytest.raises(ValueError, match="frame_rate_hz must be above 0, got -1"):
-        export(folder, "tum", tmp_path / "other", frame_rate_hz=-1)
-
-
 def test_export_replaces_its_files_only_with_overwrite(folder: Path, tmp_path: Path) -> None:
     poses = tmp_path / "poses"
     export(folder, "colmap", poses, every=5)

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -54,25 +53,6 @@ def test_turn_through_a_lens_is_rendered_again_on_a_sphere(tmp_path: Path) -> No
     assert [again.record["files"][name] for name in names] == [first.record["files"][name] for name in names]
 
 
-def test_rendering_of_a_rendering_is_the_same(small_run: RunResult, tmp_path: Path) -> None:
-    first = render(small_run.directory, tmp_path / "first", ["render.scale=0.5"])
-    second = render(first.directory, tmp_path / "second", ["render.scale=1"])
-    same = "panorama.tiff", "trajectory.npz"
-    assert [second.record["files"][name] for name in same] == [small_run.record["files"][name] for name in same]
-
-
-def test_decisions_of_the_renderer_are_replaced(small_run: RunResult, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    shutil.copytree(small_run.directory, folder)
-    record = json.loads((folder / "run.json").read_text())
-    record["decisions"].append({"what": "rounds", "value": 7, "reason": "the other renderer stopped there"})
-    record["panorama"]["decisions"] = ["rounds"]
-    (folder / "run.json").write_text(json.dumps(record))
-    merged = render(folder, tmp_path / "merged", ["render.use=merge", "render.extent=[0, 0, 40, 32]"])
-    assert merged.record["decisions"] == small_run.record["decisions"]
-    assert merged.record["panorama"]["decisions"] == []
-
-
 def test_capture_that_was_moved_is_named_and_changed_one_refused(
     small_run: RunResult, small_capture: Path, tmp_path: Path
 ) -> None:
@@ -120,32 +100,3 @@ def test_video_has_its_pictures_in_every_format(small_run: RunResult, tmp_path: 
     else:
         with Image.open(tmp_path / name) as film:
             assert (film.n_frames, film.size) == (5, (80, 60))
-
-
-def pictures(folder: Path) -> np.ndarray:
-    return np.stack([cv2.imread(str(each), cv2.IMREAD_UNCHANGED) for each in sorted(folder.iterdir())]) / 65535.0
-
-
-def test_still_things_stand_still(small_run: RunResult, tmp_path: Path) -> None:
-    video(small_run.directory, tmp_path / "film", exposure="1ms", speed=0.01, changes=[BOX])
-    shown = pictures(tmp_path / "film")
-    assert len(shown) == 6  # 97 of 300 frames each, 38.7 apart
-    assert cv2.phaseCorrelate(shown[0], shown[-1])[0] == pytest.approx((0, 0), abs=0.15)
-
-
-def test_smooth_view_follows_the_camera(small_run: RunResult, tmp_path: Path) -> None:
-    video(small_run.directory, tmp_path / "film", view="smooth", exposure=50, changes=["render.extent=[20, 20, 140, 108]"])
-    shown = pictures(tmp_path / "film")
-    steps = [cv2.phaseCorrelate(*pair)[0] for pair in pairwise(shown)]
-    # The camera pans by 60 px at 10 degrees in 300 frames, and trembles by 3 px.
-    np.testing.assert_allclose(steps, np.broadcast_to([-10 * np.cos(np.pi / 18), -10 * np.sin(np.pi / 18)], (5, 2)), atol=2)
-    assert np.std(steps, axis=0).max() < 1
-
-
-def test_trail_shows_the_panorama_around_the_frame(small_run: RunResult, tmp_path: Path) -> None:
-    video(small_run.directory, tmp_path / "film", exposure=50, speed=0.05)
-    video(small_run.directory, tmp_path / "trail", exposure=50, speed=0.05, trail=True)
-    plain, trail = pictures(tmp_path / "film")[0], pictures(tmp_path / "trail")[0]
-    assert (plain == 0).mean() > 0.15
-    assert (trail == 0).mean() < 0.05
-    assert (trail > 0.7).sum() > (plain > 0.7).sum() + 200

@@ -34,17 +34,6 @@ def test_warped_frames_show_the_reference_frame() -> None:
     assert np.abs(np.mean(error)) < 0.01 * TRUE.std()
 
 
-def test_pixels_that_a_frame_does_not_show_are_unknown() -> None:
-    warped = warp(np.ones((1, *SHAPE), bool), translation(10.5, 0)[None])
-    np.testing.assert_array_equal(np.isnan(warped[0]), np.broadcast_to(np.arange(SHAPE[1]) < 10.5, SHAPE))
-
-
-def test_frames_in_colour_are_warped_colour_by_colour() -> None:
-    frames = frames_along(MOTION)
-    coloured = warp(np.stack([frames, 2 * frames, 3 * frames], axis=-1), MOTION)
-    np.testing.assert_allclose(coloured[..., 1], 2 * warp(frames, MOTION), rtol=1e-5)
-
-
 def test_lens_of_a_run_is_seen_through(small_run: RunResult) -> None:
     run = load_trajectory(small_run.directory)
     camera = Camera.of(60.0, SHAPE, (-0.2, 0, 0, 0))

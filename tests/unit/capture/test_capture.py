@@ -56,22 +56,6 @@ def test_chunk_is_the_sum_in_the_smallest_type_that_holds_it(n_frames: int, kind
     np.testing.assert_array_equal(turned.chunk(span), turned.counts(span))
 
 
-def test_capture_without_anything_to_correct_returns_the_counts_themselves() -> None:
-    capture = capture_of(MemorySource(FRAMES))
-    counts = capture.counts(FrameSpan(0, 9))
-    assert capture.corrected(counts, 9) is counts
-    assert capture.truth() is None
-    assert capture.colours() == {}
-    np.testing.assert_array_equal(capture.weights(), np.ones(SHAPE))
-    np.testing.assert_array_equal(capture.packed(FrameSpan(0, 9)), np.packbits(FRAMES[:9], axis=-1))
-
-
-def test_chunks_are_sums_of_the_spans() -> None:
-    spans = [FrameSpan(0, 5), FrameSpan(5, 12)]
-    sums = list(capture_of(MemorySource(FRAMES)).chunks(spans))
-    np.testing.assert_array_equal(sums, [FRAMES[span.start : span.stop].sum(axis=0) for span in spans])
-
-
 def test_part_numbers_its_frames_from_zero_in_every_member() -> None:
     part = part_of(part_of(in_light(Simulated(FRAMES), LIGHT), FrameSpan(2, 30)), FrameSpan(1, 7))
     assert part.info.n_frames == 6
@@ -88,14 +72,6 @@ def test_part_numbers_its_frames_from_zero_in_every_member() -> None:
             read(FrameSpan(3, 7))
     with pytest.raises(InputError, match="the capture has 6 frames"):
         part.sharp_view(6)
-
-
-def test_pixels_moved_twice_are_gathered_once() -> None:
-    turned, twice = (CORRECTIONS["rot90"](), CORRECTIONS["missing-row"]()), CORRECTIONS["flip-lr"]()
-    once = corrected_source(MemorySource(FRAMES), (*turned, twice))
-    again = corrected_source(corrected_source(MemorySource(FRAMES), turned), (twice,))
-    np.testing.assert_array_equal(again.frames(FrameSpan(3, 9)), once.frames(FrameSpan(3, 9)))
-    np.testing.assert_array_equal(again.valid, once.valid)
 
 
 def test_colours_are_seen_in_the_light_through_the_lens_and_divided_by_the_gain_of_the_grey_capture() -> None:
@@ -129,34 +105,6 @@ def raising(error: BaseException) -> Callable[..., Any]:
     return fail
 
 
-def test_capture_reads_what_the_source_reads(source: Any) -> None:
-    named = capture_of(source, ORIGIN)
-    assert capture_of(named, "another") is named
-    assert (named.info, named.response) == (source.info, source.response)
-    assert named.valid is source.valid
-    for method, given in (("counts", SPAN), ("frames", SPAN), ("packed", SPAN), ("sharp_view", 2)):
-        np.testing.assert_array_equal(getattr(named, method)(given), getattr(source, method)(given))
-    truth = named.truth()
-    assert truth is not None
-    assert set(truth) == {"scene"}
-
-
-def test_capture_closes_the_source(source: Any) -> None:
-    closed: list[bool] = []
-    source.close = lambda: closed.append(True)
-    with capture_of(source, ORIGIN):
-        assert not closed
-    assert closed
-
-
-def test_sources_of_colours_name_the_plugin_too(source: Any, memory_source: type) -> None:
-    red = memory_source(source.frames(FrameSpan(0, 8)))
-    red.counts = raising(OSError("gone"))
-    source.colours, source.clear_mix = lambda: {"red": red}, lambda: np.ones(3)
-    with pytest.raises(PluginError, match=r"toys 1\.0.* failed at frames 2 to 4: OSError: gone"):
-        capture_of(source, ORIGIN).colours()["red"].counts(SPAN)
-
-
 @pytest.mark.parametrize(
     ("method", "given", "where", "answer", "problem"),
     [
@@ -187,14 +135,6 @@ def test_plugin_is_named_on_exception_and_on_a_wrong_answer(
         assert str(caught.value) == said
 
 
-def test_errors_written_for_users_pass(source: Any) -> None:
-    error = InputError("the disk was pulled out")
-    source.counts = raising(error)
-    with pytest.raises(InputError) as caught:
-        capture_of(source, ORIGIN).counts(SPAN)
-    assert caught.value is error
-
-
 def test_source_of_0_2_that_corrects_its_sums_is_read_with_a_warning(source: Any, caplog: pytest.LogCaptureFixture) -> None:
     source.corrected, source.light = lambda counts, _: counts / 2, LIGHT
     named = capture_of(source, ORIGIN)
@@ -208,10 +148,3 @@ def test_source_of_0_2_that_corrects_its_sums_is_read_with_a_warning(source: Any
 def test_name_of_0_2_that_was_removed_says_what_to_read_instead() -> None:
     with pytest.raises(ImportError, match=r"LitSource was removed after 0.2: a component reads `corrects_sums`, `weight`"):
         from photonpano import LitSource  # noqa: F401
-
-
-def test_values_are_checked_at_the_first_read(source: Any) -> None:
-    good = source.counts(SPAN)
-    source.counts = lambda _: good + np.uint32(9)
-    with pytest.raises(PluginError, match=r"counts\(\) returns numbers from 0 to 3 for these frames, got 1"):
-        capture_of(source, ORIGIN).counts(SPAN)

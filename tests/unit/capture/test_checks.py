@@ -10,32 +10,27 @@ import numpy as np
 import pytest
 
 from photonpano import (
-    Config,
     FrameSpan,
     InputError,
-    KnowsSharpViews,
-    SourceContribution,
     SpecError,
     StreamInfo,
     open_source,
     parse_spec,
-    run,
     simulate,
 )
-from photonpano.capture import capture_of, part_of
+from photonpano.capture import capture_of
 from photonpano.capture.writing import truth_path
 from photonpano.errors import LocationError
 from photonpano.execution.context import Context
 from photonpano.photometry import IntensityResponse
 from photonpano.pipeline.components import build_source
-from photonpano.pipeline.obstacles import naming_obstacles, obstacles, order_warning, repetition_px, timeline_of
+from photonpano.pipeline.obstacles import naming_obstacles, order_warning, timeline_of
 from photonpano.pipeline.summary import require_photons
 from photonpano.reading import FrameFile, FrameLayout, PackedFileSource
 from photonpano.record.contents import changes, fingerprint
 from photonpano.record.schema import CaptureRecord
 from photonpano.testing import MemorySource
-from photonpano.values import Decision
-from photonpano_simulator.travel import sharp_view, truth_of
+from photonpano.values import Still
 
 DARK = (
     "no pixel is lit in any of {} frames sampled all over the capture; "
@@ -55,15 +50,6 @@ def test_require_photons_refuses_all_dark_and_all_lit(
     with pytest.raises(InputError) as caught:
         require_photons(memory_source(np.full((n_frames, 4, 8), value)))
     assert str(caught.value) == text.format(looked_at)
-
-
-@pytest.mark.parametrize("value", [0, 1])
-def test_require_photons_accepts_one_pixel_of_the_last_frame_unless_it_is_masked(memory_source: type, value: int) -> None:
-    frames, valid = np.full((1000, 4, 8), value), np.ones((4, 8), bool)
-    frames[-1, 2, 3], valid[2, 3] = 1 - value, False
-    require_photons(memory_source(frames))
-    with pytest.raises(InputError):
-        require_photons(memory_source(frames, valid))
 
 
 @pytest.mark.parametrize(("level", "text"), [(16, "no pixel is brighter than black"), (235, "every pixel is saturated")])
@@ -98,10 +84,6 @@ def test_packed_source_that_is_read_in_another_order_is_warned_of(
         assert warning.endswith(" if the first pixel is the lowest bit; check the source and its keys")
 
 
-def test_source_without_packed_frames_is_not_judged(clouds: Callable[..., np.ndarray]) -> None:
-    assert order_warning(MemorySource(clouds(n_frames=16))) is None
-
-
 RNG = np.random.default_rng(8)
 
 
@@ -130,26 +112,6 @@ def test_independent_and_dark_and_saturated_frames_are_no_copies(tmp_path: Path)
     assert repeated(tmp_path, frames) == []
 
 
-def test_copies_are_found_in_frames_that_are_not_packed() -> None:
-    frames = taken(50)
-    np.testing.assert_array_equal(timeline_of(MemorySource(frames), Context()).taken, np.arange(50))
-    timeline = timeline_of(MemorySource(np.repeat(frames, 2, axis=0)), Context())
-    np.testing.assert_array_equal(timeline.taken, np.repeat(np.arange(50), 2))
-    grey = MemorySource(np.repeat(RNG.integers(0, 256, (20, 40, 64)), 2, axis=0))
-    assert timeline_of(grey, Context()).taken[-1] == 19
-
-
-def test_copies_raise_the_variance_of_a_sum() -> None:
-    order = np.array([0, 0, 1, 2, 2, 2])
-    timeline = timeline_of(MemorySource(taken(3)[order]), Context())
-    capture = replace(capture_of(MemorySource(taken(3)[order])), copies=timeline.copies)
-    # Two times one frame and three times another one add as much variance as 4 + 1 + 9 frames.
-    assert capture.times_counted(FrameSpan(0, 6)) == pytest.approx(14 / 6)
-    assert capture.times_counted(FrameSpan(1, 3)) == 1
-    assert part_of(capture, FrameSpan(2, 5)).times_counted(FrameSpan(1, 3)) == 2
-    assert capture_of(MemorySource(taken(3))).times_counted(FrameSpan(0, 3)) == 1
-
-
 SHAPE = 96, 128
 
 
@@ -162,28 +124,10 @@ def tiles(period: int) -> np.ndarray:
     return np.where((rows // (period // 2) + columns // (period // 2)) % 2, 0.05, 0.15)
 
 
-def texture(seed: int) -> np.ndarray:
-    waves = np.random.default_rng(seed).normal(size=SHAPE)
-    smooth = np.fft.ifft2(np.fft.fft2(waves) * np.outer(*(np.exp(-((np.fft.fftfreq(n) * 12) ** 2)) for n in SHAPE))).real
-    return np.asarray(0.1 + 0.03 * smooth / smooth.std()).clip(0.01, 0.4)
-
-
-def test_period_of_checkerboard_is_distance_of_its_nearest_copy() -> None:
-    found = repetition_px(counts(tiles(20), 0), counts(tiles(20), 1))
-    assert found == pytest.approx(10 * np.sqrt(2), abs=0.5)
-
-
-@pytest.mark.parametrize(
-    "rate", [*map(texture, range(5)), np.zeros(SHAPE), np.full(SHAPE, 0.02)], ids=[*map(str, range(5)), "dark", "flat"]
-)
-def test_texture_and_flat_frames_do_not_repeat(rate: np.ndarray) -> None:
-    assert repetition_px(counts(rate, 0), counts(np.roll(rate, 3, axis=1), 1)) is None
-
-
 def test_error_names_what_stands_still_and_what_repeats() -> None:
     frames = np.random.default_rng(0).random((64, *SHAPE)) < 4 * tiles(20)
-    decisions = [Decision("standing_share", 0.38, "")]
-    with pytest.raises(LocationError) as raised, MemorySource(frames) as source, naming_obstacles(source, decisions):
+    capture = replace(capture_of(MemorySource(frames)), still=Still(0.38))
+    with pytest.raises(LocationError) as raised, naming_obstacles(capture):
         raise LocationError("none of the pairs could be located")
     assert str(raised.value).splitlines() == [
         "none of the pairs could be located",
@@ -192,12 +136,6 @@ def test_error_names_what_stands_still_and_what_repeats() -> None:
         "The image repeats every 14 px, so that pairs fit at several places: "
         "use shorter groups, between which it moves by less than half of that.",
     ]
-
-
-def test_error_stays_as_it_is_where_nothing_is_found() -> None:
-    frames = np.random.default_rng(0).random((64, *SHAPE)) < texture(0)
-    with MemorySource(frames) as source:
-        assert obstacles(source, []) == []
 
 
 def part(path: Path, start: int, stop: int) -> dict[str, Any]:
@@ -215,18 +153,6 @@ def test_part_holds_the_frames_of_its_span(small_capture: Path) -> None:
             np.testing.assert_array_equal(getattr(some, method)(inner), getattr(whole, method)(outer))
 
 
-def test_run_of_a_part_is_that_of_a_capture_with_these_frames(small_capture: Path, tmp_path: Path) -> None:
-    np.save(tmp_path / "cut.npy", np.load(small_capture)[40:240])
-    cut = {"use": "packed-npy", "with": {"path": str(tmp_path / "cut.npy")}}
-    rest = {"version": 1, "resample": {"with": {"group_size": 50}}, "levels": 1}
-    of_part, of_file = (
-        run(parse_spec(rest | {"source": source}, output=tmp_path / name)).record
-        for name, source in (("part", part(small_capture, 40, 240)), ("file", cut))
-    )
-    assert of_part["files"] == of_file["files"]
-    assert of_part["source"]["n_frames"] == 200
-
-
 def test_truth_of_a_part_is_that_of_its_frames(tmp_path: Path) -> None:
     keys = {"n_frames": 60, "frame_shape": [24, 32], "path": {"kind": "pan", "length_px": 20}}
     truths = []
@@ -237,18 +163,6 @@ def test_truth_of_a_part_is_that_of_its_frames(tmp_path: Path) -> None:
     whole, some = truths
     np.testing.assert_array_equal(some["homographies"], whole["homographies"][10:40])
     np.testing.assert_array_equal(some["scene"], whole["scene"])
-
-
-def test_part_of_a_capture_with_depth_shows_the_same_views() -> None:
-    keys = {"scene": {"kind": "planes"}, "n_frames": 60, "frame_shape": [24, 32], "focal_px": 25, "drift": 2}
-    keys["objects"] = [{"moves_px": [0.5, 0]}]
-    views = []
-    for more, frame in (({}, 30), ({"frames": [10, 40]}, 20)):
-        with open_source(parse_spec({"version": 1, "source": {"use": "travel-simulator", "with": keys | more}})) as source:
-            assert isinstance(source, KnowsSharpViews)
-            views += [source.sharp_view(frame), sharp_view(truth_of(source.truth()), frame)]
-    for view in views[1:]:
-        np.testing.assert_array_equal(view, views[0])
 
 
 @pytest.mark.parametrize(
@@ -267,14 +181,6 @@ def test_frames_that_are_no_part_of_the_capture_are_named(small_capture: Path, f
     assert str(caught.value).endswith(message)
 
 
-def test_source_with_a_key_frames_of_its_own_is_refused() -> None:
-    class Keys(Config):
-        frames: int = 3
-
-    with pytest.raises(ValueError, match="toy: the key 'frames' of a source is the framework's; give yours another name"):
-        SourceContribution(name="toy", summary="Toy", config=Keys, build=lambda *_: None)
-
-
 FRAMES = np.random.default_rng(0).integers(0, 256, (200, 16, 3), np.uint8)
 
 
@@ -289,14 +195,6 @@ def fingerprint_of(cube: Path, **changed: Any) -> CaptureRecord:
     plan = parse_spec({"version": 1, "source": source, "corrections": [], **changed})
     with open_source(plan) as opened:
         return fingerprint(plan, opened)
-
-
-def test_fingerprint_names_the_file_with_its_size_and_time(cube: Path) -> None:
-    os.utime(cube, ns=(0, 1_000_000_007))
-    assert fingerprint_of(cube)["files"] == [
-        {"path": str(cube), "bytes": cube.stat().st_size, "modified": "1970-01-01T00:00:01.000000007Z", "etag": None}
-    ]
-    assert changes(fingerprint_of(cube), fingerprint_of(cube)) == []
 
 
 def test_changes_name_a_touched_file_and_other_frames_of_the_same_size_and_time(cube: Path) -> None:
@@ -335,12 +233,3 @@ def test_fingerprint_of_a_folder_leaves_out_runs_in_it(tmp_path: Path) -> None:
         assert changes(before, fingerprint(plan, source)) == []
         (tmp_path / "more.bin").write_bytes(b"content")
         assert changes(before, fingerprint(plan, source)) == [f"{tmp_path} has another size"]
-
-
-def test_fingerprint_of_a_simulation_has_frames_only() -> None:
-    settings = {"n_frames": 20, "frame_shape": [16, 24]}
-    plan = parse_spec({"version": 1, "source": {"use": "simulator", "with": settings}, "corrections": []})
-    with open_source(plan) as source:
-        found = fingerprint(plan, source)
-    assert found["files"] == []
-    assert len(found["frames_sha256"]) == 64

@@ -10,7 +10,6 @@ import pytest
 
 from photonpano import FrameSpan, InputError
 from photonpano.corrections import corrected_source, without_still_pixels
-from photonpano.pipeline.obstacles import obstacles
 from photonpano.reading import COLOURS, bayer_array
 from photonpano.testing import MemorySource
 
@@ -57,25 +56,6 @@ def test_corrected_sums_of_all_colours_are_alike_and_weighted_by_their_light(
     assert gains == pytest.approx({"red_gain": 0.375, "green_gain": 1, "blue_gain": 0.25}, rel=0.03)
 
 
-def test_sources_of_colours_divide_the_pixels_and_count_as_recorded(grey_scene: MemorySource, corrections: Callable) -> None:
-    colours = corrected_source(grey_scene, corrections(ALL)).colours()
-    assert list(colours) == ["red", "green", "blue"]
-    assert np.sum([each.valid for each in colours.values()], axis=0).tolist() == np.ones(SHAPE, int).tolist()
-    for name, each in colours.items():
-        assert not each.corrects_sums
-        np.testing.assert_array_equal(each.counts(WHOLE), grey_scene.counts(WHOLE))
-        assert each.counts(WHOLE)[each.valid].mean() / N_FRAMES == pytest.approx(1 - np.exp(-FLUX[name]), rel=0.02)
-
-
-def test_colours_are_corrected_for_dark_counts(grey_scene: MemorySource, corrections: Callable, tmp_path: Path) -> None:
-    np.save(tmp_path / "rates.npy", np.full(SHAPE, 0.05))
-    source = corrected_source(grey_scene, corrections({"dark-counts": {"dark": "rates.npy"}}, ALL))
-    red = source.colours()["red"]
-    assert red.corrects_sums
-    summed = red.corrected(red.counts(WHOLE), N_FRAMES)[red.valid].mean() / N_FRAMES
-    assert summed == pytest.approx(1 - np.exp(-(FLUX["red"] - 0.05)), rel=0.03)
-
-
 def test_flux_of_clear_pixels_is_known_as_a_mix_of_the_others(mosaic: np.ndarray, corrections: Callable) -> None:
     """Two panes of strong colours; a clear pixel sees the sum of red, green and blue."""
     flux = np.empty((N_FRAMES, *SHAPE, 3))
@@ -83,18 +63,6 @@ def test_flux_of_clear_pixels_is_known_as_a_mix_of_the_others(mosaic: np.ndarray
     source = corrected_source(behind(mosaic, flux), corrections({"colour-filter": {"pattern": "pattern.npy", "keep": "all"}}))
     assert list(source.colours()) == ["red", "green", "blue", "clear"]
     assert source.clear_mix() == pytest.approx(np.ones(3), abs=0.15)
-
-
-def test_filter_array_is_no_repeating_scene(grey_scene: MemorySource, corrections: Callable) -> None:
-    assert "repeats every 2 px" in " ".join(obstacles(grey_scene, ()))
-    assert obstacles(corrected_source(grey_scene, corrections(ALL)), ()) == []
-
-
-def test_moved_pixels_keep_their_colours(grey_scene: MemorySource, corrections: Callable) -> None:
-    source = corrected_source(grey_scene, corrections({"crop": {"rows": [1, None]}}, ALL, "flip-lr"))
-    expected = bayer_array("rggb", (SHAPE[0] - 1, SHAPE[1]))[:, ::-1]
-    for place, each in enumerate(source.colours().values()):
-        np.testing.assert_array_equal(each.valid, expected == place)
 
 
 def test_bayer_array_of_the_capture_is_the_default_and_makes_auto_see_colours(

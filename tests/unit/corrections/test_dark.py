@@ -45,15 +45,6 @@ def test_dark_counts_are_subtracted_without_bias(rate: float, corrections: Calla
     assert abs(found.mean() + np.expm1(-flux)) < 4 * error
 
 
-def test_correction_of_a_sum_is_the_sum_of_corrections(corrections: Callable, tmp_path: Path) -> None:
-    rates = np.random.default_rng(0).uniform(0, 0.1, SHAPE)
-    np.save(tmp_path / "dark.npy", rates)
-    with corrected_source(MemorySource(frames_of(0.3 + rates)), corrections({"dark-counts": {"dark": "dark.npy"}})) as source:
-        parts = [FrameSpan(0, 3), FrameSpan(3, N)]
-        together = sum(source.corrected(source.counts(part), len(part)) for part in parts)
-        np.testing.assert_allclose(source.corrected(source.counts(SPAN), N), together, atol=1e-3)
-
-
 def test_dark_counts_of_intensities_are_subtracted(corrections: Callable, tmp_path: Path) -> None:
     values = np.random.default_rng(0).integers(0, 200, (5, *SHAPE), dtype=np.uint8)
     grey = MemorySource(values)
@@ -90,7 +81,6 @@ def test_measure_dark_returns_the_rate_of_the_photons(tmp_path: Path) -> None:
     assert DarkFrames(again.rates, None).n_frames is None
 
 
-UNLIKELY = "holds dark counts that are negative or not finite"
 WRONG = {
     "negative": (
         np.array([[0, 1], [2, -0.5]]),
@@ -114,16 +104,6 @@ def test_wrong_dark_files_are_refused(case: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         read_dark(path)
     assert str(caught.value) == f"{path} {message}"
-
-
-def test_wrong_dark_archives_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "dark.npz"
-    np.savez(path, homographies=np.eye(3))
-    with pytest.raises(InputError, match="is an archive without `rates`; name what `photonpano dark` wrote, or a"):
-        read_dark(path)
-    np.savez(path, rates=np.zeros((2, 2)), n_frames=np.array(-3))
-    with pytest.raises(InputError, match="is damaged: n_frames is not a positive integer"):
-        read_dark(path)
 
 
 FRAME, N_PANNED = (96, 128), 600
@@ -154,12 +134,6 @@ def test_vignette_is_measured_from_moving_scene(flux: float, panned: Callable[..
     assert decision.what == "vignette_gain"
     assert decision.value == pytest.approx(vignette.gain[0, 0], abs=1e-3)
     assert decision.reason.startswith("light that reaches the corners, relative to the middle, from ")
-
-
-@pytest.mark.parametrize(("vignette", "speed"), [(0.0, 1.0), (0.8, 0.0)], ids=["no vignette", "nothing moves"])
-def test_vignette_is_none_where_nothing_shows_it(vignette: float, speed: float, panned: Callable[..., MemorySource]) -> None:
-    motion = KnownMotion(lambda frame: MOTION.at([speed * float(frame)])[0])
-    assert estimate_vignette(panned(vignette, 0.3, speed), motion) is None
 
 
 def test_divided_sums_are_on_average_those_without_vignette() -> None:

@@ -3,12 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from photonpano import Capture, FrameSpan
-from photonpano.corrections import DarkFrames, corrected_source, hot_in_the_dark, write_dark
+from photonpano import Capture
+from photonpano.corrections import DarkFrames, corrected_source, write_dark
 from photonpano.geometry import translation
 from photonpano.testing import MemorySource
 from photonpano.testing.captures import seen_along
@@ -24,16 +23,6 @@ def hot_ones(share: float = 0.03, seed: int = 0) -> np.ndarray:
 def exposed(flux: np.ndarray, n: int = N, seed: int = 1) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return np.stack([rng.random(SHAPE) < -np.expm1(-flux) for _ in range(n)]).astype(np.uint8)
-
-
-@pytest.mark.parametrize("n_frames", [100, 10_000])
-def test_single_counts_in_few_dark_frames_are_not_hot(n_frames: int) -> None:
-    rng, hot = np.random.default_rng(2), hot_ones()
-    rates = np.where(hot, 0.5, 0.0013)
-    measured = DarkFrames((rng.poisson(rates * n_frames) / n_frames).astype(np.float32), n_frames)
-    found, limit = hot_in_the_dark(measured, 10, np.ones(SHAPE, bool))
-    np.testing.assert_array_equal(found, hot)
-    assert 0.0013 < limit < 0.5
 
 
 def test_hot_pixels_are_found_in_dark_frames(corrections: Callable, tmp_path: Path) -> None:
@@ -79,27 +68,6 @@ def test_masked_pixels_are_not_used_as_neighbours(every: int, corrections: Calla
     source = corrected_source(MemorySource(frames), corrections({"mask": {"file": "bad.npy"}}, "hot-pixels"))
     assert source.valid[~bad & ~hot].all()
     assert (source.valid[~bad & hot].mean() < 0.2) == (every == 2)
-
-
-def test_frames_are_read_once_and_not_at_all_for_a_check(corrections: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = exposed(np.full(SHAPE, 0.1), n=50)
-    read: list[FrameSpan] = []
-    counts = MemorySource.counts
-    monkeypatch.setattr(MemorySource, "counts", lambda self, span: read.append(span) or counts(self, span))
-    checked = corrected_source(MemorySource(frames), corrections("hot-pixels"), look=False)
-    assert checked.info.frame_shape == SHAPE
-    assert read == []
-    source = corrected_source(MemorySource(frames), corrections("hot-pixels"))
-    assert [source.valid.all() for _ in range(3)] == [True] * 3
-    assert read == [FrameSpan(0, 50)]
-
-
-def test_many_hot_pixels_are_found_among_each_other(corrections: Callable) -> None:
-    """Of every pixel's neighbours one in five is hot, too."""
-    hot = hot_ones(0.2)
-    source = corrected_source(MemorySource(exposed(np.where(hot, 0.4, 0.05))), corrections("hot-pixels"))
-    assert (~source.valid[hot]).mean() > 0.95
-    assert source.valid[~hot].mean() > 0.999
 
 
 FRAME, N_PANNED = (96, 128), 640
@@ -178,25 +146,3 @@ def test_still_pixels_masks_nothing_but_records_share_if_most_stands(
     assert source.valid.all()
     assert decided(source)["standing_share"] == pytest.approx(0.75, abs=0.06)
     assert "of the frame stands still, so that it is open which part is the scene" in source.decisions[0].reason
-
-
-def test_still_pixels_takes_lines_along_the_motion_for_no_rest(panned: Callable, corrections: Callable) -> None:
-    """Rails that stay in their rows while the camera pans along them, below houses."""
-    scene = np.random.default_rng(0).random((682, 1024), np.float32)
-    scene = cv2.GaussianBlur(scene, (0, 0), 2) ** 3
-    scene[300:] = np.repeat(scene[300:, :1], 1024, axis=1)
-    source = found_in(panned(0.15, 0.3, scene), corrections)
-    assert source.valid.mean() > 0.999
-
-
-def test_still_pixels_masks_nothing_of_uniform_frames(corrections: Callable) -> None:
-    source = found_in(np.full((N_PANNED, *FRAME), 0.2, np.float32), corrections)
-    assert source.valid.all()
-    assert decided(source)["standing_share"] == 0
-    assert source.decisions[0].reason == f"0.00% of {FRAME[0] * FRAME[1]} pixels are masked: nothing in the frame moves"
-
-
-@pytest.mark.parametrize("n_frames", [1, 20, 40])
-def test_still_pixels_leaves_short_captures_as_they_are(n_frames: int, corrections: Callable) -> None:
-    frames = np.random.default_rng(0).integers(0, 2, (n_frames, *FRAME), np.uint8)
-    assert corrected_source(MemorySource(frames), corrections("still-pixels")).valid.all()

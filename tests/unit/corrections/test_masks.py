@@ -43,16 +43,6 @@ def test_mask_from_a_picture_equals_mask_from_an_array(source: MemorySource, cor
         np.testing.assert_array_equal(corrected_source(source, corrections({"mask": {"file": name}})).valid, ~bad)
 
 
-def test_mask_must_have_the_size_at_its_place_of_the_list(refused: Callable, tmp_path: Path) -> None:
-    np.save(tmp_path / "bad.npy", np.zeros((10, 6), bool))
-    mask = {"mask": {"file": "bad.npy"}}
-    file = tmp_path / "bad.npy"
-    assert refused(mask) == f"{file} has 10x6 px, and frames have 6x10 px at this place of the list"
-    assert refused({"crop": {"rows": [2, None]}}, "rot90", mask) == (
-        f"{file} has 10x6 px, and frames have 10x4 px at this place of the list"
-    )
-
-
 def test_wrong_mask_files_are_refused(refused: Callable, tmp_path: Path) -> None:
     np.save(tmp_path / "rates.npy", np.zeros(SHAPE))
     np.savez(tmp_path / "dark.npz", rates=np.zeros(SHAPE))
@@ -106,18 +96,6 @@ def test_masked_frames_count_in_no_sum(source: MemorySource, corrections: Callab
     assert np.isnan(binned_mean(capture, FrameSpan(20, 30))[bad]).all()
 
 
-def test_pixels_interpolated_from_masked_ones_are_masked_in_these_frames(
-    source: MemorySource, corrections: Callable, tmp_path: Path
-) -> None:
-    red, bad = np.zeros((2, *SHAPE), bool)
-    red[2, [3, 7]] = bad[1, 2] = True
-    np.save(tmp_path / "pattern.npy", pattern_of(red))
-    np.save(tmp_path / "bad.npy", bad)
-    filled = {"colour-filter": {"pattern": "pattern.npy", "others": "interpolate"}}
-    capture = corrected_source(source, corrections({"mask": {"file": "bad.npy", "frames": [20, 30]}}, filled))
-    assert np.argwhere(~capture.masked_in(FrameSpan(20, 21)).valid).tolist() == [[1, 2], [2, 3]]
-
-
 def test_masks_that_leave_no_pixel_in_some_frames_are_refused(refused: Callable, tmp_path: Path) -> None:
     half = np.arange(10) < 5
     for name, bad in (("left", half), ("right", ~half), ("all", half | True)):
@@ -131,20 +109,6 @@ def test_masks_that_leave_no_pixel_in_some_frames_are_refused(refused: Callable,
 
 def pattern_of(red: np.ndarray) -> np.ndarray:
     return np.where(red[..., None], np.uint8(RED), np.uint8(WHITE))
-
-
-def test_colour_filter_masks_other_colours(source: MemorySource, corrections: Callable, tmp_path: Path) -> None:
-    red = np.random.default_rng(3).random(SHAPE) < 0.3
-    np.save(tmp_path / "pattern.npy", pattern_of(red))
-    cv2.imwrite(str(tmp_path / "pattern.png"), pattern_of(red)[..., ::-1])
-    for name in ("pattern.npy", "pattern.png"):
-        clear, only_red, both = (
-            corrected_source(source, corrections({"colour-filter": {"pattern": name} | keep})).valid
-            for keep in ({}, {"keep": ["red"]}, {"keep": ["red", "clear"]})
-        )
-        np.testing.assert_array_equal(clear, ~red)
-        np.testing.assert_array_equal(only_red, red)
-        assert both.all()
 
 
 def test_interpolated_pixels_are_the_mean_of_clear_neighbours(
@@ -167,18 +131,6 @@ def test_interpolated_pixels_are_the_mean_of_clear_neighbours(
     k = counts.astype(float)
     beside, corners = k[3, 3] + k[2, 2], k[1, 2] + k[1, 4] + k[3, 2] + k[3, 4]
     assert summed[2, 3] == pytest.approx((beside + corners / 2) / 4)
-
-
-def test_interpolated_pixels_without_clear_neighbour_are_masked(
-    source: MemorySource, corrections: Callable, tmp_path: Path
-) -> None:
-    red = np.zeros(SHAPE, bool)
-    red[:3, :3] = True
-    np.save(tmp_path / "pattern.npy", pattern_of(red))
-    keys = {"pattern": "pattern.npy", "others": "interpolate"}
-    lonely = np.zeros(SHAPE, bool)
-    lonely[:2, :2] = True
-    np.testing.assert_array_equal(corrected_source(source, corrections({"colour-filter": keys})).valid, ~lonely)
 
 
 def test_wrong_patterns_are_refused(refused: Callable, tmp_path: Path) -> None:

@@ -1,25 +1,20 @@
 """What moves before the background is told from it, and left out of what is merged and compared."""
 
-from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, InputError, Source, parse_spec
-from photonpano.capture import before, capture_of
-from photonpano.corrections import estimate_vignette
+from photonpano import FrameSpan, Group, Source, parse_spec
+from photonpano.capture import with_background
 from photonpano.corrections.movers import (
-    before_background_of,
     decision_of,
     find_background,
     without_layers,
-    write_background,
 )
 from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch
-from photonpano.geometry import PATCHES, Camera, FrameTrajectory, rotation_matrices, translation
+from photonpano.geometry import PATCHES, translation
 from photonpano.merging import accumulate, chunks_of
 from photonpano.motion.level import VirtualExposures
 from photonpano.pipeline.components import build_levels
@@ -28,7 +23,6 @@ from photonpano.testing import KnownMotion, MemorySource, Scene
 SHAPE, N = (96, 128), 1600
 MOTION = KnownMotion(lambda frame: translation(0.04 * float(frame), 0.01 * float(frame)))
 ALL = FrameSpan(0, N)
-STEADY = np.ones(N)
 
 
 @cache
@@ -64,15 +58,6 @@ def shares(found: object, frames: range, side: int = 32, speed: float = 0.06) ->
     return float(np.mean(hits)), float(np.mean(false))
 
 
-def test_what_walks_is_hidden_behind_filters_of_which_few_pixels_see_much() -> None:
-    gains = np.tile(np.array([[0.2, 0.4], [1.0, 0.2]], np.float32), (SHAPE[0] // 2, SHAPE[1] // 2))
-    found = find_background(replace(capture_of(panned(with_mover=True)), weight=gains), MOTION, None, ALL, Context(1))
-    assert found is not None
-    hit, false = shares(found, range(100, 1500, 100))
-    assert hit > 0.97
-    assert false < 0.25
-
-
 @pytest.mark.parametrize("light", [0.0, 0.4], ids=["steady", "flickering"])
 def test_what_walks_before_the_background_is_hidden_whatever_the_light(light: float) -> None:
     found = find_background(panned(with_mover=True, light=light), MOTION, None, ALL, Context(1))
@@ -99,16 +84,6 @@ def test_what_is_small_is_hidden_along_an_exact_motion_alone() -> None:
     hit, false = shares(found, range(100, 1500, 100), side=16)
     assert hit > 0.9
     assert false < 0.2
-
-
-def test_places_that_something_hides_most_of_the_time_are_not_taken_for_background_along_an_exact_motion() -> None:
-    """It follows the camera, and so stays before a place that leaves the frame."""
-    source, frames = panned(with_mover=True, speed=0.02), range(0, 1600, 100)
-    rough, exact = (find_background(source, MOTION, None, ALL, Context(1), exact=each) for each in (False, True))
-    assert rough is not None
-    assert exact is not None
-    assert shares(exact, frames, speed=0.02)[0] > shares(rough, frames, speed=0.02)[0]
-    assert shares(exact, frames, speed=0.02)[0] > 0.9
 
 
 def test_what_stands_near_and_shifts_all_the_time_is_hidden_along_an_exact_motion() -> None:
@@ -142,7 +117,9 @@ def test_the_merged_background_is_that_without_the_walker() -> None:
         return np.where(photons.weight > 100, photons.counts / np.maximum(photons.weight, 1), np.nan)
 
     true = flux(panned(with_mover=False))
-    ghost, clean = (flux(source) - true for source in (panned(with_mover=True), before(panned(with_mover=True), found)))
+    ghost, clean = (
+        flux(source) - true for source in (panned(with_mover=True), with_background(panned(with_mover=True), found))
+    )
     assert np.nanmax(np.abs(ghost)) > 0.2
     assert np.sqrt(np.nanmean(clean**2)) < 0.25 * np.sqrt(np.nanmean(ghost**2))
 
@@ -159,34 +136,16 @@ def test_exposures_of_mergers_show_the_background_alone(merger: str) -> None:
         return VirtualExposures(level, source, [group], MOTION, Stopwatch(1)).merged(0).flux
 
     ghost, clean, background = map(
-        flux, (panned(with_mover=True), before(panned(with_mover=True), found), before(panned(with_mover=False), found))
+        flux,
+        (
+            panned(with_mover=True),
+            with_background(panned(with_mover=True), found),
+            with_background(panned(with_mover=False), found),
+        ),
     )
     assert np.isfinite(clean).mean() > 0.7
     assert np.nanmax(np.abs(ghost - background)) > 0.2
     np.testing.assert_allclose(clean, background, atol=1e-6)
-
-
-def test_the_vignette_is_that_of_the_background_without_the_walker() -> None:
-    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
-    assert found is not None
-    y, x = np.indices(SHAPE)
-    gain = 1 - 0.3 * ((y - 47.5) ** 2 + (x - 63.5) ** 2) / (47.5**2 + 63.5**2)
-    passed = np.random.default_rng(1).random((N, *SHAPE), np.float32) < gain
-    plain, walked = (MemorySource(panned(with_mover=each).frames(ALL) * passed) for each in (False, True))
-
-    def corner(source: Source) -> float:
-        vignette = estimate_vignette(source, MOTION)
-        assert vignette is not None
-        return float(vignette.gain[0, 0])
-
-    assert abs(corner(walked) - corner(plain)) > 0.1
-    assert abs(corner(before(walked, found)) - corner(plain)) < 0.03
-
-
-def test_every_place_that_was_seen_is_in_the_panorama() -> None:
-    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
-    assert found is not None
-    assert (found.filled >= found.shown).all()
 
 
 def test_patches_that_do_not_follow_the_motion_are_hidden() -> None:
@@ -201,29 +160,3 @@ def test_patches_that_do_not_follow_the_motion_are_hidden() -> None:
     y, x = int(5.5 * SHAPE[0] / PATCHES), int(6.5 * SHAPE[1] / PATCHES)
     assert pixels[y, x] == 0
     assert pixels.mean() > 0.8
-
-
-def test_layers_are_read_as_they_were_written(tmp_path: Path) -> None:
-    source, found = panned(with_mover=True), find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
-    assert found is not None
-    assert before_background_of(source, tmp_path) is source
-    write_background(tmp_path, found)
-    read = capture_of(before_background_of(source, tmp_path)).background
-    assert read is not None
-    np.testing.assert_array_equal(read.shown, found.shown)
-    np.testing.assert_array_equal(read.filled, found.filled)
-    with pytest.raises(InputError, match="has cells of the shape"):
-        before_background_of(MemorySource(np.zeros((4, 30, 40), np.uint8)), tmp_path)
-    (tmp_path / "layers.npz").write_bytes(b"no archive")
-    with pytest.raises(InputError, match="cannot be read as the layers of a run"):
-        before_background_of(source, tmp_path)
-
-
-@pytest.mark.parametrize("exact", [False, True])
-def test_movers_are_looked_for_all_around_a_camera_that_turns(exact: bool) -> None:
-    """Frames look up to 120 degrees aside, where no plane shows them; homographies of every frame do not say so."""
-    camera = Camera(np.array([[60, 0, 47.5], [0, 60, 31.5], [0, 0, 1.0]]))
-    turns = rotation_matrices(np.linspace([0, -2.1, 0], [0, 2.1, 0], 600))
-    motion = FrameTrajectory(camera.matrix @ turns @ np.linalg.inv(camera.matrix))
-    source = MemorySource(np.random.default_rng(0).random((600, 64, 96)) < 0.3)
-    assert find_background(source, motion, camera, source.info.span, Context(1), exact=exact) is None

@@ -71,22 +71,6 @@ def test_corrections_that_mask_all_pixels_are_refused(frames: np.ndarray, correc
     assert str(caught.value) == "mask leaves no pixel that may be used"
 
 
-def test_linearly_corrected_source_is_refused(frames: np.ndarray, corrections: Callable, tmp_path: Path) -> None:
-    """What it takes out would be lost, as it is of the size of its own frames."""
-    np.save(tmp_path / "dark.npy", np.zeros(SHAPE))
-    once = corrected_source(MemorySource(frames), corrections({"dark-counts": {"dark": "dark.npy"}}))
-    with pytest.raises(InputError, match="corrects its sums itself, and cannot be corrected further"):
-        corrected_source(once, corrections("rot90"))
-
-
-def test_corrected_source_closes_the_source(frames: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    closed = []
-    monkeypatch.setattr(MemorySource, "close", lambda self: closed.append(self))
-    with corrected_source(MemorySource(frames), ()):
-        pass
-    assert len(closed) == 1
-
-
 def bits(shape: tuple[int, int], n: int = 3) -> np.ndarray:
     return np.random.default_rng(0).integers(0, 2, (n, *shape), dtype=np.uint8)
 
@@ -139,31 +123,6 @@ def test_presets_equal_those_of_photoncube(
     corrected = moved(frames, corrections(preset))
     assert corrected.shape[1:] == result
     np.testing.assert_array_equal(np.packbits(corrected, axis=-1), expected)
-
-
-def test_rot90_turns_clockwise(corrections: Callable) -> None:
-    frames = np.uint8([[[1, 0, 0], [0, 0, 0]]])  # the corner at the top left
-    assert moved(frames, corrections("rot90"))[0].tolist() == [[0, 1], [0, 0], [0, 0]]
-    assert moved(frames, corrections("rot270"))[0].tolist() == [[0, 0], [0, 0], [1, 0]]
-
-
-def test_corrections_are_applied_in_order(corrections: Callable) -> None:
-    frames = bits((6, 10))
-    crop = {"crop": {"rows": [1, 4]}}
-    np.testing.assert_array_equal(moved(frames, corrections(crop, "rot90"))[0], np.rot90(frames[0, 1:4], -1))
-    np.testing.assert_array_equal(moved(frames, corrections("rot90", crop))[0], np.rot90(frames[0], -1)[1:4])
-
-
-def test_crop_counts_from_either_end(corrections: Callable) -> None:
-    frames = bits((6, 10))
-    cropped = moved(frames, corrections({"crop": {"rows": [2, None], "columns": [-7, -1]}}))
-    np.testing.assert_array_equal(cropped, frames[:, 2:, -7:-1])
-
-
-def test_swap_columns_swaps_both_blocks(corrections: Callable) -> None:
-    frames = bits((4, 12))
-    swapped = moved(frames, corrections({"swap-columns": {"first": [8, 10], "second": [2, 4]}}))
-    np.testing.assert_array_equal(swapped, frames[:, :, [0, 1, 8, 9, 4, 5, 6, 7, 2, 3, 10, 11]])
 
 
 @pytest.mark.parametrize(("settings", "row"), [({}, 3), ({"before": 1}, 1), ({"before": 6}, 6)])

@@ -1,7 +1,6 @@
 """Odd truths and run folders: each gets a finite score, or is refused with one sentence that names the file."""
 
 import math
-import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tifffile
 
 from photonpano import PhotonpanoError, evaluate
 from photonpano.evaluation import load_truth
@@ -57,11 +55,6 @@ def of_depth(capture: SimpleNamespace) -> None:
     del capture.true["homographies"]
 
 
-def single_array(capture: SimpleNamespace) -> None:
-    with capture.truth.open("wb") as file:
-        np.save(file, capture.true["homographies"])
-
-
 def holed(value: float) -> Callable[[np.ndarray], np.ndarray]:
     """Return what gives one number another value."""
 
@@ -75,22 +68,14 @@ def holed(value: float) -> Callable[[np.ndarray], np.ndarray]:
 
 HOMOGRAPHIES: Mapping[str, Callable[[np.ndarray], Any]] = {
     "one NaN": holed(np.nan),
-    "one infinite": holed(np.inf),
     "one of zeros": holed(0),
-    "huge": lambda values: values * 1e300,
     "turned inside out": lambda values: -values,
     "all alike": lambda values: np.broadcast_to(values[:1], values.shape),
-    "flat": lambda values: values @ np.diag([1.0, 0, 1]),
-    "whole numbers": lambda values: values.astype(int),
     "complex": lambda values: values + 0j,
     "words": lambda values: values.astype(str),
-    "objects": lambda values: values.astype(object),
-    "times": lambda values: values.astype(np.int64).astype("M8[s]"),
     "none": lambda values: values[:0],
     "one frame": lambda values: values[:1],
-    "one frame more": lambda values: np.concatenate([values, values[-1:]]),
     "two dimensions": lambda values: values.reshape(N_FRAMES, 9),
-    "four dimensions": lambda values: values[None],
 }
 CASES: Mapping[str, Change] = {
     **{f"truth, homographies: {name}": true("homographies", change) for name, change in HOMOGRAPHIES.items()},
@@ -98,91 +83,51 @@ CASES: Mapping[str, Change] = {
         f"run, homographies: {name}": found("homographies", HOMOGRAPHIES[name])
         for name in ("one NaN", "words", "none", "one frame")
     },
-    "truth, frame_shape: floats": true("frame_shape", lambda _: np.array([60.0, 90.0])),
-    "truth, frame_shape: huge": true("frame_shape", lambda _: np.array([2**62, 2**62])),
-    "truth, frame_shape: one number": true("frame_shape", lambda _: np.array(60)),
     "truth, frame_shape: words": true("frame_shape", lambda _: np.array(["60", "90"])),
     "truth, scene: one NaN": true("scene", holed(np.nan)),
     "truth, scene: infinite": true("scene", lambda values: values * np.inf),
     "truth, scene: below zero": true("scene", lambda values: -values),
-    "truth, scene: one pixel": true("scene", lambda values: values[:1, :1]),
     "truth, scene: no pixel": true("scene", lambda values: values[:0]),
-    "truth, scene: complex": true("scene", lambda values: values + 0j),
-    "truth, scene: bool": true("scene", lambda values: values > 0.5),
-    "truth, scene: alike": true("scene", lambda values: values * 0 + 1),
-    "truth, scene: huge": true("scene", lambda values: values.astype(float) * 1e300),
     "run, canvas: NaN": found("canvas", holed(np.nan)),
-    "run, canvas: zeros": found("canvas", lambda values: 0 * values),
     "run, canvas: far away": found("canvas", lambda values: values + 1e9 * np.eye(3)[[2, 1, 1]] * [0, 0, 1]),
-    "run, canvas: words": found("canvas", lambda values: values.astype(str)),
     "run, located: one": found("located", lambda values: np.arange(len(values)) == 7),
-    "run, located: numbers": found("located", lambda values: values.astype(float)),
-    "run, located: words": found("located", lambda values: values.astype(str)),
     "run, std_px: NaN": found("std_px", holed(np.nan)),
-    "run, std_px: infinite": found("std_px", lambda values: values * np.inf),
     "run, std_px: below zero": found("std_px", lambda values: -values),
-    "run, std_px: zero": found("std_px", lambda values: 0 * values),
     "run, std_px: fewer": found("std_px", lambda values: values[:7]),
-    "run, std_px: words": found("std_px", lambda values: values.astype(str)),
     "run, frame_shape: others": found("frame_shape", lambda values: values[::-1]),
-    "run, frame_shape: below zero": found("frame_shape", lambda values: -values),
     "panorama: NaN": image("flux", lambda values: values * np.nan),
-    "panorama: infinite": image("flux", lambda values: values * np.inf),
     "panorama: below zero": image("flux", lambda values: -values),
-    "panorama: zero": image("flux", lambda values: 0 * values),
-    "panorama: whole numbers": image("flux", lambda values: np.nan_to_num(values * 255).astype(np.uint8)),
     "panorama: one row": image("flux", lambda values: values[:1]),
-    "coverage: NaN": image("weight", lambda values: values * np.nan),
     "coverage: below zero": image("weight", lambda values: -values),
-    "coverage: infinite": image("weight", lambda values: values + np.inf),
     **{
         f"run.json: {name}": written("run.json", content)
         for name, content in {
             "empty": "",
             "null": "null",
-            "a list": "[]",
             "no keys": "{}",
-            "a number": "1e999",
             "no UTF-8": b'{"photonpano": "\xff"}',
-            "a spec of null": '{"photonpano": "0", "spec": null}',
             "a spec of a list": '{"photonpano": "0", "spec": [], "files": {}}',
-            "files of a list": '{"photonpano": "0", "spec": {}, "files": []}',
-            "files of numbers": '{"photonpano": "0", "spec": {}, "files": {"trajectory.npz": 3}}',
             "files without hashes": '{"photonpano": "0", "spec": {}, "files": {"trajectory.npz": {}}}',
             "files elsewhere": '{"photonpano": "0", "spec": {}, "files": {"../truth.npz": {"bytes": 1, "sha256": "0"}}}',
-            "deep": '{"photonpano": ' + "[" * 10**5,
         }.items()
     },
-    "trajectory.npz: empty": written("trajectory.npz", b""),
     "trajectory.npz: text": written("trajectory.npz", "frames"),
-    "panorama.tiff: empty": written("panorama.tiff", b""),
     "panorama.tiff: endless": written("panorama.tiff", b"II*\0\x08\0\0\0" + bytes(2) + b"\x08\0\0\0"),
     "coverage.tiff: cut": late(
         lambda capture: (capture.folder / "coverage.tiff").write_bytes((capture.folder / "panorama.tiff").read_bytes()[:500])
     ),
-    "panorama.tiff: two pages": late(
-        lambda capture: tifffile.imwrite(capture.folder / "panorama.tiff", np.stack([capture.flux] * 2))
-    ),
     "run: missing": late(lambda capture: setattr(capture, "folder", capture.folder / "nowhere")),
     "trajectory.npz: missing": late(lambda capture: (capture.folder / "trajectory.npz").unlink()),
     "coverage.tiff: missing": late(lambda capture: (capture.folder / "coverage.tiff").unlink()),
-    "run, canvas: four numbers": found("canvas", lambda _: np.eye(2)),
     "run, located: none": found("located", lambda values: values & False),
     "truth: missing": late(lambda capture: capture.truth.unlink()),
     "truth: without homographies": lambda capture: capture.true.pop("homographies"),
     "truth: of a scene with depth": of_depth,
-    "truth: a pickle": truth_file(lambda _: pickle.dumps({"homographies": 1})),
     "truth: cut": truth_file(lambda content: content[:-200]),
     "truth: a wrong byte": truth_file(lambda content: content[:1000] + bytes([content[1000] ^ 0xFF]) + content[1001:]),
-    "truth: a single array": late(single_array),
-    "truth, frame_shape: three numbers": true("frame_shape", lambda _: np.array([60, 90, 1])),
     "truth, frame_shape: no width": true("frame_shape", lambda _: np.array([60, 0])),
-    "truth, scene: two colours": true("scene", lambda _: np.zeros((4, 4, 2))),
     "truth, undistorted_corners: three": lambda capture: capture.true.update(undistorted_corners=np.zeros((3, 2))),
     "run, camera_matrix: alone": lambda capture: capture.trajectory.update(camera_matrix=np.diag([80.0, 80, 1])),
-    "run, camera_matrix: four numbers": lambda capture: capture.trajectory.update(
-        camera_matrix=np.eye(2), distortion=np.zeros(4)
-    ),
     "run, distortion: three numbers": lambda capture: capture.trajectory.update(
         camera_matrix=np.eye(3), distortion=np.zeros(3)
     ),

@@ -15,14 +15,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from photonpano.compiling import notify_on_first_compile
-from photonpano.errors import described
-from photonpano.execution.threads import Stopwatch, in_order, one_thread_inside, thread_count
-
-
-def test_thread_count_auto_is_the_number_of_usable_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 2, 5}, raising=False)
-    assert thread_count("auto") == 3
-    assert thread_count(7) == 7
+from photonpano.execution.threads import Stopwatch, in_order, one_thread_inside
 
 
 @pytest.fixture
@@ -52,16 +45,6 @@ def test_one_thread_inside_limits_libraries_and_restores_them() -> None:
     assert threads_of_libraries() == before
 
 
-def test_stopwatch_adds_up_by_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = iter([0.0, 1.5, 10.0, 10.25, 20.0, 22.0])
-    monkeypatch.setattr(time, "perf_counter", lambda: next(now))
-    clock = Stopwatch(2)
-    for stage in ("merge", "merge", "locate"):
-        with clock(stage):
-            pass
-    assert clock.seconds == {"merge": 1.75, "locate": 2.0}
-
-
 def test_stopwatch_divides_time_in_a_pool_by_its_threads() -> None:
     """Two threads that are busy for the same 0.1 s count as 0.1 s."""
     clock, together = Stopwatch(2), threading.Barrier(2)
@@ -78,13 +61,6 @@ def test_stopwatch_divides_time_in_a_pool_by_its_threads() -> None:
     assert 0.1 <= clock.seconds["merge"] < 0.19
 
 
-def test_stopwatch_counts_blocks_that_raise() -> None:
-    clock = Stopwatch(1)
-    with pytest.raises(ValueError, match="half-way"), clock("merge"):
-        raise ValueError("half-way")
-    assert set(clock.seconds) == {"merge"}
-
-
 def test_in_order_yields_in_order_and_holds_few_results() -> None:
     made: list[int] = []
 
@@ -99,30 +75,6 @@ def test_in_order_yields_in_order_and_holds_few_results() -> None:
         ahead.append(len(made) - taken)
     assert len(made) == 30
     assert max(ahead) <= 4
-
-
-def test_in_order_raises_an_error_in_its_turn() -> None:
-    results = in_order(lambda item: 1 / (3 - item), range(9), threads=2)
-    assert [next(results) for _ in range(3)] == [1 / 3, 1 / 2, 1]
-    with pytest.raises(ZeroDivisionError):
-        next(results)
-
-
-class Mute(BaseException):
-    def __str__(self) -> str:
-        raise RuntimeError("no words")
-
-
-@pytest.mark.parametrize(
-    ("error", "text"),
-    [
-        (ValueError("too dark"), "ValueError: too dark"),
-        (SystemExit(), "SystemExit"),
-        (Mute(), "Mute: (its message cannot be written)"),
-    ],
-)
-def test_described_exception_has_type_and_message(error: BaseException, text: str) -> None:
-    assert described(error) == text
 
 
 SOURCE = """\

@@ -5,10 +5,10 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Light
-from photonpano.capture import capture_of, in_light
+from photonpano import FrameSpan
+from photonpano.capture import capture_of
 from photonpano.geometry import from_parameters, rescaling, translation
-from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of, divided
+from photonpano.merging import Chunk, PhotonSum, accumulate, chunks_of
 from photonpano.photometry import BinaryResponse
 from photonpano.testing import MemorySource
 from photonpano.testing.captures import detected
@@ -37,24 +37,6 @@ def test_accumulate_returns_source_counts_of_still_capture(memory_source: type, 
     np.testing.assert_array_equal(photons.counts, source.counts(FrameSpan(0, 50)))
     np.testing.assert_array_equal(photons.weight, np.full(SHAPE, 50))
     assert advances == told
-
-
-def test_accumulate_moves_counts_and_weight_by_whole_pixels_without_loss(memory_source: type) -> None:
-    source = memory_source(frames_of(FLUX, 50))
-    photons = accumulate(source, still(50, translation(3, -2)), translation(10, 10), (60, 70))
-    there = (slice(8, 38), slice(13, 53))
-    np.testing.assert_allclose(photons.counts[there], source.counts(FrameSpan(0, 50)), rtol=1e-6)
-    assert photons.weight.sum() == pytest.approx(50 * 30 * 40)
-    assert np.count_nonzero(photons.weight) == 30 * 40
-
-
-def test_accumulate_keeps_visible_half_of_frame_and_ignores_frame_off_the_grid(memory_source: type) -> None:
-    source = memory_source(frames_of(FLUX, 5))
-    half, off = (accumulate(source, still(5, translation(x, 0)), np.eye(3), SHAPE) for x in (-15, 500))
-    np.testing.assert_allclose(half.counts[:, :25], source.counts(FrameSpan(0, 5))[:, 15:], rtol=1e-6)
-    assert not half.weight[:, 25:].any()
-    assert not off.counts.any()
-    assert not off.weight.any()
 
 
 def test_accumulate_interpolates_counts_and_weight_alike(memory_source: type) -> None:
@@ -145,21 +127,6 @@ def test_accumulate_preserves_photons_on_coarser_grid(memory_source: type, facto
     assert np.nanmean(flux) == pytest.approx(FLUX, abs=0.02)
 
 
-def test_accumulate_averages_four_pixels_at_half_scale(memory_source: type) -> None:
-    source = memory_source(frames_of(FLUX, 50))
-    photons = accumulate(source, still(50), rescaling(0.5), (15, 20))
-    blocks = source.counts(FrameSpan(0, 50)).reshape(15, 2, 20, 2).mean(axis=(1, 3))
-    np.testing.assert_allclose(photons.counts, blocks, rtol=1e-6)
-
-
-def test_accumulate_weight_is_number_of_frames(memory_source: type, pan: Callable) -> None:
-    """A pan of 1 px per frame over 40 px: column c of the plane is seen in min(c, 39) + 1 of the first 60 frames."""
-    source = memory_source(frames_of(FLUX, 60))
-    chunks = chunks_of(FrameSpan(0, 60), pan(1), SHAPE, 0.25)
-    photons = accumulate(source, chunks, np.eye(3), (30, 60))
-    np.testing.assert_allclose(photons.weight, np.tile(np.minimum(np.arange(60), 39) + 1, (30, 1)), rtol=1e-5)
-
-
 def test_estimate_is_nan_below_one_frame_and_zero_where_corrected_counts_are_negative() -> None:
     counts, weight = np.float32([[0.5, 0.5, 3]]), np.float32([[0.99, 1, 4]])
     flux, known = PhotonSum(counts, weight).estimate(BinaryResponse())
@@ -167,16 +134,6 @@ def test_estimate_is_nan_below_one_frame_and_zero_where_corrected_counts_are_neg
     np.testing.assert_allclose(flux, [[np.nan, np.log(2), np.log(4)]], rtol=1e-6)
     flux, _ = PhotonSum(np.float32([[-3, 5]]), np.float32([[10, 10]])).estimate(BinaryResponse())
     assert flux.tolist() == [[0, pytest.approx(np.log(2))]]
-
-
-@pytest.mark.parametrize("shift_px", [0.01, 0.1, 1 / 64])
-def test_accumulate_is_exact_for_shifts_below_opencv_4_rounding(memory_source: type, shift_px: float) -> None:
-    """OpenCV 4 rounds bilinear coordinates to 1/32 px, so that 0.01 px would have no effect."""
-    ramp = np.arange(100)[:, None, None] < np.arange(SHAPE[1])  # column x is lit in x of 100 frames
-    source = memory_source(np.broadcast_to(ramp, (100, *SHAPE)))
-    photons = accumulate(source, still(100, translation(shift_px, 0)), np.eye(3), SHAPE)
-    inside = (slice(1, -1), slice(1, -1))
-    np.testing.assert_allclose(photons.counts[inside], np.arange(SHAPE[1])[None, 1:-1].repeat(28, 0) - shift_px, atol=2e-4)
 
 
 def halved_less_an_offset(counts: np.ndarray, n_frames: int) -> np.ndarray:
@@ -198,24 +155,3 @@ def test_accumulate_corrects_each_chunk_once(scale: float) -> None:
     )
     np.testing.assert_array_equal(halved.weight, plain.weight)
     np.testing.assert_allclose(halved.counts, plain.counts / 2 - plain.weight, atol=1e-3)
-
-
-def test_divided_returns_about_equal_parts_of_1_or_more() -> None:
-    assert divided(10, 3) == [range(3), range(3, 6), range(6, 10)]
-    assert divided(2, 7) == [range(1), range(1, 2)]
-
-
-@pytest.mark.parametrize("run", [1, 7, 64])
-def test_runs_of_chunks_add_up(memory_source: type, run: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the light of lamps, with masked pixels, along a path that leaves the grid."""
-    monkeypatch.setitem(accumulate.__globals__, "_RUN", run)
-    valid = np.random.default_rng(1).random(SHAPE) > 0.1
-    light = Light.of_frames(1 + 0.5 * np.sin(np.arange(50) / 3))
-    source = in_light(memory_source(frames_of(FLUX, 50), valid), light)
-    chunks = [Chunk(FrameSpan(t, t + 1), translation(0.6 * t, -0.3 * t)) for t in range(50)]
-    done: list[int] = []
-    at_once = accumulate(source, chunks, translation(2, 3), (25, 40))
-    in_runs = accumulate(source, chunks, translation(2, 3), (25, 40), done.append, in_order=map)
-    assert sum(done) == 50
-    np.testing.assert_allclose(in_runs.counts, at_once.counts, atol=1e-4)
-    np.testing.assert_allclose(in_runs.weight, at_once.weight, atol=1e-4)

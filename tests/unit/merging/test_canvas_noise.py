@@ -14,8 +14,8 @@ from photonpano.corrections.colour_filter import with_colours
 from photonpano.geometry import Canvas, rescaling, translation
 from photonpano.merging import accumulate, canvas_noise
 from photonpano.merging.accumulate import chunks_of
-from photonpano.merging.canvas_noise import Averaging, CanvasNoise, DynamicRange, squared_gradient
-from photonpano.photometry import BinaryResponse, flux_std
+from photonpano.merging.canvas_noise import Averaging, CanvasNoise, DynamicRange
+from photonpano.photometry import BinaryResponse
 from photonpano.testing import KnownMotion, MemorySource
 from photonpano.values import Light
 
@@ -25,28 +25,6 @@ STILL = KnownMotion(lambda _: np.eye(3))
 
 def factor(motion: KnownMotion, canvas: Canvas, n_frames: int = 400) -> np.ndarray:
     return Averaging.of(motion, FrameSpan(0, n_frames), SHAPE, canvas).over(canvas.shape).std_factor
-
-
-@pytest.mark.parametrize(("shift", "expected"), [(0.0, 1.0), (0.5, 0.5)])
-def test_averaging_of_still_camera_follows_from_place_between_pixels(shift: float, expected: float) -> None:
-    np.testing.assert_allclose(factor(STILL, Canvas(8, 8, translation(-8 - shift, -8 - shift))), expected, rtol=1e-6)
-
-
-def test_averaging_of_pan_by_whole_steps_is_not_that_of_its_instants(pan: Callable) -> None:
-    """A pan along x passes all fractions of a pixel: the mean of `a^2 + (1 - a)^2` is 2 / 3."""
-    found = factor(pan(0.02), Canvas(8, 8, translation(-12, -8)))
-    np.testing.assert_allclose(found, np.sqrt(2 / 3), rtol=0.03)
-
-
-def test_averaging_of_smaller_canvas_is_that_of_summed_squares() -> None:
-    np.testing.assert_allclose(factor(STILL, Canvas(12, 16, rescaling(0.5)))[2:-2, 2:-2], 0.5, rtol=1e-6)
-
-
-def test_averaging_of_a_part_is_the_part() -> None:
-    motion = KnownMotion(lambda frame: translation(0.02 * frame, 0.01 * frame))
-    canvas = Canvas(28, 40, np.eye(3))
-    averaging = Averaging.of(motion, FrameSpan(0, 400), SHAPE, canvas)
-    np.testing.assert_allclose(averaging.over((6, 7), 9, 12).std_factor, factor(motion, canvas)[9:15, 12:19], rtol=0.01)
 
 
 def test_averaging_is_that_of_merged_photons() -> None:
@@ -78,23 +56,10 @@ def image(value: float, shape: tuple[int, ...] = CANVAS.shape) -> np.ndarray:
     return np.full(shape, value, np.float32)
 
 
-def test_noise_of_uncorrected_source_is_that_of_its_response(pan: Callable) -> None:
-    noise = CanvasNoise.of(MemorySource(np.zeros((N, 8, 12))), pan(0), SPAN, CANVAS)
-    np.testing.assert_array_equal(noise.std(image(0.1), image(N)), flux_std(image(0.1), image(N), BinaryResponse()))
-
-
 def test_noise_of_still_camera_follows_dark_counts_of_each_pixel(pan: Callable) -> None:
     rates = np.linspace(0.01, 0.5, 96).reshape(8, 12)
     std = CanvasNoise.of(dark_counts(rates), pan(0), SPAN, CANVAS).std(image(0.1), image(1e6))
     np.testing.assert_allclose(std, np.sqrt(np.expm1(0.1 + rates) / 1e6), rtol=0.01)
-
-
-def test_noise_of_moving_camera_follows_mean_dark_counts(pan: Callable) -> None:
-    """Every pixel of the sensor passes by the middle of the canvas."""
-    rates = np.tile(np.where(np.arange(12) % 2, 0.02, 0.04), (8, 1))
-    noise = CanvasNoise.of(dark_counts(rates), pan(1), SPAN, Canvas(8, 12 + N, translation(0, 0)))
-    std = noise.std(image(0.1, (8, 4)), image(1e6, (8, 4)), left=24)
-    np.testing.assert_allclose(std, np.sqrt(np.expm1(0.13) / 1e6), rtol=0.01)
 
 
 @pytest.mark.parametrize("even", [True, False])
@@ -121,22 +86,6 @@ def test_dynamic_range_is_that_of_flux_above_its_noise(colours: int) -> None:
     assert found.decibels == pytest.approx(20 * np.log10(np.log(20_001) / 0.005), abs=0.01)
     assert found.saturated_share == pytest.approx(1 / 19)
     assert found.measurable_decibels == pytest.approx(99.9, abs=0.1)
-
-
-def test_range_that_was_measured_can_be_measured() -> None:
-    """The flux of the darkest pixel exceeds its noise by more frames than the others have."""
-    flux, weight = image(1.0), image(100)
-    flux[0, 0], weight[0, 0] = 2e-7, 1e7
-    found = DynamicRange(CanvasNoise(BinaryResponse()))
-    found.add(flux, weight, found.noise.std(flux, weight))
-    assert found.decibels == pytest.approx(20 * np.log10(5e6))
-    assert found.measurable_decibels == found.decibels
-
-
-def test_dynamic_range_of_nothing_is_unknown() -> None:
-    found = DynamicRange(CanvasNoise(BinaryResponse()))
-    found.add(image(np.nan), image(0), image(np.nan))
-    assert (found.decibels, found.measurable_decibels, found.saturated_share) == (None, None, 0)
 
 
 def test_noise_of_weighted_pixels_is_that_of_their_counts(pan: Callable) -> None:
@@ -177,27 +126,7 @@ def test_uncertainty_does_not_depend_on_the_parts_it_is_computed_in(monkeypatch:
     np.testing.assert_allclose(whole_std(SMOOTH, std_px=0.3), at_once, rtol=1e-5)
 
 
-def test_uncertainty_is_infinite_where_that_of_the_motion_is() -> None:
-    assert np.isinf(whole_std(SMOOTH, std_px=np.inf)).all()
-
-
-def test_noise_is_no_gradient() -> None:
-    """A gradient that photon noise alone makes does not count as one that errors of the motion move."""
-    flux = np.random.default_rng(0).normal(1, 0.01, (60, 80)).astype(np.float32)
-    noise = CanvasNoise.of(MemorySource(np.zeros((N, 60, 80))), STILL, SPAN, Canvas(60, 80, np.eye(3)), np.full(N, 1.0))
-    (found,) = [found for _, found in noise.of_tile(flux, np.full_like(flux, np.expm1(1) / 0.01**2), 0, 0)]
-    assert np.median(found.photons) == pytest.approx(0.01, rel=0.02)
-    assert np.sqrt(np.mean(found.whole**2)) == pytest.approx(0.01, rel=0.1)
-
-
 def test_uncertain_light_changes_flux_in_proportion() -> None:
     light = Light.of_frames(np.ones(N), std=np.full(N, 0.03))
     source = replace(capture_of(MemorySource(np.zeros((N, 60, 80)))), light=light)
     np.testing.assert_allclose(whole_std(np.full((60, 80), 0.5, np.float32), source), 0.015, rtol=1e-3)
-
-
-def test_gradient_at_the_border_is_that_of_the_neighbours_that_are_known() -> None:
-    ramp = np.tile(3 * np.arange(6, dtype=np.float32), (4, 1))
-    ramp[:, 3] = np.nan
-    squares = squared_gradient(ramp)
-    np.testing.assert_allclose(squares[:, [0, 1, 2, 4, 5]], 9, rtol=1e-5)

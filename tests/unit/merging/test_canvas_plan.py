@@ -29,11 +29,6 @@ def test_auto_projection_follows_field_of_view(degrees: float, pitch: float, pro
     assert planned(degrees, pitch=pitch).projection == projection
 
 
-def test_auto_shows_reference_frame_on_a_plane() -> None:
-    canvas = planned(360, extent="reference")
-    assert (canvas.projection, canvas.shape) == ("planar", SHAPE)
-
-
 def test_box_in_degrees_is_that_part_of_the_panorama() -> None:
     whole = planned(360, "spherical", scale=2.0)
     part = planned(360, "spherical", (150, -10, 210, 15), scale=2.0)
@@ -75,13 +70,3 @@ def test_view_that_cannot_be_shown_is_refused(
     with pytest.raises(InputError) as caught:
         planned(degrees, projection, extent, pitch=pitch)
     assert str(caught.value) == message
-
-
-def test_sphere_of_any_homographies_is_refused() -> None:
-    still = FrameTrajectory(np.repeat(np.eye(3)[None], 5, axis=0))
-    with pytest.raises(InputError) as caught:
-        plan_canvas(still, FrameSpan(0, 5), SHAPE, 1.0, 2**30, view=View("spherical"))
-    assert str(caught.value) == (
-        "a spherical panorama needs a camera that only turns, and this motion is one homography a frame; "
-        "write motion: {model: rotation}, or render.projection: planar"
-    )

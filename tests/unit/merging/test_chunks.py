@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photonpano import FrameSpan, InputError
-from photonpano.geometry import Canvas, corner_displacements, from_parameters, inverse, rescaling, transform_points, translation
-from photonpano.merging import CountsCache, chunks_of, clipped
+from photonpano.geometry import Canvas, corner_displacements, from_parameters, inverse, transform_points, translation
+from photonpano.merging import CountsCache, chunks_of
 from photonpano.merging.warping import Footprint, Grid, Texture, add_warped, footprints_of
 
 SHAPE = (30, 40)
@@ -26,11 +26,6 @@ def test_chunks_of_splits_pan_where_it_moved_by_tolerance(pan: Callable) -> None
     assert still.span == FrameSpan(5, 105)
     np.testing.assert_array_equal(still.homography, np.eye(3))
     assert [len(chunk.span) for chunk in chunks_of(FrameSpan(0, 7), pan(3), SHAPE, 0.25)] == [1] * 7
-
-
-def test_chunks_of_cuts_at_instants_inside_the_span(pan: Callable) -> None:
-    chunks = chunks_of(FrameSpan(10, 20), pan(0), SHAPE, 0.5, [3.0, 10.0, 12.5, 17.0, 20.0, 31.0])
-    assert [chunk.span for chunk in chunks] == [FrameSpan(10, 13), FrameSpan(13, 17), FrameSpan(17, 20)]
 
 
 @pytest.mark.parametrize("zoom", [0.5, 2.0])
@@ -69,23 +64,6 @@ def test_chunks_of_covers_every_frame_once_within_tolerance(
         assert corner_displacements(moved, np.eye(3), SHAPE).max() <= tolerance_px * 1.01 + 0.01 * (len(chunk.span) > 1)
 
 
-def test_clipped_keeps_chunks_inside_span(pan: Callable) -> None:
-    motion = pan(0.125)
-    chunks = chunks_of(FrameSpan(0, 40), motion, SHAPE, 0.5)
-    found = clipped(chunks, FrameSpan(10, 23), motion)
-    assert [each.span for each in found] == [FrameSpan(10, 12), FrameSpan(12, 16), FrameSpan(16, 20), FrameSpan(20, 23)]
-    assert found[1] is chunks[3]
-    for each in found:
-        np.testing.assert_allclose(each.homography, translation(0.125 * each.span.centre, 0))
-
-
-def test_clipped_returns_part_of_chunk_around_span(pan: Callable) -> None:
-    chunks = chunks_of(FrameSpan(0, 40), pan(0.125), SHAPE, 4)
-    (part,) = clipped(chunks, FrameSpan(33, 39), pan(0.125))
-    assert part.span == FrameSpan(33, 39)
-    assert clipped(chunks, FrameSpan(0, 40), pan(0.125)) == chunks
-
-
 @pytest.fixture
 def counted(memory_source: type) -> tuple[object, list[FrameSpan]]:
     """A source of 20 frames, and the spans that it summed."""
@@ -103,24 +81,6 @@ def counted(memory_source: type) -> tuple[object, list[FrameSpan]]:
     return source, summed
 
 
-def test_counts_cache_computes_each_sum_once(counted: tuple) -> None:
-    source, summed = counted
-    shared = CountsCache(source, 1000)
-    first = shared(FrameSpan(0, 5))
-    assert shared(FrameSpan(0, 5)) is first
-    assert summed == [FrameSpan(0, 5)]
-    np.testing.assert_array_equal(first, source.frames(FrameSpan(0, 5)).sum(axis=0))
-    assert not first.flags.writeable
-
-
-def test_counts_cache_drops_least_recently_used_sum(counted: tuple) -> None:
-    source, summed = counted
-    shared = CountsCache(source, 2 * 4 * 6 * 4)
-    for start in (0, 1, 0, 2, 0, 1):
-        shared(FrameSpan(start, start + 3))
-    assert [span.start for span in summed] == [0, 1, 2, 1]
-
-
 def test_counts_cache_computes_sum_once_for_concurrent_threads(counted: tuple) -> None:
     source, summed = counted
     shared, together = CountsCache(source, 1000), Barrier(4)
@@ -135,38 +95,11 @@ def test_counts_cache_computes_sum_once_for_concurrent_threads(counted: tuple) -
     assert all(each is found[0] for each in found)
 
 
-def test_counts_cache_raises_source_error_on_each_call(counted: tuple) -> None:
-    shared = CountsCache(counted[0], 1000)
-    for _ in range(2):
-        with pytest.raises(InputError, match="a damaged block"):
-            shared(FrameSpan(7, 9))
-
-
 FRAME, GRID = (254, 496), Canvas(300, 700, np.eye(3))
 
 
 def footprints(to_grid: np.ndarray) -> list[Footprint]:
     return footprints_of(GRID, None, to_grid, FRAME)
-
-
-def test_footprint_of_shift_covers_shifted_frame() -> None:
-    (footprint,) = footprints(translation(10.5, 20.25)[None])
-    assert footprint.shrink == 1
-    assert (footprint.rows, footprint.columns) == (range(19, 276), (range(9, 508),))
-    assert footprint.to_image == pytest.approx(translation(-10.5, -20.25))
-
-
-def test_footprint_is_empty_outside_of_grid() -> None:
-    for shift in (translation(800, 0), translation(-600, 0), translation(0, 400)):
-        (footprint,) = footprints(shift[None])
-        assert not (footprint.rows and footprint.columns)
-
-
-def test_footprint_shrinks_frame_on_coarse_grid() -> None:
-    found = footprints(np.array([rescaling(1), rescaling(0.5), rescaling(0.26)]))
-    assert [footprint.shrink for footprint in found] == [1, 2, 3]
-    assert found[1].to_image == pytest.approx(np.eye(3))
-    assert found[2].to_image == pytest.approx(inverse(rescaling(0.26) @ rescaling(3)))
 
 
 IMAGE = np.random.default_rng(0).random((23, 37)).astype(np.float32)
@@ -221,15 +154,3 @@ def test_places_on_a_wide_grid_are_exact_to_a_thousandth_of_a_pixel() -> None:
     grid = warped(ramp, to_image, (16, 40_200))
     inside = slice(40_010, 40_110)
     np.testing.assert_allclose(grid.total[5, inside], 0.5 * np.arange(40_200)[inside] + 0.005 - 20_000.25, atol=0.01)
-
-
-@pytest.mark.parametrize(("largest", "kind"), [(1, np.uint8), (255, np.uint8), (7, np.uint32), (65_535, np.uint32)], ids=str)
-def test_texture_keeps_whole_numbers(largest: int, kind: type[np.unsignedinteger]) -> None:
-    image = np.random.default_rng(1).integers(0, largest + 1, (9, 14)).astype(kind)
-    image[0, 0] = largest
-    np.testing.assert_array_equal(warped(image, np.eye(3), (9, 14)).total, image)
-
-
-def test_texture_rounds_other_numbers_to_its_range() -> None:
-    image = np.random.default_rng(1).normal(-3, 10, (9, 14)).astype(np.float32)
-    np.testing.assert_allclose(warped(image, np.eye(3), (9, 14)).total, image, atol=np.ptp(image) / 65_000)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from photonpano.merging.colour import filled, with_clear, with_shared_detail
-from photonpano.photometry import BinaryResponse, frame_variance
-from photonpano.reading import bayer_array
+from photonpano.photometry import BinaryResponse
 
 SHAPE = (64, 80)
 FRAMES = 2000
@@ -26,16 +25,6 @@ def seen_by(flux: np.ndarray, weight: np.ndarray, seed: int = 0) -> np.ndarray:
     return np.where(weight > 0, BinaryResponse().flux(mean.astype(np.float32), np.maximum(weight, 1)), np.float32(np.nan))
 
 
-def mosaic(frames: int) -> np.ndarray:
-    """Return the frames in which a still camera sees each colour: (H, W, 3)."""
-    places = bayer_array("rggb", SHAPE)
-    return np.stack([np.where(places == place, frames, 0) for place in range(3)], axis=-1).astype(np.float32)
-
-
-def rms(image: np.ndarray, truth: np.ndarray) -> float:
-    return float(np.sqrt(np.mean((image - truth)[4:-4, 4:-4] ** 2)))
-
-
 def test_colours_that_motion_brings_everywhere_stay_as_they_are() -> None:
     weight = np.broadcast_to(np.float32([500, 1000, 500]), (*SHAPE, 3))
     flux = seen_by(scene(), weight)
@@ -51,23 +40,6 @@ def test_filling_follows_the_texture_of_the_colours_that_were_seen() -> None:
     for colour in (0, 2):
         box = np.s_[16:48, 6:18, colour]
         assert np.std(result[box] - truth[box]) < 0.25 * np.std(truth[box])
-
-
-def test_still_camera_gives_every_pixel_all_colours() -> None:
-    weight, truth = mosaic(100 * FRAMES), scene()
-    flux = seen_by(truth, weight)
-    result = filled(flux, weight)
-    assert np.isfinite(result).all()
-    np.testing.assert_allclose(result[weight > 0], flux[weight > 0], rtol=1e-5)
-    assert rms(result, truth) < 0.6 * rms(np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape), truth)
-
-
-def test_pixels_that_no_colour_saw_are_unknown() -> None:
-    weight = mosaic(FRAMES)
-    weight[:10] = 0
-    result = filled(seen_by(scene(), weight), weight)
-    assert np.isnan(result[:10]).all()
-    assert np.isfinite(result[10:]).all()
 
 
 def test_thin_colours_join_the_others_without_a_jump() -> None:
@@ -123,8 +95,3 @@ def test_detail_of_single_colours_stays_with_many_photons() -> None:
     flux = seen_by(truth, weight)
     found = with_shared_detail(flux, weight, BinaryResponse())
     assert (rms_of_colours(found, truth) < 1.05 * rms_of_colours(flux, truth)).all()
-
-
-def test_frame_variance_is_the_binomial_one() -> None:
-    flux = np.float32([0.01, 0.1, 1, 3])
-    assert frame_variance(flux, BinaryResponse()) == pytest.approx(np.expm1(flux), rel=0.01)

@@ -46,11 +46,6 @@ def test_flux_of_known_gains_is_exact(
     np.testing.assert_allclose(lit.flux(np.float32([[counts]]), response), flux, rtol=1e-5)
 
 
-def test_pixel_lit_in_every_frame_has_finite_flux() -> None:
-    frames, gains = np.float32([[[60]], [[40]]]), np.float32([[[0]], [[80]]])
-    assert np.isfinite(LitFrames(frames, gains).flux(np.float32([[100]]), BinaryResponse())).all()
-
-
 def test_gains_are_counted_where_frames_lie_with_and_without_a_mask() -> None:
     valid = np.ones(SHAPE, np.bool_)
     valid[5, 7] = False

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from photonpano import CanvasTooLargeError, FrameSpan, InputError, LocationError, Panorama
-from photonpano.execution.context import Context, Quiet
-from photonpano.geometry import Canvas, from_parameters, transform_points, translation
-from photonpano.merging import MergeRenderer, accumulate
+from photonpano.execution.context import Context
+from photonpano.geometry import Canvas, from_parameters, translation
+from photonpano.merging import MergeRenderer
 from photonpano.merging.panorama import BYTES_PER_PIXEL, Thumbnail, Tile, plan_canvas, render, render_tiles, tiles_of
 from photonpano.photometry import tone_mapped
 
@@ -39,11 +39,6 @@ def test_plan_canvas_refuses_canvas_far_beyond_memory(pan: Callable) -> None:
     )
 
 
-def test_plan_canvas_suggests_no_scale_that_specs_refuse(pan: Callable) -> None:
-    with pytest.raises(CanvasTooLargeError, match=r"Raise run\.memory, or choose a render\.reference"):
-        plan_canvas(pan(1e5), ALL, SHAPE, 1.0, GIB // 4096)
-
-
 @pytest.mark.parametrize(("scale", "memory"), [(8.0, GIB // 8), (1.0, GIB // 256), (0.9, GIB // 256)])
 def test_plan_canvas_suggests_largest_scale_that_fits(pan: Callable, scale: float, memory: int) -> None:
     with pytest.raises(CanvasTooLargeError) as caught:
@@ -63,19 +58,6 @@ def test_plan_canvas_refuses_turn_to_the_horizon(known_motion: type) -> None:
         "(homography 59 of 60 sends part of its frame behind the reference plane); "
         "choose a render.reference in the middle of the motion, or fewer frames"
     )
-
-
-@pytest.mark.parametrize("scale", [1.0, 2.0])
-def test_plan_canvas_of_reference_is_its_frame(pan: Callable, scale: float) -> None:
-    canvas = plan_canvas(pan(2), ALL, SHAPE, scale, GIB, extent="reference")
-    assert canvas.shape == (30 * scale, 40 * scale)
-    np.testing.assert_allclose(canvas.transform, plan_canvas(pan(0), ALL, SHAPE, scale, GIB).transform, atol=1e-12)
-
-
-def test_plan_canvas_of_box_is_part_of_panorama(pan: Callable) -> None:
-    canvas = plan_canvas(pan(2), ALL, SHAPE, 1.0, GIB, extent=(-5, 10, 55, 25))
-    assert canvas.shape == (15, 60)
-    np.testing.assert_array_equal(canvas.transform, translation(5, -10))
 
 
 @pytest.mark.parametrize("box", [(158, 0, 170, 30), (-9, 0, 0, 30), (0, 30, 40, 31), (0, -4, 40, 0)])
@@ -126,12 +108,6 @@ def test_render_shows_scene_with_binomial_noise(panning: Any, pan: Callable) -> 
     assert (error * np.sqrt(weight)).std() == pytest.approx(np.sqrt(0.16), rel=0.1)
 
 
-def test_render_ignores_frames_beyond_span(panning: Any, pan: Callable) -> None:
-    panorama, _ = rendered(panning, pan(1), span=FrameSpan(10, 20))
-    assert panorama.weight.max() == pytest.approx(10)
-    assert panorama.weight.sum() == pytest.approx(10 * 30 * 40)
-
-
 def test_render_at_twice_the_scale_keeps_brightness(panning: Any, pan: Callable) -> None:
     panorama, canvas = rendered(panning, pan(1), scale=2.0)
     assert canvas.shape == panorama.flux.shape == (60, 2 * 99)
@@ -167,72 +143,6 @@ def test_render_tiles_equals_render(panning: Any, known_motion: type, motion: tu
     single.add(Tile(0, 0, canvas), Panorama(flux, weight, canvas.transform), 0.1 * flux)
     np.testing.assert_allclose(shown.panorama.flux, single.panorama.flux, rtol=1e-6)
     np.testing.assert_allclose(shown.panorama.weight, single.panorama.weight, rtol=1e-6)
-
-
-@pytest.mark.parametrize("n_tiles", [1, 2])
-def test_render_of_rolled_frames_does_not_depend_on_threads(memory_source: type, known_motion: type, n_tiles: int) -> None:
-    """Warps of parts of the grid are rounded by where the parts start: these must not depend on the threads."""
-    frames = np.random.default_rng(2).random((40, 150, 60)) < 0.4
-    source = memory_source(frames)
-    roll = known_motion(lambda frame: np.array([[1, -0.002 * frame, 0.3 * frame], [0.002 * frame, 1, 0.1], [1e-5, 0, 1]]))
-    canvas = plan_canvas(roll, source.info.span, source.info.frame_shape, 1.0, 2**30)
-    tiles, _ = tiles_of(canvas, BYTES_PER_PIXEL * canvas.height * canvas.width // (1 if n_tiles == 1 else 2))
-    assert (len(tiles) > 1) == (n_tiles > 1)
-    one, *others = (
-        list(render_tiles(MergeRenderer(context.in_order), source, roll, source.info.span, tiles, 0.1, context))
-        for context in map(Context, (1, 2, 3, 5))
-    )
-    for other in others:
-        for part, same in zip(one, other, strict=True):
-            np.testing.assert_array_equal(part.flux, same.flux)
-            np.testing.assert_array_equal(part.weight, same.weight)
-
-
-def test_thumbnail_averages_seen_pixels() -> None:
-    flux = np.array([[1, 3, np.nan], [np.nan, 5, np.nan], [4, 4, 8]], np.float32)
-    canvas = Canvas(3, 3, translation(2, 1))
-    shown = Thumbnail(canvas, 2)
-    weight = np.where(np.isnan(flux), 0, 8).astype(np.float32)
-    shown.add(Tile(0, 0, canvas), Panorama(flux, weight, canvas.transform), flux / 2)
-    np.testing.assert_array_equal(shown.panorama.flux, [[3, np.nan], [4, 8]])
-    np.testing.assert_array_equal(shown.panorama.weight, [[6, 0], [4, 2]])
-    np.testing.assert_array_equal(shown.std, [[1.5, np.nan], [2, 4]])
-    # The centre of the first square lies between the pixels 0 and 1.
-    np.testing.assert_allclose(transform_points(shown.panorama.canvas, [[-1.5, -0.5]]), [[0, 0]], atol=1e-12)
-
-
-@pytest.mark.parametrize("size", [(3000, 40_000), (50_000, 3000), (3001, 3003)])
-@pytest.mark.parametrize("excess", [1.01, 3, 16])
-def test_tiles_of_fit_into_memory_with_thumbnail(size: tuple[int, int], excess: float) -> None:
-    canvas, memory = Canvas(*size, np.eye(3)), int(size[0] * size[1] * BYTES_PER_PIXEL / excess)
-    tiles, reduction = tiles_of(canvas, memory)
-    assert sum(tile.canvas.height * tile.canvas.width for tile in tiles) == size[0] * size[1]
-    assert all(tile.left % reduction == tile.top % reduction == 0 for tile in tiles)
-    most = max(tile.canvas.height * tile.canvas.width for tile in tiles)
-    assert BYTES_PER_PIXEL * (most + size[0] * size[1] / reduction**2) <= memory
-    assert len(tiles) <= 4 * excess
-
-
-def test_render_reports_progress_of_every_frame(panning: Any, pan: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Counting(Quiet):
-        def __init__(self) -> None:
-            self.frames: list[int] = []
-
-        def stage(self, title: str, total: int, unit: str) -> Any:
-            self.title = (title, total, unit)
-            return self
-
-        def __enter__(self) -> Any:
-            return self.frames.append
-
-        def __exit__(self, *_: object) -> None: ...
-
-    progress = Counting()
-    motion, span = pan(1), FrameSpan(10, 40)
-    monkeypatch.setitem(accumulate.__globals__, "_RUN", 4)
-    render(panning, motion, span, plan_canvas(motion, span, SHAPE, 1.0, GIB), 2.0, Context(2, progress))
-    assert progress.title == ("panorama", 30, "frames")
-    assert progress.frames == [8, 8, 8, 6]
 
 
 def test_render_takes_no_more_memory_than_predicted(memory_source: type, pan: Callable) -> None:

@@ -8,7 +8,6 @@ from photonpano.capture import seen_through
 from photonpano.geometry import (
     Camera,
     Canvas,
-    FrameTrajectory,
     canvas_around,
     canvas_of,
     covered_by,
@@ -16,7 +15,6 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.merging import Chunk, accumulate
-from photonpano.merging.canvas_noise import Averaging, laid
 from photonpano.testing.captures import MemorySource
 from photonpano.values import FloatArray, FluxImage, FrameSpan
 
@@ -90,15 +88,6 @@ def test_full_turn_shows_the_scene_without_a_seam(projection: str, camera: Camer
     assert seen[:, [0, -1]].mean() > 0.7
 
 
-def test_pole_is_filled() -> None:
-    turns = rotations(YAWS, 75)
-    canvas = around(turns, CAMERA)
-    mean, weight = mean_on(canvas, capture(turns, CAMERA), turns)
-    seen = weight > 0.5
-    assert_shows_the_scene(mean, canvas, seen)
-    assert seen.mean() > 0.45
-
-
 def test_lens_on_a_plane_straightens_frames() -> None:
     turns = rotations(np.arange(-20.0, 21, 5))
     turns = np.linalg.inv(turns[4]) @ turns
@@ -119,15 +108,6 @@ def test_counts_and_weight_are_interpolated_alike_at_masks_and_borders() -> None
     _, whole = mean_on(canvas, alike(turns), turns)
     assert np.allclose(mean[weight > 1e-3], 7, rtol=1e-3)
     assert weight.sum() == pytest.approx(valid.mean() * whole.sum(), rel=0.02)
-
-
-def test_small_scale_averages_pixels_before_the_warp() -> None:
-    turns = rotations(np.zeros(1))
-    canvas = around(turns, CAMERA, "cylindrical", 0.25)
-    frame = (7 * np.indices(SHAPE).sum(axis=0) % 2).astype(np.uint8) * 40
-    photons = accumulate(MemorySource(frame[None]), chunks(turns, CAMERA), canvas, canvas.shape)
-    middle = photons.weight > 0.99
-    assert np.allclose(photons.counts[middle] / photons.weight[middle], 20, atol=0.5)
 
 
 def test_part_of_a_canvas_is_the_same_as_that_part_of_the_whole() -> None:
@@ -177,33 +157,6 @@ def test_frames_behind_a_plane_leave_no_ghost() -> None:
     few = accumulate(source, [chunk for chunk, near in zip(chunks(turns, CAMERA), ahead, strict=True) if near], canvas, SHAPE)
     assert np.allclose(photons.weight, few.weight, atol=1e-3)
     assert np.allclose(photons.counts, few.counts, atol=0.02)
-
-
-@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_noise_on_a_sphere_is_lowered_by_interpolation(camera: Camera) -> None:
-    """The variance of pixels between others is 4 / 9 on average."""
-    turns = rotations(np.arange(0.0, 100, 0.5))
-    canvas = around(turns, camera)
-    span = FrameSpan(0, len(turns))
-    averaging = Averaging.of(FrameTrajectory(CAMERA.homographies(turns)), span, SHAPE, canvas, camera)
-    factor = averaging.over(canvas.shape).std_factor
-    assert np.median(factor) == pytest.approx(2 / 3, abs=0.04)
-    part = averaging.over((10, 20), 15, 60).std_factor
-    assert np.allclose(part, factor[15:25, 60:80], atol=0.02)
-
-
-def test_corrections_are_laid_on_a_sphere_as_counts_are() -> None:
-    turns = rotations()
-    canvas = around(turns, LENS)
-    image = np.random.default_rng(0).integers(0, 255, SHAPE)
-    source = seen_through(MemorySource(np.repeat(image[None], len(turns), axis=0)), LENS)
-    photons = accumulate(source, chunks(turns, CAMERA), canvas, canvas.shape)
-    motions = CAMERA.homographies(turns)
-    images = [image.astype(np.float32), np.ones(SHAPE, np.float32)]
-    sums, share = laid(canvas, LENS, motions, images, np.ones(SHAPE, np.bool_))
-    assert np.allclose(sums[0], photons.counts, rtol=1e-4, atol=0.1)
-    assert np.allclose(share, photons.weight, atol=1e-3)
-    assert np.allclose(sums[1], share, atol=1e-3)
 
 
 def test_tangential_distortion_moves_pixels_as_the_camera_says() -> None:

@@ -7,10 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from photonpano import FrameSpan, Group, Located, LocationError, NotLocated, VirtualExposure
-from photonpano.motion.diagnosis import Contrast, contrast_of, require_in_front, require_tied, solving
+from photonpano.motion.diagnosis import Contrast, contrast_of, require_in_front, require_tied
 from photonpano.motion.graph import GraphSolution
 from photonpano.photometry import BinaryResponse
-from photonpano.testing import photographed
 from photonpano.values import Edge
 
 
@@ -24,17 +23,6 @@ def test_contrast_is_blank_if_all_pixels_are_saturated_and_not_if_one_has_one_da
         blank = contrast_of(VirtualExposure(flux, weight, GROUPS[0], 1.0, response)).blank
         sentence = "every pixel is saturated, so that its flux is unknown; use a smaller aperture"
         assert blank == (sentence if saturated else None)
-
-
-@pytest.mark.parametrize(
-    ("unseen", "blank"),
-    [
-        (None, "no pixel detected a photon; is the shutter closed, or is it the wrong file?"),
-        (np.ones((4, 6), bool), "no pixel was seen"),
-    ],
-)
-def test_contrast_is_blank_without_photons_or_pixels(unseen: np.ndarray | None, blank: str) -> None:
-    assert contrast_of(photographed(np.zeros((4, 6)), 100, unseen=unseen)).blank == blank
 
 
 N = 10
@@ -69,11 +57,6 @@ def test_require_tied_accepts_two_lost_exposures_in_a_row_or_the_largest_part(
 ) -> None:
     require(lost, disconnected=disconnected)
     require_tied(1, GROUPS[:1], [], np.array([0]), {0: CLEAR}, "error")
-
-
-def test_exposures_that_the_level_before_has_lost_may_be_lost_again() -> None:
-    require((6, 7, 8, 9), foreseen=6)
-    assert "so that frames 600 to 999 cannot be tied to the rest" in refusal((6, 7, 8, 9), foreseen=7)
 
 
 def refusal(*args: Any, **kwargs: Any) -> str:
@@ -135,49 +118,6 @@ def test_refusal_advises_by_the_signal_to_noise_ratio(contrast: Contrast, advice
     ]
 
 
-SIX = "; ".join(f"frames {200 * part} to {200 * part + 199}" for part in range(6))
-
-
-@pytest.mark.parametrize(
-    ("parts", "named"),
-    [
-        # An exposure without a located pair is no part.
-        (
-            [1, 1, 1, 3, 0, 0, 4, 0, 0, 2, 2],
-            "frames 400 to 599 with frames 700 to 899; frames 0 to 299; frames 900 to 1099.",
-        ),
-        ([0, 0, 1, 2, 3], "frames 0 to 199."),
-        ([part for part in range(6) for _ in range(2)], f"{SIX}."),
-        ([part for part in range(7) for _ in range(2)], f"{SIX}; and others."),
-    ],
-    ids=["largest first", "one", "six", "seven"],
-)
-def test_refusal_lists_six_parts_at_most(parts: list[int], named: str) -> None:
-    groups = tuple(Group(FrameSpan(100 * index, 100 * index + 100), 100 * index + 49.5) for index in range(len(parts)))
-    contrasts = dict.fromkeys(range(len(parts)), CLEAR)
-    with pytest.raises(LocationError) as caught:
-        require_tied(1, groups, [Edge(1, 0, NotLocated("lost"))], np.array(parts), contrasts, "error")
-    assert str(caught.value).splitlines()[1] == f"Parts that are tied together: {named}"
-
-
-def test_refusal_lists_six_pairs_at_most_and_gives_no_advice_for_blank_exposures() -> None:
-    lines = refusal((2, 3, 4, 5, 6, 7, 8, 9)).splitlines()
-    assert [line for line in lines if line.startswith("  ")][6:] == ["  ... and 2 more"]
-    blank = Contrast(0.0, "no pixel detected a photon")
-    assert refusal((4, 5, 6), blank, reason="frames 400 to 499: no pixel detected a photon").splitlines()[-2:] == [
-        "  frames 700 to 799 onto frames 600 to 699: frames 400 to 499: no pixel detected a photon",
-        "To go on with the largest part alone, set graph.disconnected to largest.",
-    ]
-
-
-def test_refusal_offers_no_largest_part_if_no_pair_is_located() -> None:
-    """Without located pairs, the largest component is a single exposure."""
-    for disconnected in ("error", "largest"):
-        lines = refusal(tuple(range(1, N)), disconnected=disconnected).splitlines()
-        assert lines[0] == "level 2: none of the 9 pairs of exposures could be located"
-        assert lines[-1].endswith("or the scene has no texture there.")
-
-
 def test_exposures_beyond_the_horizon_are_named() -> None:
     groups = [Group(FrameSpan(10 * index, 10 * index + 10), 10 * index) for index in range(6)]
     homographies = np.array([np.eye(3)] * 6)
@@ -192,25 +132,3 @@ def test_exposures_beyond_the_horizon_are_named() -> None:
     )
     homographies[3:5] = np.eye(3)
     require_in_front(2, groups, solution, (40, 60), ValueError("no root"))
-
-
-def test_graph_that_cannot_be_solved_is_a_location_error() -> None:
-    with pytest.raises(LocationError) as caught, solving(1):
-        np.linalg.inv(np.zeros((3, 3)))
-    assert str(caught.value) == (
-        "level 1: the located pairs contradict each other so much that no homographies fit them (Singular matrix); try other "
-        "groups, or another locator"
-    )
-
-
-@pytest.mark.parametrize(("shape", "small"), [((8, 24), True), ((1, 512), True), ((24, 24), False), ((8, 512), False)])
-def test_frames_that_are_too_small_are_the_cause(shape: tuple[int, int], small: bool) -> None:
-    groups, parts = GROUPS[:2], np.array([0, 1])
-    with pytest.raises(LocationError) as caught:
-        require_tied(1, groups, [Edge(1, 0, NotLocated("lost"))], parts, {0: CLEAR, 1: CLEAR}, "error", frame_shape=shape)
-    height, width = shape
-    sentence = (
-        f"Frames of {height}x{width} px are too small for most scenes: use 8 rows and columns or more, and 500 pixels or more."
-    )
-    assert (str(caught.value).splitlines()[1] == sentence) == small
-    assert ("lost" in str(caught.value)) == (not small)

@@ -38,13 +38,6 @@ def test_each_photon_counts_once_in_dense_groups_and_many_pairs(length: int, ski
     np.testing.assert_allclose(weights_within(groups, skips), weight, rtol=1e-3)
 
 
-def test_a_pair_weighs_no_more_than_itself() -> None:
-    """The only pair of two exposures, and that at the end of a chain, whose exposures are in three pairs together."""
-    assert ExposureNoise.of(np.array([[1, 0]]), [group.span for group in groups_of(2)]).weights.tolist() == [1]
-    chain = ExposureNoise.of(np.array(pairs(5, (1,))), [group.span for group in groups_of(5)])
-    assert chain.weights.tolist() == [1] * 4
-
-
 @pytest.mark.parametrize(
     ("first", "second", "correlation"),
     [
@@ -87,24 +80,3 @@ def test_drawn_errors_are_those_of_pairs_that_share_the_noise_of_exposures(lengt
     np.testing.assert_allclose(of_pairs[0], of_pairs[1], atol=0.12)
     # What shares an exposure is far from independent.
     assert np.abs(of_pairs[0] - np.eye(len(expected))).max() > 0.4
-
-
-def test_a_pair_that_knows_less_than_its_exposures_errs_by_itself() -> None:
-    """Three exposures of which the first two pairs with the third know four times as much: the rest of the first is its own."""
-    ends, slopes = np.array([[1, 0], [2, 0], [2, 1]]), np.stack([0.5 * np.eye(8), np.eye(8), np.eye(8)])
-    noise = ExposureNoise.of(ends, [group.span for group in groups_of(3)])
-    errors = noise.errors(slopes, -slopes, 4000, np.random.default_rng(0))
-    shared = np.einsum("eis,fis->ef", errors, errors) / (8 * 4000)
-    np.testing.assert_allclose(shared, [[1, 0.25, -0.25], [0.25, 1, 0.5], [-0.25, 0.5, 1]], atol=0.03)
-
-
-def test_an_exposure_knows_what_all_its_pairs_know_together() -> None:
-    """Of two pairs of an exposure, each knows some directions well, and hardly anything of the others."""
-    ends, knows = np.array([[1, 0], [2, 0]]), np.where(np.arange(8) < 4, 1, 1e-2)
-    slopes = np.stack([np.diag(knows), np.diag(0.5 * knows[::-1])])
-    errors = ExposureNoise.of(ends, [group.span for group in groups_of(3)]).errors(
-        slopes, -slopes, 4000, np.random.default_rng(0)
-    )
-    np.testing.assert_allclose(errors.var(axis=2), 1, atol=0.1)
-    # What one of them hardly sees is error of its own, which the other does not share.
-    assert np.abs((errors[0] * errors[1]).mean(axis=1)).max() < 0.06

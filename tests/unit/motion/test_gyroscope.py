@@ -50,20 +50,6 @@ def test_wrong_files_are_refused(tmp_path: Path, text: str, message: str) -> Non
     assert str(caught.value).removeprefix(str(file)).removeprefix(":").strip() == message
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"imu\.csv cannot be read: .* No such file"):
-        read_rates(tmp_path / "imu.csv")
-
-
-def test_frames_without_rates_are_named() -> None:
-    rates = Rates(Path("imu.csv"), np.r_[0:0.5:0.01, 0.6:1.0:0.01], np.zeros((90, 3)))
-    rates.require_covered(np.arange(10) * 0.01)
-    with pytest.raises(InputError, match=r"holds rates from 0 to 0.99 s, .* 11 of them, from 90 to 100, are without; correct"):
-        rates.require_covered(np.arange(0.1, 1.101, 0.01))
-    with pytest.raises(InputError, match=r"no rates from 0.49 to 0.6 s, when the frames 40 to 50 were taken"):
-        rates.require_covered(np.arange(0.0945, 0.9, 0.01))
-
-
 def test_rates_in_degrees_without_their_bias_are_the_rotations(tmp_path: Path) -> None:
     frames = np.arange(1000)[:, None] / 1000
     truth = rotation_matrices(np.sin(frames * [3.0, 2.0, 5.0]) * [0.1, 0.5, 0.2])
@@ -109,17 +95,6 @@ def test_pairs_of_a_still_camera_scatter_as_expected() -> None:
     variance = sum(edge.motion.evidence["std_px"] ** 2 for edge in walked) / expected * (noise**2 * 0.05) * 3
     assert np.mean(ends) == pytest.approx(variance, rel=0.3)
     assert [(edge.moving, edge.fixed, edge.locator) for edge in edges[:2]] == [(1, 0, GYROSCOPE), (2, 1, GYROSCOPE)]
-
-
-def test_a_graph_of_the_gyroscope_alone_follows_its_rates() -> None:
-    gyroscope = gyroscope_of(np.array([0.1, 0.6, -0.2]), np.deg2rad(0.01), np.deg2rad(0.3))
-    edges, model = gyroscope.edges(GROUPS), MotionModel("rotation", FOCAL_PX)
-    solution = solve(
-        GROUPS, edges, len(GROUPS) // 2, SHAPE, gyroscope.trajectory(0).at([each.reference for each in GROUPS]), model
-    )
-    assert solution.located.all()
-    assert solution.residual_px < 1e-6
-    assert gyroscope.agreement(edges, solution, 0.05).reason.startswith("of what pairs of exposures show of rotations, 100% is")
 
 
 def test_a_graph_of_the_gyroscope_alone_drifts_by_its_expected_error() -> None:

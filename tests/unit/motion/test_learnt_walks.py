@@ -5,11 +5,11 @@ import pytest
 
 from photonpano.geometry import Camera, inverse, normalised, rotation_matrices, translation
 from photonpano.motion.graph import solve
-from photonpano.motion.models import HOMOGRAPHIES, MotionModel
-from photonpano.motion.planar import PLANAR_NAMES, PlanarName, basis_of, logarithms, moved
+from photonpano.motion.models import MotionModel
+from photonpano.motion.planar import PLANAR_NAMES, PlanarName, basis_of, moved
 from photonpano.values import Edge
 
-from .measured_graphs import NOISE_PX, SHAPE, groups_of, measured, noise_of, squared_errors, true_motion
+from .measured_graphs import NOISE_PX, SHAPE, groups_of, measured, noise_of, squared_errors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -62,7 +62,7 @@ def test_learnt_walks_are_as_accurate_as_the_model_that_moved_and_as_sure(model:
     """What does not move has narrow walks: the noise is 0.3 px, and what moves goes to 10 px and more."""
     errors: dict[str, list[float]] = {"auto": [], model: []}
     squares: dict[str, list[float]] = {"auto": [], model: []}
-    for seed in range(4):
+    for seed in range(2):
         true = path(model, seed)
         edges = measured_with(true, seed, 0.3)
         for name in errors:
@@ -96,38 +96,12 @@ def test_zoom_out_and_back_is_no_outlier() -> None:
 
 def test_what_only_shifts_and_rolls_has_three_unknowns_an_exposure() -> None:
     """Walks that are not worth their place are left out, and with them their noise."""
-    for seed in range(4):
+    for seed in range(2):
         edges = measured_with(path("euclidean", seed), seed, NOISE_PX)
         found, told = (solve(GROUPS, edges, N_NODES // 2, SHAPE, model=MotionModel(name)) for name in ("auto", "euclidean"))
         assert found.walks_px == {}
         assert found.compare()["homography"].unknowns == 3 * (N_NODES - 1)
         assert rms_px(found.homographies, path("euclidean", seed)) < 1.05 * rms_px(told.homographies, path("euclidean", seed))
-
-
-def test_a_long_way_without_walks_is_as_accurate_as_told() -> None:
-    """Perspective that noise alone shows bends a way of 30 frames so far that none is hard to find from there."""
-    n_nodes = 200
-    true = np.array([translation(30 * SHAPE[1] * each, 0) for each in np.linspace(0, 1, n_nodes)])
-    edges = measured_with(true, 0, 0.3)
-    found, told = (
-        solve(groups_of(n_nodes), edges, n_nodes // 2, SHAPE, model=MotionModel(name)) for name in ("auto", "euclidean")
-    )
-    assert found.walks_px == {}
-    assert rms_px(found.homographies, true) < 1.05 * rms_px(told.homographies, true)
-
-
-def test_turns_couple_perspective_to_shift() -> None:
-    """What couples is no walk: without it, perspective walks far; and rotations are the likelier model."""
-    edges = measured_with(turned(), 0, NOISE_PX)
-    free = solve(GROUPS, edges, N_NODES // 2, SHAPE)
-    # The perspective of a turn by 30 degrees moves the ends of a frame by 15 px.
-    assert all(px < 0.3 for px in free.walks_px.values())
-    assert free.turning_px == pytest.approx(FOCAL_PX, rel=0.05)
-    chosen = solve(GROUPS, edges, N_NODES // 2, SHAPE, model=AUTO)
-    assert chosen.model.name == "rotation"
-    assert chosen.rotations is not None
-    assert chosen.rotations.camera.focal_px == pytest.approx(FOCAL_PX, rel=0.01)
-    assert rms_px(free.homographies, turned()) < 1.3 * rms_px(chosen.homographies, turned())
 
 
 @pytest.mark.parametrize("zoom", [0.02, 0.1])
@@ -153,41 +127,3 @@ def test_the_model_that_moved_has_the_lower_deviance(true: np.ndarray, likelier:
         "rotation": 3 * (N_NODES - 1) + 1,
         "homography": 8 * (N_NODES - 1) + 1,
     }
-
-
-@pytest.mark.parametrize("model", [AUTO, HOMOGRAPHIES, MotionModel("similarity")])
-@pytest.mark.parametrize("n_nodes", [1, 2, 3])
-def test_few_exposures_assume_how_wide_walks_are(n_nodes: int, model: MotionModel) -> None:
-    """A fiftieth of half a frame over the capture."""
-    edges = measured_with(true_motion(n_nodes), 0, NOISE_PX)
-    solution = solve(groups_of(n_nodes), edges, n_nodes // 2, SHAPE, model=model)
-    assert solution.located.all()
-    names = () if n_nodes == 1 else WALKS[:1] if model.kind == "similarity" else WALKS
-    assert solution.walks_px == pytest.approx(dict.fromkeys(names, 0.02 * max(SHAPE) / 2))
-
-
-def test_walks_of_few_exposures_are_learnt_without_failing() -> None:
-    for n_nodes in (4, 5, 6, 7):
-        edges = measured_with(true_motion(n_nodes), 0, NOISE_PX)
-        solution = solve(groups_of(n_nodes), edges, n_nodes // 2, SHAPE, model=AUTO)
-        assert rms_px(solution.homographies, true_motion(n_nodes)) < 2 * NOISE_PX
-
-
-def test_logarithms_undo_exponentials() -> None:
-    steps = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 8))
-    np.testing.assert_allclose(logarithms(normalised(moved(np.eye(3)[None], steps, np.eye(8), SHAPE)), SHAPE), steps, atol=1e-6)
-
-
-def test_shifts_claim_what_a_turn_that_does_not_show_would_bend() -> None:
-    """Between neighbours, the turn changes perspective by less than noise; over 15 frames, it bends the path by pixels."""
-    n_nodes, focal_px, errors, claims = 40, 12_000.0, [], []
-    angles = np.linspace(-0.5, 0.5, n_nodes) * 15 * SHAPE[1] / focal_px
-    rotations = rotation_matrices(np.outer(angles, [0, 1, 0]))
-    true = normalised(Camera.of(focal_px, SHAPE).homographies(rotations[n_nodes // 2].T @ rotations))
-    for seed in range(3):
-        solution = solve(groups_of(n_nodes), measured_with(true, seed, 1.0), n_nodes // 2, SHAPE, model=AUTO)
-        assert (solution.model.kind, solution.walks_px) == ("homography", {})
-        errors.append(rms_px(solution.homographies, true))
-        claims.append(float(np.sqrt((solution.assess().std_px ** 2).mean())))
-    assert np.mean(errors) > 10
-    assert 0.5 < np.linalg.norm(errors) / np.linalg.norm(claims) < 2

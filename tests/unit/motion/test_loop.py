@@ -8,14 +8,14 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, InputError, PluginError
+from photonpano import FrameSpan, Group, PluginError
 from photonpano.contracts.attribution import attributed
 from photonpano.execution.context import Context, Quiet
-from photonpano.geometry import from_parameters, inverse, normalised, translation
+from photonpano.geometry import translation
 from photonpano.motion.level import Cut, Level, Timeline
 from photonpano.motion.locate import LoopSetting
-from photonpano.motion.loop import LevelResult, ReferencedTrajectory, converges, estimate_motion
-from photonpano.motion.velocity import ConstantVelocity, Velocity
+from photonpano.motion.loop import LevelResult, converges, estimate_motion
+from photonpano.residuals.findings import Findings
 from photonpano.specs.settings import GraphSettings
 
 N_FRAMES = 120
@@ -23,16 +23,6 @@ N_FRAMES = 120
 
 def groups(*spans: tuple[int, int]) -> tuple[Group, ...]:
     return tuple(Group(span, span.centre) for span in (FrameSpan(*each) for each in spans))
-
-
-class Grouping:
-    """A resampler that returns these groups, whatever the capture."""
-
-    def __init__(self, *spans: tuple[int, int]) -> None:
-        self.answer = groups(*spans)
-
-    def groups(self, n_frames: int, level: int) -> tuple[Group, ...]:
-        return self.answer
 
 
 class Notes(Quiet):
@@ -129,73 +119,11 @@ def test_the_motion_converges_while_changes_shrink_and_exceed_their_error(
     assert converges(results) is expected
 
 
-def test_motion_that_is_corrected_goes_on_beyond_the_exposures(run: Callable, make_level: Callable, known_motion: type) -> None:
-    """A fan turns by 3 degrees a frame, and drifts by 0.1 px beyond each end, where the interpolator stands still."""
-    fan = ConstantVelocity(Velocity(np.radians(3), np.zeros(2), np.array([30.0, 20.0])), 60)
-    drifting = known_motion(lambda frame: fan.at([frame])[0] @ translation(0.02 * (frame - 60), 0))
-    levels = [make_level(drifting, number=number) for number in (1, 2)]
-    *_, result = run(*levels, previous=fan, corrected=fan)
-    frames = np.arange(N_FRAMES)
-    np.testing.assert_allclose(result.trajectory.at(frames), drifting.at(frames), atol=0.1)
-
-
 def raising(error: BaseException) -> Callable[..., Any]:
     def fail(*_: Any) -> Any:
         raise error
 
     return fail
-
-
-@pytest.mark.parametrize(
-    ("kind", "method"),
-    [("resampler", "groups"), ("merger", "merge"), ("locator", "describe"), ("locator", "register"), ("interpolator", "fit")],
-)
-def test_component_that_raises_is_named_and_errors_for_users_pass_unchanged(
-    run: Callable, make_level: Callable, kind: str, method: str
-) -> None:
-    second = make_level(number=2)
-    component = second.locators[0].component if kind == "locator" else getattr(second, kind)
-    component = component.component
-    setattr(component, method, raising(ZeroDivisionError("by nothing")))
-    with pytest.raises(PluginError) as caught:
-        run(make_level(), second)
-    assert str(caught.value) == f"{kind} 'toy' of toys 1.0 failed at level 2: ZeroDivisionError: by nothing"
-    assert isinstance(caught.value.__cause__, ZeroDivisionError)
-    error = InputError("said for users")
-    setattr(component, method, raising(error))
-    with pytest.raises(InputError) as unchanged:
-        run(make_level(), second)
-    assert unchanged.value is error
-
-
-def test_single_group_is_one_located_instant_without_information(run: Callable, make_level: Callable) -> None:
-    (result,) = run(make_level(resampler=Grouping((0, N_FRAMES))))
-    assert (result.located.n_located, result.located.edges, result.located.information) == (1, (), None)
-    np.testing.assert_array_equal(result.located.homographies, [np.eye(3)])
-    np.testing.assert_array_equal(result.trajectory.at([0, 119]), [np.eye(3)] * 2)
-
-
-def test_referenced_trajectory_is_the_identity_at_the_reference_and_keeps_pairwise_motions(
-    pan: Callable, known_motion: type
-) -> None:
-    """A camera that zooms while it pans: these maps do not commute."""
-    trajectory = ReferencedTrajectory(pan(0.5), 40)
-    np.testing.assert_allclose(trajectory.at([40, 50, 20.5]), [np.eye(3), translation(5, 0), translation(-9.75, 0)])
-    zoom, speed = np.array([1e-3, -2e-4, 3e-4, 1e-3, 0, 0, 1e-6, 2e-6]), np.array([0.3, -0.1])
-    free = known_motion(lambda frame: translation(*speed * frame) @ from_parameters(zoom * frame))
-    pairs = []
-    for reference in (0, 25, 100):
-        first, second = ReferencedTrajectory(free, reference).at([20, 70])
-        pairs.append(normalised(inverse(first) @ second))
-        np.testing.assert_allclose(ReferencedTrajectory(free, reference).at([reference]), [np.eye(3)], atol=1e-12)
-    np.testing.assert_allclose(pairs[1:], [pairs[0]] * 2, atol=1e-9)
-
-
-def test_attributed_trajectory_returns_what_the_trajectory_returns(pan: Callable) -> None:
-    motion = pan(0.3)
-    named = attributed(motion, "interpolator 'toy' of toys 1.0", "level 2")
-    for frames in ([3], [0, 2.5, 7], np.arange(4), 3):
-        np.testing.assert_array_equal(named.at(frames), motion.at(frames))
 
 
 @pytest.mark.parametrize(
@@ -283,19 +211,6 @@ def test_trajectory_jumps_at_cut_and_is_exact_beside_it(estimated: Callable[...,
     assert not any(group.span.start < 50 < group.span.stop for group in result.groups)
 
 
-def test_shift_of_cut_is_that_of_trajectory_beyond_its_motion(known_motion: type) -> None:
-    moved = known_motion(lambda frame: translation(jumping(frame), -2 * (frame >= 49.5)))
-    np.testing.assert_allclose(cut_at(50).along(moved, (40, 60)).shift_px, [-7, 2], atol=1e-9)
-
-
-def test_repeated_frames_stand_still(estimated: Callable[..., LevelResult]) -> None:
-    """Every fifth frame is sent twice: the camera moves by 0.3 px in each of the others."""
-    timeline = repeating(*range(5, N_FRAMES, 6))
-    result = estimated(lambda frame: 0.3 * float(timeline.times(frame)), timeline)
-    steps = np.diff(result.trajectory.at(np.arange(10, 110))[:, 0, 2])
-    np.testing.assert_allclose(steps, np.where(np.arange(11, 110) % 6 == 5, 0, 0.3), atol=1e-9)
-
-
 def test_expected_error_grows_towards_cut_and_covers_jump_in_the_dark(estimated: Callable[..., LevelResult]) -> None:
     whole = estimated(lambda frame: 0.3 * frame, REGULAR).uncertainty
     cut = estimated(jumping, REGULAR.cut_at([cut_at(50)])).uncertainty
@@ -309,27 +224,8 @@ def test_pieces_end_in_long_darkness_and_other_shots_are_not_shown() -> None:
     timeline = replace(REGULAR, dark=(FrameSpan(0, 10), FrameSpan(40, 61))).in_shots([FrameSpan(0, 90), FrameSpan(90, 120)])
     np.testing.assert_array_equal(timeline.piece_of([5, 50, 51, 100]), [0, 1, 1, 1])
     np.testing.assert_array_equal(np.flatnonzero(timeline.shown), [*range(10, 40), *range(61, 90)])
-    assert [(each.what, each.value) for each in timeline.decisions] == [
+    assert [(each.what, each.value) for each in Findings().along(timeline).of_frames] == [
         ("shots", "frames 0 to 89 and frames 90 to 119"),
         ("dark_frames", "frames 0 to 9"),
         ("dark_frames", "frames 40 to 60"),
-    ]
-
-
-def test_decisions_name_cuts_jumps_in_the_dark_and_repeated_frames() -> None:
-    timeline = repeating(7, 8).cut_at([cut_at(50), cut_at(80, FrameSpan(75, 85))])
-    assert [(each.what, each.value, each.reason) for each in timeline.decisions] == [
-        ("repeated_frames", 2, "copies of the frame before; the motion stands still there"),
-        (
-            "cut",
-            50,
-            "the image jumps by 7 px (20 standard deviations) from the frame before to this one, as where frames are missing "
-            "or doubled; the interpolation is cut there",
-        ),
-        (
-            "jump_in_the_dark",
-            "frames 75 to 84",
-            "the image jumps by 7 px (20 standard deviations) while they show nothing; the interpolation is cut in the middle, "
-            "at frame 80",
-        ),
     ]

@@ -19,9 +19,3 @@ def test_motions_of_a_model_stay_within_it(model: PlanarName, steps: list[float]
     once = moved(np.eye(3)[None], first, basis, SHAPE)
     for element in (once, moved(once, second, basis, SHAPE), normalised(inverse(once))):
         np.testing.assert_allclose(corner_displacements(nearest(model, element, SHAPE), element, SHAPE), 0, atol=1e-6)
-
-
-def test_steps_that_follow_each_other_add_up() -> None:
-    basis = basis_of("euclidean")
-    step = np.array([[0.1, -0.05, 0.3]])
-    np.testing.assert_allclose(moved(moved(np.eye(3)[None], step, basis, SHAPE), -step, basis, SHAPE)[0], np.eye(3), atol=1e-12)

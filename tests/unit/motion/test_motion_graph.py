@@ -13,10 +13,9 @@ from photonpano.geometry import (
     from_parameters,
     inverse,
     normalised,
-    rescaled,
 )
 from photonpano.motion import adjustment
-from photonpano.motion.graph import _Tied, components, solve
+from photonpano.motion.graph import components, solve
 from photonpano.values import Edge
 
 from .measured_graphs import (
@@ -51,25 +50,6 @@ def test_solve_follows_pairs_that_are_known_exactly(skips: tuple[int, ...], anch
     assert solution.residual_px < 1e-6
 
 
-@pytest.mark.parametrize(("n", "times"), [(200, 1), (60, 3)], ids=["expected", "overconfident"])
-def test_residual_is_that_of_the_measurements_and_no_edge_is_an_outlier(n: int, times: float) -> None:
-    """Every corner has an error of 0.1 px along two axes, of which free unknowns would absorb a half, and the walks less.
-
-    The spanning tree that the solution starts from contains one pair in two; errors are `times` what information predicts.
-    """
-    _, edges = graph(n, (1, 2))
-    solution = solve(groups_of(n), confident(edges, times), n // 2, SHAPE)
-    most = NOISE_PX * np.sqrt(2)
-    assert 0.95 * most * np.sqrt(1 - (n - 1) / len(edges)) < solution.residual_px < most
-    assert solution.outliers == ()
-
-
-def test_solve_accepts_pairs_in_either_direction_and_twice() -> None:
-    true = true_motion(4)
-    edges = [edge(true, 1, 0), edge(true, 1, 2), edge(true, 2, 1), edge(true, 2, 3), edge(true, 0, 3), edge(true, 1, 0)]
-    assert error_px(solve(groups_of(4), confident(edges, 100), 0, SHAPE).homographies, true, 0) < 1e-4
-
-
 @pytest.mark.parametrize("weighted_by", ["information", "residual_px"])
 def test_solve_weights_edges_by_information_or_residual(weighted_by: str) -> None:
     """Every second measurement of a pair is twenty times as noisy."""
@@ -92,7 +72,7 @@ def test_solve_weights_edges_by_information_or_residual(weighted_by: str) -> Non
 
 
 def test_solve_error_falls_with_more_edges_than_a_chain() -> None:
-    """Errors of 0.1 px a pair: over 120 exposures a chain drifts by 0.7 px; second and fourth neighbours leave 0.14 px."""
+    """Errors of 0.1 px a pair: a chain drifts; second and fourth neighbours leave a third of that."""
     errors: dict[tuple[int, ...], list[float]] = {(1,): [], (1, 2, 4): [], (1, 2, 4, 40): []}
     for seed in range(2):
         true, rng = true_motion(120, seed), np.random.default_rng(seed)
@@ -107,27 +87,11 @@ def test_solve_error_falls_with_more_edges_than_a_chain() -> None:
 def test_solve_drops_one_gross_outlier_at_any_edge() -> None:
     true, edges = graph(9)
     clean = error_px(solve(groups_of(9), edges, 4, SHAPE).homographies, true, 4)
-    for index, each in enumerate(edges):
+    for index in range(0, len(edges), 4):
+        each = edges[index]
         solution = solve(groups_of(9), [*edges[:index], moved(each, 40, -30), *edges[index + 1 :]], 4, SHAPE)
         assert solution.outliers == (index,)
         assert error_px(solution.homographies, true, 4) < 1.5 * clean
-
-
-def test_solve_with_outliers_equals_solve_without_them() -> None:
-    """The positions of outliers count failed edges."""
-    _, edges = graph(20)
-    failure = Edge(5, 3, NotLocated("nothing to see"))
-    edges[:0], edges[20:20] = [failure], [failure]
-    wrong = {7: moved(edges[7], 3, 0), 30: moved(edges[30], 40, -30), 31: moved(edges[31], 0, 500)}
-    solution = solve(groups_of(20), [wrong.get(index, each) for index, each in enumerate(edges)], 10, SHAPE)
-    without = solve(groups_of(20), [each for index, each in enumerate(edges) if index not in wrong], 10, SHAPE)
-    assert solution.outliers == tuple(wrong)
-    assert without.outliers == ()
-    # Outliers still count in the number of pairs of an exposure.
-    assert corner_displacements(solution.homographies, without.homographies, SHAPE).max() < 0.3 * NOISE_PX
-    assert solution.residual_px == pytest.approx(without.residual_px, rel=0.02)
-    # Both are estimated from 64 draws.
-    np.testing.assert_allclose(solution.assess().std_px, without.assess().std_px, rtol=0.25)
 
 
 @pytest.mark.parametrize("informed", [True, False])
@@ -149,14 +113,7 @@ def test_expected_error_includes_both_of_two_places_that_pairs_show() -> None:
     assert std_px[:20].max() < 1 < 3 < std_px[20] < 40
 
 
-def test_one_closure_of_a_chain_does_not_spoil_its_walks() -> None:
-    """The chain alone is off by 0.2 px, and all pairs agree."""
-    true = true_motion(30)
-    solution = solve(groups_of(30), measured(true, (1, 29)), 15, SHAPE)
-    assert error_px(solution.homographies, true, 15) < 0.3
-
-
-@pytest.mark.parametrize(("skips", "n"), [((1, 2, 8), 300), ((2, 3, 8), 400)], ids=["disjoint", "half overlapping"])
+@pytest.mark.parametrize(("skips", "n"), [((1, 2, 8), 100), ((2, 3, 8), 140)], ids=["disjoint", "half overlapping"])
 def test_solve_of_a_long_capture_does_not_depend_on_its_start(skips: tuple[int, ...], n: int) -> None:
     """Errors of 8 px a pair, as of blurred exposures: along skips of 8, paths to neighbours drift apart by far more."""
     true = true_motion(n)
@@ -165,18 +122,6 @@ def test_solve_of_a_long_capture_does_not_depend_on_its_start(skips: tuple[int, 
     assert found.residual_px == pytest.approx(expected.residual_px, rel=0.01)
     neighbours = inverse(found.homographies[:-1]) @ found.homographies[1:]
     assert corner_displacements(neighbours, inverse(true[:-1]) @ true[1:], SHAPE).mean() < 8
-
-
-def test_solve_does_not_depend_on_the_unit_of_length() -> None:
-    edges = without_information(graph(20)[1])
-    halved = [
-        Edge(each.moving, each.fixed, replace(each.motion, homography=rescaled(each.motion.homography, 0.5))) for each in edges
-    ]
-    whole = solve(groups_of(20), edges, 10, SHAPE)
-    # Rescaling keeps pixel edges in place, so that corner pixels are not quite the same points, to a few 1/1000 px.
-    half = solve(groups_of(20), halved, 10, (SHAPE[0] // 2, SHAPE[1] // 2))
-    moved = inverse(whole.homographies) @ rescaled(half.homographies, 2)
-    assert corner_displacements(moved, np.eye(3), SHAPE).max() < 5e-3
 
 
 def test_components_are_numbered_from_the_largest() -> None:
@@ -237,7 +182,7 @@ def any_edges(seed: int) -> tuple[int, list[Edge]]:
 
 def test_solve_is_finite_for_any_information() -> None:
     """Nearly singular systems are damped: nothing raises, and what is not determined is uncertain."""
-    for seed in range(15):
+    for seed in range(6):
         n_nodes, edges = any_edges(seed)
         solution = solve(groups_of(n_nodes), edges, 0, SHAPE)
         assessed = solution.assess()
@@ -255,11 +200,3 @@ def test_singular_system_leaves_undetermined_unknowns_and_calls_them_uncertain()
     std = adjustment._solved(normal, jacobian.T @ draws, draws=True).std(axis=1)
     np.testing.assert_allclose(std[:2], [0.5, 1], rtol=0.15)
     assert (std[2:] > 1e3).all()
-
-
-def test_start_of_the_graph_follows_exact_edges_in_both_directions() -> None:
-    """Edges lead from each exposure to an earlier one, and the anchor is in the middle."""
-    true, anchor = true_motion(9), 4
-    tied = _Tied.of(groups_of(len(true)), measured(true, (1,)), anchor, SHAPE)
-    start = normalised(tied.composed(tied.problem.observed))
-    assert error_px(start, true, anchor) < 1e-6

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.signal import find_peaks
 
 from photonpano import FrameSpan, Group, VirtualExposure
 from photonpano.geometry import inverse, rescaling, translation
 from photonpano.motion.graph import GraphSolution
-from photonpano.motion.pairs import alike, pairs_of, shared_share
-from photonpano.motion.registration import _PROMINENCE, _visits, closure_candidates, exposure_similarity
+from photonpano.motion.pairs import pairs_of, shared_share
+from photonpano.motion.registration import closure_candidates, exposure_similarity
 from photonpano.specs.settings import GraphSettings
 from photonpano.testing import photographed
 from photonpano.testing.captures import seen_along
@@ -43,27 +42,6 @@ def test_pairs_of_groups_of_one_length(
     starts: tuple[int, ...], skips: tuple[float, ...], moving: int | None, pairs: list[tuple[int, int]]
 ) -> None:
     assert [pair for pair in pairs_of(groups(*starts), skips) if moving in (None, pair[0])] == pairs
-
-
-def test_pairs_of_end_groups_count_by_their_instant() -> None:
-    ends = [Group(FrameSpan(0, 100), 0.0), *groups(0, 50, 100), Group(FrameSpan(100, 200), 199.0)]
-    pairs = pairs_of(ends, (1.0,))
-    # Instants 0, 49.5, 99.5, 149.5, 199: a hundred frames before the last lies the third.
-    assert [pair for pair in pairs if pair[0] == 4] == [(4, 1), (4, 2)]
-    assert (2, 0) in pairs
-
-
-def test_pairs_include_partners_before_and_after_each_exposure() -> None:
-    """A hundred frames before the last lies the second, but a hundred frames after the first lies the last."""
-    pairs = pairs_of(groups(0, 30, 60, 120), (1.0,))
-    assert {(3, 1), (3, 0)} <= set(pairs)
-
-
-def test_pairs_of_groups_of_different_lengths_count_in_their_mean_length() -> None:
-    """An exposure of a hundred frames touches the next one, of fifty, 75 frames away; the third is the one beyond;
-    the last two have nothing else that is nearer to a group length away."""
-    spans = FrameSpan(0, 100), FrameSpan(100, 150), FrameSpan(135, 185)
-    assert pairs_of([Group(span, span.centre) for span in spans], (1.0,)) == [(1, 0), (2, 0), (2, 1)]
 
 
 @given(
@@ -142,35 +120,10 @@ def test_exposure_similarity_is_1_for_one_place_at_any_noise(flux: float, scale:
     assert 0.97 < found.min() < found.max() < 1.03
 
 
-def test_exposure_similarity_is_0_or_large_for_one_place_in_the_dark() -> None:
-    found = similarities(0.002, NEARBY)
-    assert np.all((found == 0) | (found > 0.7))
-    assert 0 < np.count_nonzero(found) < len(found)
-
-
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 @pytest.mark.parametrize("flux", [1.0, 0.1, 0.02, 0.002])
 def test_exposure_similarity_is_small_for_different_places(flux: float, scale: float) -> None:
     assert np.abs(similarities(flux, ELSEWHERE, scale)).max() < 0.6
-
-
-@pytest.mark.parametrize("motion", [np.eye(3), translation(2.2, 1.7), translation(40, 0)], ids=["none", "small", "large"])
-@pytest.mark.parametrize("flux", [3.0, 0.1, 0.002])
-def test_exposure_similarity_is_0_for_noise_alone(flux: float, motion: np.ndarray) -> None:
-    def similarity(plane: np.ndarray, rng: np.random.Generator) -> float:
-        moving, fixed = (seen(np.ones_like(plane), HERE, flux, rng) for _ in range(2))
-        return exposure_similarity(moving, fixed, motion)
-
-    np.testing.assert_array_equal(several(similarity), 0)
-
-
-def test_exposure_similarity_falls_with_the_error_of_the_motion() -> None:
-    rng = np.random.default_rng(0)
-    moving, fixed = (seen(scene(0), place, 0.1, rng) for place in (HERE, NEARBY))
-    found = [exposure_similarity(moving, fixed, translation(off_px, 0) @ inverse(NEARBY) @ HERE) for off_px in (0, 2, 4, 8, 16)]
-    assert found == sorted(found, reverse=True)
-    assert found[0] > 0.99
-    assert found[-1] < 0.5
 
 
 ROLL = np.array([[np.cos(0.35), -np.sin(0.35), 90], [np.sin(0.35), np.cos(0.35), 30], [2e-4, 0, 1]])
@@ -195,19 +148,6 @@ def test_exposure_similarity_is_1_for_one_place(
     here, there = places
     first, second = (seen(scene(0), place, 0.1, rng, **more) for place, more in ((here, moving), (there, fixed)))
     assert exposure_similarity(first, second, inverse(there) @ here) == pytest.approx(1, abs=0.02)
-
-
-def test_exposure_similarity_is_0_for_little_overlap_or_few_seen_pixels() -> None:
-    rng = np.random.default_rng(0)
-    exposure, tiny = (seen(scene(0), HERE, 1.0, rng, scale) for scale in (1.0, 0.02))
-    sliver = np.ones(SHAPE, bool)
-    sliver[:6] = False
-    unseen = [seen(scene(0), HERE, 1.0, rng, unseen=each) for each in (sliver, np.ones(SHAPE, bool))]
-    assert exposure_similarity(exposure, exposure, np.eye(3)) == pytest.approx(1, abs=0.02)
-    for moving, fixed, shift_px in ((exposure, exposure, 155), (exposure, exposure, 500), (tiny, tiny, 0)):
-        assert exposure_similarity(moving, fixed, translation(shift_px, 0)) == 0
-    for fixed in unseen:
-        assert exposure_similarity(exposure, fixed, np.eye(3)) == 0
 
 
 FIELD = (40, 60)  # height and width of the frames whose overlap is counted
@@ -272,13 +212,6 @@ def test_candidates_overlap_by_the_least_share() -> None:
     assert visiting(places, min_overlap=0.7) == [(6, 2), (7, 1)]
 
 
-def test_candidates_include_three_visits_of_a_place_at_most() -> None:
-    """Of five visits of the left end, the three of the largest overlap."""
-    far = 200.0
-    places = line(0, far, 2, far, 9, far, 12, far, 20, far, 3)
-    assert [pair for pair in visiting(places, skips=()) if pair[0] == 10] == [(10, 0), (10, 2), (10, 4)]
-
-
 def tremor(std_px: float, seed: int, n: int = 60) -> np.ndarray:
     return np.random.default_rng(seed).normal(scale=std_px, size=(n, 2))
 
@@ -298,56 +231,6 @@ def test_candidates_are_none_for_a_pan_or_a_trembling_camera(places: np.ndarray)
     assert visiting(places) == []
 
 
-def test_candidates_take_the_best_view_of_a_visit_despite_tremor() -> None:
-    pairs = visiting(THERE_AND_BACK + tremor(1.0, 0, 40))
-    assert [moving for moving, _ in pairs] == list(range(22, 40))
-    assert all(abs(moving + fixed - 39) <= 1 for moving, fixed in pairs)
-
-
-def test_candidates_thin_out_dense_exposures() -> None:
-    """Four in a group length: as many pairs as with one."""
-    sparse = visiting(THERE_AND_BACK)
-    dense = visiting(line(*np.repeat(np.concatenate([FORTH, BACK]), 4)), step=25)
-    assert {index % 4 for pair in dense for index in pair} == {0}
-    assert len(dense) == len(sparse)
-
-
-def test_candidates_are_at_least_twice_the_longest_skip_apart() -> None:
-    """The longest skip counts in group lengths."""
-    for skips, nearest in (((1.0, 2.0), 5), ((1.0, 4.0), 9), ((6.0,), 13)):
-        pairs = visiting(THERE_AND_BACK, skips=skips)
-        assert min(moving - fixed for moving, fixed in pairs) == nearest
-
-
-def test_candidates_skip_exposures_that_are_not_located_and_groups_of_another_length() -> None:
-    """The first and the last group of a capture may be shorter; their exposures are noisier."""
-    homographies = np.array([translation(x, y) for x, y in THERE_AND_BACK])
-    spread = [Group(FrameSpan(0, 50), 0.0), *groups(*range(100, 4000, 100))]
-    pairs = candidates(spread, homographies, np.ones(40, bool))
-    assert {index for pair in pairs for index in pair} == set(range(1, 18)) | set(range(22, 40))
-    located = np.ones(40, bool)
-    located[[5, 30]] = False
-    homographies[~located] = np.nan
-    pairs = candidates(groups(*range(0, 4000, 100)), homographies, located)
-    assert not {5, 30} & {index for pair in pairs for index in pair}
-    assert len(pairs) >= 16
-
-
-@pytest.mark.parametrize(
-    ("lengths", "lost", "pairs"),
-    [((10, 10, 10, 20, 20, 20), (), [(2, 0)]), ((10, 10, 10, 20), (0, 1, 2), [])],
-    ids=["two lengths", "none of the typical length"],
-)
-def test_candidates_have_a_length_that_occurs(
-    lengths: tuple[int, ...], lost: tuple[int, ...], pairs: list[tuple[int, int]]
-) -> None:
-    stops = np.cumsum(lengths).tolist()
-    spread = [Group(FrameSpan(stop - size, stop), stop - (size + 1) / 2) for stop, size in zip(stops, lengths, strict=True)]
-    located = ~np.isin(np.arange(len(lengths)), lost)
-    homographies = np.array([translation(x, 0) for x in (0, 100, 0, 100, 200, 300)[: len(lengths)]])
-    assert candidates(spread, homographies, located, skips=()) == pairs
-
-
 @given(
     places=st.lists(st.tuples(st.floats(-80, 80), st.floats(-40, 40)), min_size=1, max_size=40),
     step=st.integers(20, 150),
@@ -365,21 +248,3 @@ def test_candidates_are_ordered_unique_and_beyond_the_skips(
         away = np.abs(np.subtract(places[moving], places[fixed]))
         # Counted on a grid of eight by eight.
         assert np.prod(np.maximum(0, 1 - away / [59, 39]) + 1 / 8) >= min_overlap
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_visits_equal_the_prominent_peaks_of_scipy(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    overlap = np.cumsum(rng.normal(0, 0.15, rng.integers(1, 60))) % 1.0
-    if seed % 2:
-        overlap = np.round(overlap * 8) / 8
-    expected, _ = find_peaks(np.concatenate([[0.0], overlap, [1.0]]), height=0.5, prominence=_PROMINENCE)
-    np.testing.assert_array_equal(_visits(overlap, 0.5), expected - 1)
-
-
-def test_pairs_that_see_too_little_alike_are_left_out_unless_exposures_would_lose_their_only_ones() -> None:
-    """Frames are 100 px wide; the fourth exposure lies beyond the reach of all others."""
-    to_plane = np.array([translation(x, 0) for x in (0, 30, 95, 300)])
-    assert alike([(1, 0), (2, 0), (2, 1)], to_plane[:3], (60, 101)) == [(1, 0), (2, 1)]
-    assert alike([(1, 0), (2, 1), (3, 2)], to_plane, (60, 101)) == [(1, 0), (2, 1), (3, 2)]
-    assert alike([], to_plane[:1], (60, 101)) == []

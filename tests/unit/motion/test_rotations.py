@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from photonpano.contracts.protocols import Interpolator
-from photonpano.execution.threads import Stopwatch
 from photonpano.geometry import (
     Camera,
     align_rotations,
     corner_displacements,
     corners,
-    normalised,
     patch_centres,
     rotation_matrices,
     rotation_vectors,
@@ -23,13 +21,9 @@ from photonpano.geometry import (
     transform_points,
 )
 from photonpano.locating import fit_homography
-from photonpano.motion.adjustment import std_of
 from photonpano.motion.graph import GraphSolution, solve
-from photonpano.motion.level import Timeline, VirtualExposures
-from photonpano.motion.locate import LocatedLevel
-from photonpano.motion.loop import interpolate
 from photonpano.motion.models import ModelName, MotionModel
-from photonpano.motion.rotations import LensShift, Rotations, RotationTrajectory, fit_rotations
+from photonpano.motion.rotations import Rotations, RotationTrajectory, fit_rotations
 from photonpano.values import Edge, FloatArray, Located, NotLocated, Patches
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators import GeodesicInterpolator, LucasKanadeInterpolator, SmoothingSplineInterpolator
@@ -102,34 +96,6 @@ def test_expected_errors_of_rotations_hold() -> None:
     assert np.std(focals) / np.mean(focal_stds) == pytest.approx(1, abs=0.5)
 
 
-def test_interpolators_leave_the_error_of_the_focal_length(make_level: Callable, memory_source: type) -> None:
-    """All exposures share it. The rest of their errors is smoothed, as that of a camera whose focal length is known."""
-    groups, n_frames = groups_of(40), 400
-    edges = tuple(edges_of(turn(40, 4.0), np.random.default_rng(0)))
-    level = make_level(interpolator=INTERPOLATORS["smoothing-spline"])
-    exposures = VirtualExposures(level, memory_source(np.zeros((n_frames, *SHAPE))), groups, None, Stopwatch(1))
-    variances, shared = [], []
-    for focal_px in (FOCAL_PX, None):
-        solution = solve(groups, edges, 20, SHAPE, model=MotionModel("rotation", focal_px=focal_px))
-        assessed = solution.assess()
-        located = LocatedLevel(groups, edges, (), solution, assessed, SHAPE, {})
-        variances.append(interpolate(exposures, located, Timeline.regular(n_frames), 200).std_px ** 2)
-        shared.append(std_of(assessed.shared_px) ** 2)
-    assert not shared[0].any()
-    inner = slice(5, -5)
-    assert np.mean(variances[1][inner]) == pytest.approx(np.mean((variances[0] + shared[1])[inner]), rel=0.1)
-    assert np.mean(variances[1][inner]) > 1.3 * np.mean(variances[0][inner])
-
-
-def test_known_focal_length_is_kept() -> None:
-    rotations = turn(20, 60.0)
-    edges = edges_of(rotations, np.random.default_rng(0))
-    solution = solve(groups_of(20), edges, 10, SHAPE, model=MotionModel("rotation", focal_px=FOCAL_PX))
-    assert solution.rotations is not None
-    assert solution.rotations.camera.focal_px == FOCAL_PX
-    np.testing.assert_array_equal(solution.assess().std_camera, np.zeros(5))
-
-
 def test_auto_takes_rotations_of_a_camera_that_turns() -> None:
     solution = solve(groups_of(20), edges_of(turn(20, 60.0), np.random.default_rng(0)), 10, SHAPE, model=MotionModel("auto"))
     assert solution.rotations is not None
@@ -149,7 +115,6 @@ def test_auto_takes_homographies_where_no_rotation_explains_the_pairs() -> None:
 
 
 LENS = (-0.1, 0.0, 0.0, 0.0)
-RELATIVE = rotation_matrices([[0.02, 0.15, 0.05], [0.0, -0.3, 0.0]])
 
 
 NEAR = (-0.105, 0.028, 0.0, 0.0)
@@ -187,12 +152,6 @@ def test_patches_of_pairs_show_the_lens_that_their_homographies_follow(focal_px:
     assert std[0] < 0.05 * focal_px
 
 
-def test_patches_without_a_lens_show_none() -> None:
-    camera = Camera.of(330.0, SHAPE)
-    solution = solve(groups_of(20), bent(turn(20, 60.0), camera, camera), 10, SHAPE, model=MotionModel("auto"))
-    assert solution.model.name == "rotation"
-
-
 @pytest.mark.parametrize(
     ("given", "contradicted"),
     [((330.0, -0.1), None), ((331.0, -0.1), None), ((337.0, -0.1), 0), ((330.0, -0.08), 1), ((330.0, 0.0), 1)],
@@ -210,27 +169,6 @@ def test_pairs_contradict_a_focal_length_or_a_lens_that_is_wrong(given: tuple[fl
     assert freed.given == given[freed.number]
     assert abs(freed.found - true.numbers[freed.number]) < 4 * freed.std
     assert (freed.number if abs(freed.found - freed.given) > 10 * freed.std else None) == contradicted
-
-
-@pytest.mark.parametrize("model", [MotionModel("rotation"), MotionModel("rotation", distortion=(None, 0.0, 0.0, 0.0))])
-def test_pairs_contradict_nothing_where_the_camera_is_found(model: MotionModel) -> None:
-    assert solve(groups_of(20), edges_of(turn(20, 60.0), np.random.default_rng(0)), 10, SHAPE, model=model).freed() is None
-
-
-def test_patches_that_move_by_themselves_do_not_bend_the_lens() -> None:
-    """A quarter of the frame moves by 3 px in each pair, as a person who walks."""
-    camera, assumed = Camera.of(330.0, SHAPE, (-0.11, 0.03, 0, 0)), Camera.of(333.0, SHAPE, NEAR)
-    edges = bent(turn(20, 60.0), camera, assumed)
-    for each in edges:
-        assert isinstance(each.motion, Located)
-        assert each.motion.patches is not None
-        each.motion.patches.shifts[:36, 0] += 3.0
-    solution = solve(groups_of(20), edges, 10, SHAPE, model=MotionModel("auto").knowing(assumed))
-    assert solution.rotations is not None
-    np.testing.assert_allclose(solution.rotations.camera.numbers[:3], camera.numbers[:3], rtol=0.02)
-    assert solution.layers is not None
-    assert (solution.layers[1:, :36] > 100).all()
-    assert solution.layers[:, 36:].max() < 9
 
 
 def behind_things_that_are_near(rotations: FloatArray, camera: Camera) -> list[Edge]:
@@ -266,24 +204,6 @@ def test_pairs_follow_the_background_behind_things_that_are_near(kind: ModelName
     without = [replace(each, motion=replace(each.motion, patches=None)) for each in edges]
     pulled = solve(groups_of(16), without, 8, SHAPE, model=MotionModel("rotation", focal_px=430.0)).homographies
     assert corner_displacements(np.linalg.inv(true) @ pulled, np.eye(3), SHAPE).mean() > 1
-
-
-def test_unknown_lens_moves_corners_as_the_best_homography_between_distorted_pixels() -> None:
-    """Between pixels that are taken for ideal, the homography with the least squares over common points is fitted."""
-    camera, seen_by = Camera.of(330.0, SHAPE, LENS), Camera.of(330.0, SHAPE)
-    relative = camera.homographies(RELATIVE)
-    lens = LensShift.of(SHAPE, [Located(scaled_ahead(each)) for each in relative], np.ones(len(relative)))
-    np.testing.assert_allclose(lens.of_patches(relative, camera, camera), 0, atol=1e-8)
-    found = transform_points(relative, corners(SHAPE)) + lens.of_corners(lens.of_patches(relative, camera, seen_by))
-    for number, homography in enumerate(relative):
-        there = transform_points(homography, patch_centres(SHAPE))
-        points = patch_centres(SHAPE)[np.all((there >= 0) & (there <= [SHAPE[1] - 1, SHAPE[0] - 1]), axis=-1)]
-        there = camera.distorted(transform_points(homography, camera.ideal(points)))
-        best = fit_homography(points, there, np.ones(len(points)), scaled_ahead(homography)).homography
-        moved = np.abs(transform_points(best, corners(SHAPE)) - transform_points(homography, corners(SHAPE))).max()
-        assert moved > 5
-        # To first order, and without robust weights.
-        assert np.abs(found[number] - transform_points(best, corners(SHAPE))).max() < 0.2 * moved
 
 
 CAMERA = Camera.of(330.0, SHAPE)
@@ -326,15 +246,6 @@ def test_trajectory_follows_a_turn_by_any_angle(name: str, degrees: float) -> No
     assert errors.max() < 0.3
 
 
-def test_homographies_have_determinant_1_and_are_the_identity_at_the_reference() -> None:
-    instants = np.linspace(10, 990, 60)
-    trajectory = fitted(INTERPOLATORS["smoothing-spline"], instants, rotations_at(instants, 400.0), None)
-    homographies = trajectory.at(np.arange(1000))
-    np.testing.assert_allclose(np.linalg.det(homographies), 1)
-    np.testing.assert_allclose(homographies[500], np.eye(3), atol=1e-9)
-    assert homographies[:, 2, 2].min() < 0
-
-
 def test_smoothing_spline_lowers_the_noise_of_turns_with_information() -> None:
     """The wobble is slow: each frame is known from many knots."""
     instants, frames, std = np.linspace(10, 990, 300), np.arange(20.0, 980.0), 1e-3
@@ -344,11 +255,6 @@ def test_smoothing_spline_lowers_the_noise_of_turns_with_information() -> None:
     true = rotations_at(frames, 300.0)
     away = rotation_vectors(np.swapaxes(true, -1, -2) @ trajectory._free_rotations(frames))
     assert away.std() < 0.5 * std
-
-
-def test_single_knot_stands_still() -> None:
-    trajectory = fitted(INTERPOLATORS["smoothing-spline"], np.array([500.0]), rotations_at(np.array([500.0]), 300.0), None)
-    np.testing.assert_allclose(trajectory.rotations([0, 999]), [np.eye(3)] * 2, atol=1e-12)
 
 
 class _Turning:
@@ -377,12 +283,3 @@ def test_locators_get_the_camera_in_px_of_exposures_once_its_focal_length_is_kno
         assert found.locators[1] is level.locators[1]
     for unknown in (MotionModel("rotation"), MotionModel("homography", focal_px=400.0)):
         assert level.turning(unknown.turning_camera(shape)) is level
-
-
-def test_locators_try_shifts_and_rolls_as_long_as_no_camera_is_known() -> None:
-    """A camera of a very long focal length only shifts and rolls the image, to 0.01 px."""
-    camera = MotionModel("auto").turning_camera(SHAPE)
-    assert camera is not None
-    shifted = camera.homographies(rotation_matrices(np.array([0.0, 100 / camera.focal_px, 0.0])))
-    moved = transform_points(normalised(shifted), corners(SHAPE)) - corners(SHAPE)
-    np.testing.assert_allclose(moved, np.tile([100, 0], (4, 1)), atol=0.02)

@@ -7,7 +7,7 @@ import pytest
 
 from photonpano import FrameSpan, Group, InputError, Located, NotLocated, StreamInfo
 from photonpano.geometry import inverse, transform_points, translation
-from photonpano.motion.pairs import TIE, excluded_pairs, read_ties, require_agreement, tied_pairs
+from photonpano.motion.pairs import TIE, read_ties, require_agreement, tied_pairs
 from photonpano.testing import KnownMotion
 from photonpano.testing.captures import rolled
 from photonpano.values import Edge
@@ -94,17 +94,3 @@ def test_contradictions_name_lines_and_px(tmp_path: Path, n: int) -> None:
     with pytest.raises(InputError) as caught:
         require_agreement(read_ties(file, INFO), GROUPS, everywhere, motion)
     assert str(caught.value) == f"{file}: {expected}"
-
-
-def test_a_wrong_tie_does_not_blame_a_right_one_across_other_frames(tmp_path: Path) -> None:
-    (file := tmp_path / "ties.csv").write_text(HEADER + "150,20,30,350,10,30\n550,70,20,750,10,20\n")
-    motion = KnownMotion(lambda frame: translation(0.05 * frame, 0))
-    with pytest.raises(InputError, match="line 3 contradicts the motion that fits all pairs best by 50 px"):
-        require_agreement(read_ties(file, INFO), GROUPS, np.ones(10, dtype=bool), motion)
-
-
-def test_excluded_pairs_hold_the_frames_at_any_density() -> None:
-    assert excluded_pairs(GROUPS, [(120, 900)]) == {(9, 1)}
-    dense = [Group(FrameSpan(start, start + 100), start + 49.5) for start in range(0, 901, 50)]
-    assert excluded_pairs(dense, [(900, 120)]) == {(17, 1), (17, 2), (18, 1), (18, 2)}
-    assert excluded_pairs(GROUPS, []) == set()

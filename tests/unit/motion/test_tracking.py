@@ -21,7 +21,7 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.motion.frame_motion import FrameMotion, smooth_view
-from photonpano.motion.tracking import StartingMotion, _steady, starting_motion
+from photonpano.motion.tracking import StartingMotion, starting_motion
 from photonpano.motion.velocity import ConstantVelocity, FoundVelocity, Velocity, find_velocity
 from photonpano.testing.captures import detected, seen_along, textured
 
@@ -60,13 +60,6 @@ def test_speed_is_right_where_groups_move_by_more_than_a_panel(started: Callable
     assert start.alternative_px(80.0, 48.0) == 0
 
 
-def test_slower_motion_is_taken_and_the_other_named_where_spans_move_by_half_a_panel(started: Callable) -> None:
-    """Spans of 4 frames move by 8 px, so that panels of 20 px fit a motion back by 12 px as well."""
-    start = started(tiled(20), 2)
-    np.testing.assert_allclose(start.between(80.0, 48.0)[:2, 2], [64, 0], atol=6)
-    assert start.alternative_px(80.0, 48.0) == pytest.approx(32 / 4 * 20, abs=8)
-
-
 def uneven(shape: tuple[int, int], seed: int) -> np.ndarray:
     """Flux of texture without a period, and of strong contrast."""
     noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(0, 1, shape), (0, 0), 2)
@@ -89,27 +82,6 @@ def test_motion_is_unknown_beyond_the_windows_with_a_significant_peak_and_withou
     assert start.between(64.0, 32.0) is not None
     assert start.between(250.0, 220.0) is None
     assert started(np.full((64, 800), 0.3), 2) is None
-
-
-def test_start_is_a_path_of_shifts_that_agrees_with_its_motion_between_frames() -> None:
-    instants, velocities = np.array([10.0, 30.0, 60.0]), np.array([[1.0, 0.0], [2.0, -1.0], [0.0, 1.0]])
-    start = StartingMotion(instants, velocities, *np.full((2, 3, 2), np.nan), 100.0)
-    for moving, fixed in ((30.0, 10.0), (52.5, 20.0), (90.0, 60.0), (5.0, -4.0)):
-        there, here = start.at([fixed, moving])
-        expected = start.between(moving, fixed)
-        assert expected is not None
-        np.testing.assert_allclose(inverse(there) @ here, expected, atol=1e-6)
-    np.testing.assert_allclose(start.at([10.0])[0], np.eye(3), atol=1e-9)
-    np.testing.assert_allclose(start.at([30.0])[0, :2, 2], [-30, 10])
-
-
-@pytest.mark.parametrize("wrong", [[], [4], [0], [0, 1], [9], [5, 6]], ids=str)
-def test_windows_that_move_unlike_those_near_are_left_out(wrong: list[int]) -> None:
-    windows = np.arange(10)
-    velocities = np.stack([0.1 * np.sin(windows / 3), 0.05 * np.cos(windows / 2)], axis=1)
-    velocities[wrong] = [0.7, 0.1]
-    kept = _steady(velocities, px_per_frame=0.2)
-    assert sorted({*range(10)} - {*kept.tolist()}) == wrong
 
 
 MIDDLE = np.array([47.5, 31.5])
@@ -192,14 +164,6 @@ def test_captures_without_a_constant_velocity_are_refused(
         found(captured(motions[:7], 0.1))
 
 
-def test_what_changes_at_its_place_is_no_motion(memory_source: type) -> None:
-    rng = np.random.default_rng(0)
-    blobs = cv2.GaussianBlur(rng.normal(0, 1, SHAPE), (0, 0), 2) > 0
-    frames = [rng.random(SHAPE) < 0.05 + 0.4 * blobs * (1 + np.sin(index / 3)) * (np.arange(96) < 48) for index in range(32)]
-    with pytest.raises(LocationError, match="stays at its place in the frame"):
-        found(memory_source(frames))
-
-
 FRAME = (96, 128)
 
 
@@ -238,8 +202,3 @@ def test_turn_all_the_way_round_is_followed() -> None:
     motion = motion_of(homographies, camera)
     for instant in (0, 300, 600, 1199):  # ahead, to the side, backwards
         assert distance_px(motion, instant, homographies[instant]) < 1e-6
-
-
-def test_single_frame_has_its_own_view() -> None:
-    motion = motion_of(np.eye(3)[None])
-    np.testing.assert_array_equal(smooth_view(motion, 0, 10), np.eye(3))

@@ -2,7 +2,6 @@
 
 import re
 
-import cv2
 import numpy as np
 import pytest
 
@@ -18,8 +17,8 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.pipeline.film import Film, outline_on
-from photonpano.pipeline.photo_sphere import photo_sphere, with_xmp
+from photonpano.pipeline.film import Film
+from photonpano.record.picture_files import photo_sphere
 from photonpano.testing import MemorySource
 from photonpano.testing.captures import detected
 
@@ -51,39 +50,6 @@ def test_noise_of_stabilised_pictures_is_that_of_photons(still: Film) -> None:
     assert np.sqrt(flux.var(axis=0, ddof=1).mean()) == pytest.approx(expected, rel=0.04)
 
 
-@pytest.mark.parametrize(("bits", "white"), [(8, 255), (16, 65535)])
-def test_pictures_have_levels_of_srgb(still: Film, bits: int, white: int) -> None:
-    [picture] = still.pictures([FrameSpan(0, 2000)], 2, bits)
-    assert picture.dtype.itemsize * 8 == bits
-    assert picture.mean() / white == pytest.approx(1.055 * 0.5 ** (1 / 2.4) - 0.055, rel=0.01)
-
-
-def test_pictures_do_not_depend_on_threads(still: Film) -> None:
-    spans = [FrameSpan(start, start + 100) for start in range(0, 600, 100)]
-    np.testing.assert_array_equal(*(np.stack(list(still.pictures(spans, threads, 8))) for threads in (1, 3)))
-
-
-def test_outline_lies_around_the_frame() -> None:
-    motion = motion_of(np.array([translation(10, 5), translation(30, 5)]))
-    drawn = outline_on(canvas_of_box((0, 0, 80, 40), 1.0), motion, None, 1)
-    y, x = np.nonzero(drawn > 0.5)
-    assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((30, 61, 5, 28), abs=2)
-    assert drawn[10:24, 35:56].max() == 0
-
-
-def test_outline_goes_on_at_the_other_end_of_a_sphere() -> None:
-    camera = Camera.of(20, SHAPE)
-    behind = camera.homographies(rotation_matrices([[0, np.pi, 0]]))
-    canvas = Canvas(
-        40, 80, np.array([[80 / (2 * np.pi), 0, 40], [0, 80 / (2 * np.pi), 20], [0, 0, 1]]), "spherical", camera.matrix
-    )
-    drawn = outline_on(canvas, motion_of(behind, camera), camera, 0)
-    columns = np.flatnonzero((drawn > 0.5).any(axis=0))
-    assert columns.min() == 0
-    assert columns.max() == 79
-    assert not ((columns > 12) & (columns < 67)).any()
-
-
 FRAME = (40, 60)
 CAMERA = Camera.of(50.0, FRAME)
 
@@ -108,18 +74,3 @@ def test_full_turn_has_the_width_of_the_sphere() -> None:
     assert found["CroppedAreaTopPixels"] + canvas.transform[1, 2] == pytest.approx(158 / 2 - 0.5, abs=0.51)
     found = numbers(photo_sphere(canvas, (canvas.height // 2, canvas.width // 2)) or "")
     assert (found["FullPanoWidthPixels"], found["FullPanoHeightPixels"]) == (158, 79), "numbers of the pixels of the picture"
-
-
-def test_part_of_a_turn_lies_where_it_looks_and_a_plane_has_no_metadata() -> None:
-    canvas = spherical(0, 60)
-    found = numbers(photo_sphere(canvas, canvas.shape) or "")
-    assert found["CroppedAreaLeftPixels"] + canvas.transform[0, 2] == pytest.approx(314 / 2 - 0.5, abs=0.51)
-    assert photo_sphere(Canvas(40, 60, np.eye(3)), FRAME) is None
-
-
-def test_pixels_of_png_stay_as_they_are() -> None:
-    image = np.random.default_rng(0).integers(0, 255, FRAME, np.uint8)
-    png = cv2.imencode(".png", image)[1].tobytes()
-    marked = with_xmp(png, "<x:xmpmeta/>")
-    assert np.array_equal(cv2.imdecode(np.frombuffer(marked, np.uint8), cv2.IMREAD_UNCHANGED), image)
-    assert marked.replace(marked[33 : 33 + len(marked) - len(png)], b"") == png

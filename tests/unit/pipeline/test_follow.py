@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano import InputError, OutputError, PluginError, RunResult, SourceContribution, SpecError, parse_spec, run
-from photonpano.contracts.protocols import Arrived
-from photonpano.report import LiveFigures
+from photonpano import InputError, OutputError, RunResult, parse_spec, run
 
 
 @pytest.fixture(scope="session")
@@ -163,14 +160,6 @@ def test_pipe_that_ends_within_a_frame(
     assert "spool" not in [each.name for each in threading.enumerate()]
 
 
-@pytest.mark.parametrize("data", [b"", b"not a frame"])
-def test_pipe_without_a_frame_leaves_nothing(data: bytes, pipe_on_stdin: Callable[..., None], tmp_path: Path) -> None:
-    pipe_on_stdin(data)
-    with pytest.raises(InputError, match=r"^standard input ended (before the first|within a) frame"):
-        follow(PIPED, tmp_path / "piped")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_interrupted_run_keeps_its_frames_and_says_how_to_go_on(moving_frames: np.ndarray, tmp_path: Path) -> None:
     (tmp_path / "pipe.yaml").write_text(json.dumps(PIPED))
     live, kept = tmp_path / "run.live" / "live.json", tmp_path / "run.live" / "frames.raw"
@@ -210,57 +199,6 @@ def test_writer_that_dies_is_told_from_one_that_has_finished(moving_frames: np.n
     assert not (tmp_path / "run").exists()
 
 
-def test_missing_file_is_waited_for(tmp_path: Path) -> None:
-    start = time.monotonic()
-    with pytest.raises(InputError, match=r"no\.npy: no frame has come within 0\.3 s; check the path, or wait longer with"):
-        follow(spec("packed-npy", path=str(tmp_path / "no.npy")), tmp_path / "run", end_after=0.3)
-    assert time.monotonic() - start > 0.3
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_file_of_another_kind_is_refused_at_once(tmp_path: Path) -> None:
-    (tmp_path / "a.npy").write_text("This is a text, and no array, however long it gets. " * 5)
-    with pytest.raises(InputError, match=r"a\.npy is not a \.npy file"):
-        follow(spec("packed-npy", path=str(tmp_path / "a.npy")), tmp_path / "run", end_after=60)
-
-
-@pytest.mark.parametrize("at_first", [True, False])
-def test_source_that_fails_while_frames_arrive_is_named_and_ends_the_run(
-    at_first: bool, moving_frames: np.ndarray, tmp_path: Path
-) -> None:
-    np.save(tmp_path / "a.npy", moving_frames)
-    plan = parse_spec(spec("packed-npy", path=str(tmp_path / "a.npy")), output=tmp_path / "run")
-    looks = iter([Arrived(None)] * (not at_first))
-
-    def arrived(_: object) -> Arrived:
-        try:
-            return next(looks)
-        except StopIteration:
-            raise ValueError("no luck") from None
-
-    contribution = plan.source.contribution
-    assert isinstance(contribution, SourceContribution)
-    plan = replace(plan, source=replace(plan.source, contribution=replace(contribution, arrived=arrived)))
-    with pytest.raises(PluginError, match=r"^source 'packed-npy' of .* failed at the frames so far: ValueError: no luck"):
-        run(plan, follow=True, end_after=60)
-
-
-def test_array_without_frames_is_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.array(5, np.uint8))
-    with pytest.raises(InputError, match=r"a\.npy has the shape \(\); a packed capture has 3 dimensions"):
-        follow(spec("packed-npy", path=str(tmp_path / "a.npy")), tmp_path / "run", end_after=60)
-
-
-def test_spec_that_does_not_suit_the_frames_is_refused(
-    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], tmp_path: Path
-) -> None:
-    pipe_on_stdin(moving_frames[:60].tobytes())
-    document = PIPED | {"render": {"white_balance": "grey-world"}}
-    with pytest.raises(SpecError, match="the capture is grey; remove this key"):
-        follow(document, tmp_path / "piped")
-    assert json.loads((tmp_path / "piped.live" / "live.json").read_text())["state"] == "stopped"
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -274,33 +212,3 @@ def test_what_cannot_be_followed_is_refused(changes: dict[str, Any], message: st
     with pytest.raises(InputError, match=message):
         follow(document, tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_terminal_is_no_pipe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("os.isatty", lambda _: True)
-    with pytest.raises(InputError, match=r"no frames come on standard input; write PROGRAM \| photonpano run SPEC --follow"):
-        follow(PIPED, tmp_path / "run")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_run_that_begins_anew_resumes_nothing(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="a run that follows a capture begins anew"):
-        follow(PIPED, tmp_path / "run", resume=True)
-
-
-def test_frames_that_give_no_panorama_are_run_all_the_same(
-    moving_frames: np.ndarray, pipe_on_stdin: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first frames are fewer than a group."""
-    pipe_on_stdin(moving_frames.tobytes(), 15, 6.0)
-    figures = []
-
-    def render(found: LiveFigures, *_: object) -> str:
-        figures.append(found)
-        return "<html></html>"
-
-    monkeypatch.setattr("photonpano.pipeline.follow.render_live", render)
-    result = follow(PIPED, tmp_path / "piped")
-    assert any(each.message.startswith("20 frames gave no panorama: ") for each in figures)
-    assert figures[-1].message == ""
-    assert result.record["source"]["n_frames"] == 300

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -49,18 +49,6 @@ def log(told: list[Any]) -> ModuleType:
     )
 
 
-def test_observers_are_called_at_start_stage_and_end_of_a_run(told: list[Any], log: ModuleType) -> None:
-    observers = watching(log)
-    with observers.watching({"version": 1}) as finished:
-        observers.rendered(Canvas(30, 40, np.eye(3)), 2.5)
-        finished({"status": "done"})
-    assert told == [
-        (DIRECTORY, {"version": 1}),
-        (None, "render", 2.5, {"height": 30, "width": 40}),
-        (DIRECTORY, {"status": "done"}, None),
-    ]
-
-
 @pytest.mark.parametrize(
     ("error", "message"),
     [
@@ -103,17 +91,6 @@ def test_observers_receive_four_stages_of_each_level(
     assert summaries[7] == {"change_px": results[1].change_px, "std_px": results[1].uncertainty.mean_px}
 
 
-def test_stage_summary_holds_none_where_std_is_infinite(told: list[Any], log: ModuleType) -> None:
-    located = SimpleNamespace(edges=(), failures=(), n_located=1)
-    alone = SimpleNamespace(mean_px=np.inf)
-    watching(log).level_finished(
-        SimpleNamespace(
-            level=SimpleNamespace(number=1), groups=(1,), located=located, uncertainty=alone, seconds={}, change_px=None
-        )
-    )
-    assert told[-1] == (1, "interpolate", 0.0, {"change_px": None, "std_px": None})
-
-
 def test_exception_of_observer_is_logged_with_its_name_and_others_are_called(
     told: list[Any], log: ModuleType, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -132,15 +109,6 @@ def test_exception_of_observer_is_logged_with_its_name_and_others_are_called(
         for hook in ("run_started", "stage_finished", "run_finished")
     ]
     assert all(record.exc_info and record.exc_info[1] is error for record in caplog.records)
-
-
-def test_failing_observer_does_not_replace_the_error_of_the_run(caplog: pytest.LogCaptureFixture) -> None:
-    def fail(error: str) -> None:
-        raise RuntimeError("and now this")
-
-    with pytest.raises(LocationError, match=r"^lost$"), watching(plugin(run_finished=fail)).watching({}):
-        raise LocationError("lost")
-    assert len(caplog.messages) == 1
 
 
 def test_frozen_data_cannot_be_changed() -> None:

@@ -1,152 +1,26 @@
 """Passes and refiners: what explains the photons no worse is accepted, and the state before is kept otherwise."""
 
-import logging
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, LocationError, Refined
-from photonpano.capture import before, capture_of
+from photonpano import FrameSpan, Refined
 from photonpano.contracts.attribution import attributed
-from photonpano.errors import CanvasTooLargeError
 from photonpano.execution.context import Context
-from photonpano.geometry import Camera, FrameTrajectory, corner_displacements, inverse, likely_rotations, translation
+from photonpano.geometry import Camera, FrameTrajectory, likely_rotations, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.level import Cut, Timeline
-from photonpano.pipeline.passes import Pass, Proposal, cut_at_jumps, later_levels, tried, worse_in_light
-from photonpano.pipeline.refiners import refine
+from photonpano.motion.level import Timeline
+from photonpano.pipeline.passes import refine
 from photonpano.pipeline.state import State
-from photonpano.record.run_json import refinement_record
-from photonpano.record.run_warnings import refinement_warnings
-from photonpano.residuals.measure import Residuals, measure
-from photonpano.residuals.refinement import Explained, MotionFit, NamedRefiner
+from photonpano.record.run_json import refinement_record, refinement_warnings
+from photonpano.residuals.refinement import Explained, NamedRefiner
 from photonpano.specs import parse_spec
-from photonpano.testing import MemorySource
 from photonpano.testing.captures import KnownMotion, ReadOnlySource, Scene, recorded
-from photonpano.values import Background
 
 PLAN = parse_spec({"version": 1, "source": {"use": "simulator"}})
-BEFORE = State(PLAN, MemorySource(np.zeros((9, 8, 16))), Context(), 0, (), Timeline.regular(9))
-
-
-AFTER = replace(BEFORE, reference=4)
-
-
-def propose(proposal: Any, worse: str = "", compared: bool = True) -> Callable[[State], Proposal]:
-    """Make a pass that proposes a state, or raises an error."""
-
-    def make() -> State | None:
-        if isinstance(proposal, Exception):
-            raise proposal
-        return proposal
-
-    def settle(proposed: State) -> State:
-        return replace(proposed, reference=5)
-
-    compare = (lambda *_: worse) if compared else None
-    return lambda _: Proposal(make, compare, settle, "it is not used", logging.WARNING)
-
-
-@pytest.mark.parametrize(
-    ("step", "accepted", "worse"),
-    [
-        (propose(AFTER), True, ""),
-        (propose(AFTER, "it grew"), False, "it grew"),
-        (propose(AFTER, "it grew", compared=False), True, ""),
-        (propose(None), False, ""),
-        (propose(LocationError("lost")), False, "lost"),
-        (propose(CanvasTooLargeError("too large")), False, "too large"),
-        (lambda _: None, False, ""),
-    ],
-)
-def test_proposal_is_accepted_if_not_worse(
-    step: Pass, accepted: bool, worse: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(State, "fit", None)
-    trial = tried(BEFORE, step)
-    assert (trial.accepted, trial.worse) == (accepted, worse)
-    assert trial.state.reference == (5 if accepted else 0)
-    assert caplog.messages == ([f"it is not used: {worse}"] if worse else [])
-
-
-def test_errors_of_proposals_that_are_not_compared_end_the_run() -> None:
-    with pytest.raises(LocationError, match="lost"):
-        tried(BEFORE, propose(LocationError("lost"), compared=False))
-
-
-@pytest.mark.parametrize(
-    ("n_levels", "outdated", "located"), [(1, False, []), (1, True, [1]), (3, False, [2, 3]), (3, True, [2, 3])]
-)
-def test_single_level_is_located_again_if_the_capture_was_corrected_since(
-    n_levels: int, outdated: bool, located: list[int], make_level: Callable, pan: Callable, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ran: list[tuple[list[int], Any]] = []
-
-    def run(state: State, levels: Any, previous: Any) -> State:
-        ran.append(([level.number for level in levels], previous))
-        return state
-
-    monkeypatch.setattr(State, "located", run)
-    levels = tuple(make_level(number=number) for number in range(1, n_levels + 1))
-    first = SimpleNamespace(trajectory=pan(0.3))
-    source: Any = MemorySource(np.zeros((9, 8, 16)))
-    tried(
-        replace(BEFORE, source=source, levels=levels, results=(first,), outdated=outdated, watched=True),
-        partial(later_levels, journal=[]),
-    )
-    assert ran == [(located, first.trajectory)]
-
-
-@pytest.mark.parametrize(("reduced_chi2", "worse"), [(1.5, ""), (2.9, "the scatter grew")])
-def test_scatter_of_steps_counts_only_if_light_does_not_lower_chi2(reduced_chi2: float, worse: str) -> None:
-    proposed, before = (
-        SimpleNamespace(reduced_chi2=each, worse_than=lambda _: "the scatter grew") for each in (reduced_chi2, 3.0)
-    )
-    assert worse_in_light(proposed, before) == worse
-
-
-@pytest.mark.parametrize(("dark", "worse"), [(None, "the scatter grew"), (FrameSpan(3, 6), "")])
-def test_cut_among_dark_frames_is_not_compared(dark: FrameSpan | None, worse: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    cut = Cut(4, np.array([3.0, 0.0]), 9.0, dark)
-    monkeypatch.setattr("photonpano.pipeline.passes.find_cuts", lambda *_: (cut,))
-    monkeypatch.setattr(MotionFit, "worse_than", lambda *_: "the scatter grew")
-    monkeypatch.setattr(State, "fit", None)
-    proposal = cut_at_jumps(BEFORE)
-    assert proposal.worse(None, None) == worse
-    assert proposal.rejection == "the image seems to jump before frame 4, but the motion is not cut there"
-
-
-def test_jumps_are_looked_for_in_all_photons(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Along a motion that misses a jump, most of the frames around it look as if something hid the background there."""
-    searched = []
-    monkeypatch.setattr("photonpano.pipeline.passes.find_cuts", lambda source, *_: searched.append(source) or ())
-    monkeypatch.setattr(State, "fit", None)
-    cells = np.zeros((1, 1, 2), bool)
-    assert (
-        cut_at_jumps(replace(BEFORE, source=before(BEFORE.source, Background(np.array([4.0]), cells, cells, (8, 16))))) is None
-    )
-    assert [capture_of(each).background for each in searched] == [None]
-
-
-@pytest.mark.parametrize(("sizes_px", "kept"), [((3.0, 0.2), [4]), ((3.0, 2.0), [4, 7]), ((0.9, 0.2), None)])
-def test_motion_is_not_cut_where_pieces_meet(
-    sizes_px: tuple[float, ...], kept: list[int] | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cuts = tuple(Cut(frame, np.array([3.0, 0.0]), 9.0) for frame in (4, 7))
-    found = {cut.frame: replace(cut, shift_px=np.array([size, 0.0])) for cut, size in zip(cuts, sizes_px, strict=True)}
-    monkeypatch.setattr("photonpano.pipeline.passes.find_cuts", lambda *_: cuts)
-    monkeypatch.setattr("photonpano.pipeline.passes.build_levels", lambda *_: ())
-    monkeypatch.setattr(Cut, "along", lambda cut, *_: found[cut.frame])
-    monkeypatch.setattr(State, "motion", SimpleNamespace(trajectory=None, frame_shape=None))
-    monkeypatch.setattr(State, "fit", None)
-    state = cut_at_jumps(BEFORE).make()
-    assert (state and [cut.frame for cut in state.timeline.cuts]) == kept
 
 
 SHAPE, FRAMES = (40, 64), 400
@@ -267,57 +141,6 @@ def test_last_level_runs_again_along_a_motion_corrected_by_more_than_a_pixel(
     found = run(refiner, offset_px=offset_px)
     assert ran == relocated
     np.testing.assert_allclose(found.motion.homographies, PATH.at(np.arange(FRAMES)), atol=1e-9)
-
-
-def test_correction_by_a_shift_moves_a_camera_that_turns_by_the_whole_of_it(run: Callable[..., Explained]) -> None:
-    """Half of the frames are off by 1 px; the refiner answers with shifts, which no turn is exactly."""
-
-    def mend(homographies: np.ndarray, std_px: np.ndarray) -> Refined | None:
-        return Refined(PATH.at(np.arange(FRAMES)), std_px, "1 px") if refiner.calls == 1 else None
-
-    refiner = Answering(mend)
-    camera = Camera.of(1e4, SHAPE)
-    found = run(refiner, offset_px=1.0, camera=camera).motion.homographies
-    steps = [inverse(each[0]) @ each[FRAMES // 2] for each in (found, PATH.at(np.arange(FRAMES)))]
-    assert corner_displacements(*steps, SHAPE).max() < 0.02
-    np.testing.assert_allclose(np.linalg.det(found), 1)
-
-
-def test_small_correction_after_another_is_not_measured_again(
-    run: Callable[..., Explained], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Half of the frames are off by 1 px; the refiner leaves a tremor at its first call, and corrects that at its second."""
-    measured = list[Residuals]()
-
-    def counted(*given: Any) -> Residuals:
-        measured.append(measure(*given))
-        return measured[-1]
-
-    def mend(homographies: np.ndarray, std_px: np.ndarray) -> Refined | None:
-        corrected = PATH.at(np.arange(FRAMES))
-        corrected[:, 0, 2] += 0.1 * np.sin(np.arange(FRAMES) / 10) if refiner.calls == 1 else 0
-        return Refined(corrected, std_px, "some") if refiner.calls < 3 else None
-
-    def tremor_px(residuals: Residuals) -> float:
-        return float(2 * np.mean(residuals.steps().steps[:, 0] * np.sin(residuals.instants / 10)))
-
-    monkeypatch.setattr("photonpano.residuals.refinement.measure", counted)
-    refiner = Answering(mend)
-    found = run(refiner, offset_px=1.0)
-    assert (found.refinements[0].rounds, len(measured)) == (("some", "some"), 2)
-    np.testing.assert_allclose(found.motion.homographies, PATH.at(np.arange(FRAMES)), atol=1e-9)
-    assert tremor_px(measured[-1]) == pytest.approx(-0.1, abs=0.03)
-    assert tremor_px(found.residuals) == pytest.approx(0, abs=0.03)
-
-
-def test_motion_is_returned_with_identity_at_reference_frame(run: Callable[..., Explained]) -> None:
-    """A refiner may move the whole plane, which changes nothing that can be seen."""
-    moved = Answering(
-        lambda homographies, std_px: Refined(translation(3, 4) @ homographies, std_px, "moved") if moved.calls == 1 else None
-    )
-    found = run(moved).motion
-    np.testing.assert_allclose(found.homographies[found.reference], np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(inverse(found.homographies[0]) @ found.homographies[9], translation(0.45, 0), atol=1e-9)
 
 
 def test_refiner_that_never_stops_is_stopped(run: Callable[..., Explained]) -> None:

@@ -1,7 +1,6 @@
 """Runs with `pose`, with a pose estimator that knows the poses."""
 
 import json
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -19,7 +18,6 @@ from photonpano import (
     Config,
     FrameSpan,
     InputError,
-    LocationError,
     LostFrames,
     PosedView,
     PoseEstimate,
@@ -175,43 +173,6 @@ def test_other_files_hold_the_same_poses(finished: RunResult, tmp_path: Path) ->
     np.testing.assert_allclose(np.loadtxt(tmp_path / "poses" / "trajectory.txt"), tum[::2])
 
 
-def test_panorama_in_the_same_folder_replaces_the_poses(
-    plan_of: Callable[..., Plan], small_spec: dict[str, Any], tmp_path: Path
-) -> None:
-    folder = tmp_path / "run"
-    run(plan_of())
-    (folder / "sparse" / "mine.txt").write_text("a user's")
-    panorama = parse_spec(small_spec | {"levels": 1, "refine": []}, output=folder)
-    with pytest.raises(photonpano.OutputError, match=re.escape("files that no run has written: sparse/mine.txt")):
-        run(panorama)
-    run(panorama, overwrite=True)
-    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == {
-        *("panorama.tiff", "panorama-std.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"),
-        *("sparse", "sparse/mine.txt"),
-    }
-    run(plan_of(), overwrite=True)
-    assert (folder / "sparse" / "mine.txt").read_text() == "a user's"
-    assert (folder / "sparse" / "images.txt").exists()
-    assert not (folder / "panorama.tiff").exists()
-
-
-def test_record_that_lists_files_elsewhere_is_not_followed(plan_of: Callable[..., Plan], tmp_path: Path) -> None:
-    folder, other = tmp_path / "run", tmp_path / "precious.txt"
-    run(plan_of())
-    other.write_text("precious")
-    record = json.loads((folder / "run.json").read_text())
-    record["files"]["../precious.txt"] = {"bytes": 8, "sha256": ""}
-    (folder / "run.json").write_text(json.dumps(record))
-    run(plan_of(), overwrite=True)
-    assert other.read_text() == "precious"
-
-
-def test_commands_of_panoramas_refuse_a_run_of_poses(finished: RunResult, tmp_path: Path) -> None:
-    for command in (photonpano.check_run, lambda folder: photonpano.render(folder, tmp_path / "again")):
-        with pytest.raises(InputError, match="is a run with `pose`: it has the poses of a camera that travels"):
-            command(finished.directory)
-
-
 def test_doubts_and_lost_frames_are_in_record_report_and_warnings(
     plan_of: Callable[..., Plan], tmp_path: Path, with_report: None
 ) -> None:
@@ -232,15 +193,6 @@ def test_doubts_and_lost_frames_are_in_record_report_and_warnings(
     assert all(text in page for text in ("280 to 299", "median parallax (°)", "from above", "doubtful", "pose-errors-"))
 
 
-def test_camera_that_stays_where_it_is_has_no_poses(plan_of: Callable[..., Plan]) -> None:
-    def still(it: PoseEstimate) -> PoseEstimate:
-        poses = np.concatenate([it.camera_from_world[:, :, :3], 0 * it.camera_from_world[:, :, 3:]], axis=-1)
-        return replace(it, camera_from_world=poses)
-
-    with pytest.raises(LocationError, match="the camera does not travel: all located frames have one position"):
-        run(plan_of(still))
-
-
 def test_resume_of_finished_poses_returns_them_and_of_changed_ones_begins_anew_for_observers_too(
     plan_of: Callable[..., Plan], tmp_path: Path
 ) -> None:
@@ -259,21 +211,6 @@ def test_resume_of_finished_poses_returns_them_and_of_changed_ones_begins_anew_f
     for options in ({"keep_work": True}, {"from_level": 2}):
         with pytest.raises(InputError, match="a run with `pose` has no levels to keep"):
             run(plan_of(), **options)
-
-
-def test_other_sections_are_refused(plan_of: Callable[..., Plan]) -> None:
-    output = {"formats": ["hdr"], "keep": "exposures"}
-    with pytest.raises(photonpano.SpecError) as caught:
-        plan_of(levels=2, output=output, camera={"distortion": {"k1": "find"}}, run={"executor": "threads"})
-    where = [problem.where for problem in caught.value.problems]
-    assert sorted(where) == sorted(["levels", "output.formats", "run.executor", "camera.distortion.k1", "output.keep"])
-
-
-def test_document_is_a_spec_itself(plan_of: Callable[..., Plan]) -> None:
-    plan = plan_of(camera={"focal_px": 99})
-    assert list(plan.document) == ["version", "source", "corrections", "pose", "camera", "output", "run"]
-    toy = plan.pose.contribution
-    assert parse_spec(plan.document, catalog=CATALOG.including(toy)).document == plan.document
 
 
 def test_explain_and_check_describe_a_spec_with_pose(plan_of: Callable[..., Plan]) -> None:

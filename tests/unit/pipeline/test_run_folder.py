@@ -130,40 +130,11 @@ def test_run_folder_is_replaced_and_keeps_other_files(old: Path) -> None:
     assert list(old.parent.iterdir()) == [old]
 
 
-def test_run_folder_behind_a_link_is_replaced_and_the_link_stays(old: Path) -> None:
-    link = old.parent / "latest"
-    link.symlink_to(old)
-    run_into(link, overwrite=True)
-    assert link.is_symlink()
-    assert "seed" not in json.loads((old / "run.json").read_text())
-    assert set(files_in(old)) == {*FILES, "notes/a.txt"}
-
-
-def test_run_folder_keeps_files_of_other_programs_that_come_meanwhile(tmp_path: Path) -> None:
-    directory = tmp_path / "runs" / "scan"
-    with run_folder(directory) as folder:
-        directory.mkdir()
-        (directory / "notes.txt").write_text("a note")
-        write_all(folder)
-    assert set(files_in(directory)) == {*FILES, "notes.txt"}
-
-
 def refusal(directory: Path, **options: Any) -> str:
     """Return why a folder is refused, before anything is written."""
     with pytest.raises(OutputError) as caught, run_folder(directory, **options):
         raise AssertionError("the block must not run")
     return str(caught.value)
-
-
-def test_run_folder_refuses_a_file_in_the_way(tmp_path: Path) -> None:
-    """As root, permissions stop nobody; a file does."""
-    way = tmp_path / "runs"
-    way.write_text("a file")
-    for directory, reason in ((way, "File exists"), (way / "scan", "Not a directory")):
-        assert refusal(directory) == (
-            f"{directory}: the run folder cannot be written to ({reason}); choose another one with --output"
-        )
-    assert way.read_text() == "a file"
 
 
 def test_run_folder_refuses_files_that_no_run_wrote(old: Path, tmp_path: Path) -> None:
@@ -190,14 +161,6 @@ def test_run_folder_refuses_what_must_not_be_replaced(tmp_path: Path, monkeypatc
             reason = f"cannot be written, since {capture}, which is read, lies in it; choose another folder"
         found = refusal(directory, overwrite=True, inputs=[capture])
         assert found == f"{directory} {reason}"
-
-
-def test_run_folder_that_cannot_be_replaced_is_refused(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(old / "notes")
-    assert refusal(old, overwrite=True) == (
-        f"the run folder {old} cannot be replaced, since it is mounted, or the current folder lies in it; choose another one, "
-        f"such as {old}/panorama"
-    )
 
 
 def test_second_run_into_a_folder_is_refused_with_the_first(tmp_path: Path) -> None:

@@ -1,12 +1,11 @@
 """Looking components up."""
 
-import sys
 from dataclasses import replace
 from types import ModuleType
 
 import pytest
 
-from photonpano import Config, LocatorContribution, MergerContribution, PluginError, Requirement, hookimpl
+from photonpano import Config, LocatorContribution, MergerContribution, PluginError, Requirement
 from photonpano.plugins.registry import BrokenPlugin, Catalog, DisabledPlugin, Origin
 
 
@@ -37,33 +36,11 @@ def message(catalog, kind, name):
     return str(caught.value)
 
 
-def test_including_contributions_leaves_the_catalog_as_it_was(catalog):
-    extended = catalog.including(locator("phase"))
-    assert extended.names("locator") == ("direct", "opencv-sift", "phase")
-    assert catalog.names("locator") == ("direct", "opencv-sift")
-    entry = extended.find("locator", "phase")
-    assert (entry.origin.plugin, entry.origin.version) == (__name__, "unreleased")
-
-
-def test_including_a_plugin():
-    plugin = ModuleType("my_hooks")
-    plugin.photonpano_mergers = hookimpl(lambda: [MERGER])
-    assert Catalog().including(plugin).find("merger", "sum").contribution is MERGER
-
-
 def test_including_a_broken_plugin_is_an_error():
     plugin = ModuleType("my_hooks")
     plugin.photonpano_mergers = lambda: [MERGER]
     with pytest.raises(PluginError, match=r"^photonpano_mergers is not marked with @photonpano\.hookimpl$"):
         Catalog().including(plugin)
-
-
-def test_including_plugin_with_observation_hooks_adds_observer():
-    plugin = ModuleType("my_hooks")
-    plugin.photonpano_run_started = hookimpl(lambda: None)
-    catalog = Catalog().including(plugin, MERGER).including(locator("direct"))
-    assert [str(each.origin) for each in catalog.observers] == ["my_hooks unreleased (given in Python)"]
-    assert [each.name for each in catalog.rows] == ["sum", "direct"]
 
 
 def test_including_a_contribution_for_another_contract_is_an_error():
@@ -124,9 +101,3 @@ def test_missing_library_names_extra_for_index_and_checkout():
         'pip install "photonpano[kornia]" "other>=2" (in a checkout: pip install ".[kornia]" "other>=2")'
     )
     assert catalog.find("locator", "loftr").missing == (KORNIA,)
-
-
-def test_installed_library_is_found_without_importing_it():
-    assert "this" not in sys.modules
-    assert Catalog().including(locator("zen", Requirement("this", "python"))).find("locator", "zen").unavailable is None
-    assert "this" not in sys.modules

@@ -8,7 +8,6 @@ from textwrap import dedent
 
 import pytest
 
-import photonpano
 from photonpano import PluginError
 from photonpano.plugins.registry import BrokenPlugin, DisabledPlugin, Origin, discover
 
@@ -90,16 +89,6 @@ def test_good_plugin_is_on_offer_with_its_distribution(install):
     assert of_toys(catalog.broken) == []
 
 
-@pytest.mark.parametrize(("kind", "name"), [("source", "auto"), ("locator", "chain-of-backends")])
-def test_framework_offers_names_through_its_own_entry_point(kind, name):
-    entry = discover().find(kind, name)
-    assert (entry.origin.plugin, entry.origin.entry_point, entry.origin.version) == (
-        "photonpano",
-        "framework = photonpano.specs.builtin",
-        photonpano.__version__,
-    )
-
-
 @pytest.mark.parametrize(("code", "error"), BROKEN, ids=[code.splitlines()[-1].strip() for code, _ in BROKEN])
 def test_broken_plugin_is_a_row_and_harms_no_other(code, error, install, tmp_path):
     install("alpha", "1.2", GOOD)
@@ -108,23 +97,6 @@ def test_broken_plugin_is_a_row_and_harms_no_other(code, error, install, tmp_pat
     error = error.replace("{path}", str(tmp_path / "broken_hooks.py"))
     assert of_toys(catalog.broken) == [BrokenPlugin(Origin("broken", "0.3", "broken = broken_hooks"), error)]
     assert {row.origin.plugin for row in of_toys(catalog.rows)} == {"alpha"}
-
-
-def test_hook_module_that_is_not_there(install, tmp_path):
-    install("alpha", "1.2", GOOD)
-    (tmp_path / "alpha_hooks.py").unlink()
-    (row,) = of_toys(discover().broken)
-    assert str(row) == "alpha 1.2 (alpha = alpha_hooks): ModuleNotFoundError: No module named 'alpha_hooks'"
-
-
-def test_distribution_without_metadata_is_still_used(install):
-    install("alpha", "1.2", GOOD, metadata=False)
-    assert {(row.origin.plugin, row.origin.version) for row in of_toys(discover().rows)} == {("unknown", "unknown")}
-
-
-def test_hook_may_return_single_contribution(install):
-    install("alpha", "1.2", "@hookimpl\ndef photonpano_sources(): return source('single')")
-    assert discover().find("source", "single").origin.plugin == "alpha"
 
 
 def test_name_of_two_plugins_is_an_error_on_use_until_one_is_disabled(install, monkeypatch):
@@ -165,15 +137,6 @@ def test_disabled_plugin_is_a_row_and_is_not_imported(word, install, monkeypatch
     assert {row.origin.plugin for row in of_toys(catalog.rows)} == {"alpha"}
 
 
-def test_distribution_is_disabled_with_all_its_plugins(install, monkeypatch):
-    install("alpha", "1.2", GOOD)
-    monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", "photonpano")
-    catalog = discover()
-    assert {row.origin.plugin for row in catalog.rows} == {"alpha"}
-    disabled = [row.origin.entry_point.partition(" = ")[0] for row in catalog.disabled]
-    assert disabled == ["colmap", "core", "dask", "direct", "framework", "kornia", "opencv", "sensors", "simulator", "zarr"]
-
-
 @pytest.mark.parametrize(
     ("words", "message", "disabled"),
     [
@@ -190,9 +153,3 @@ def test_disabling_unknown_plugin_is_logged(words, message, disabled, install, m
     assert len(of_toys(discover().disabled)) == disabled
     known = "alpha, colmap, core, dask, direct, framework, kornia, opencv, photonpano, sensors, simulator and zarr"
     assert caplog.messages == ([f"PHOTONPANO_DISABLE_PLUGINS {message.format(known=known)}"] if message else [])
-
-
-def test_interrupt_during_discovery_ends_it(install):
-    install("slow", "0.3", "raise KeyboardInterrupt")
-    with pytest.raises(KeyboardInterrupt):
-        discover()

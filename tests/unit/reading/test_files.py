@@ -1,7 +1,6 @@
 """Files and arrays that hold captures."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,9 @@ from photonpano.reading import (
     PackedFileSource,
     files_in,
     frames_are_last,
-    packed_frames_are_last,
     read_json,
     unpacked_content,
 )
-from photonpano.reading import files as files_of_captures
 
 
 def test_files_in_returns_natural_order(tmp_path: Path) -> None:
@@ -47,40 +44,12 @@ def source(tmp_path: Path) -> PackedFileSource:
     return PackedFileSource(files, FrameLayout((4, 16), (4, 2)))
 
 
-def open_files() -> int:
-    return len(list(Path("/dev/fd").iterdir()))
-
-
-def test_at_most_16_files_stay_open(source: PackedFileSource) -> None:
-    before = open_files()
-
-    def read(first: int) -> int:
-        for start in range(first, 190):
-            span = FrameSpan(start, start + 10)
-            np.testing.assert_array_equal(source.counts(span), FRAMES[start : start + 10].sum(axis=0))
-        return open_files()
-
-    with source, ThreadPoolExecutor(4) as pool:
-        assert open_files() == before, "nothing is opened before it is read"
-        assert max(pool.map(read, range(4))) <= before + 16 + 4
-    assert open_files() == before
-
-
 def test_missing_file_is_named_when_read(source: PackedFileSource, tmp_path: Path) -> None:
     (tmp_path / "7.bin").unlink()
     source.counts(FrameSpan(0, 14))
     with pytest.raises(InputError) as caught:
         source.counts(FrameSpan(13, 16))
     assert str(caught.value) == f"there is no file {tmp_path / '7.bin'}; check the path"
-
-
-def test_kind_of_a_file_is_asked_when_it_is_opened_only(source: PackedFileSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Path] = []
-    monkeypatch.setattr(files_of_captures, "refusal", lambda path: asked.append(path))
-    with source:
-        for frame in range(2):
-            source.counts(FrameSpan(frame, frame + 1))
-        assert [path.name for path in asked] == ["0.bin"]
 
 
 class Size(BaseModel):
@@ -118,10 +87,6 @@ def test_zeros_and_ones_are_bits(clouds: Callable[..., np.ndarray], dtype: Any) 
     assert unpacked_content([clouds(0.003, n_frames=40).astype(dtype)])[:3] == ("bits", 0, 1)
 
 
-def test_zeros_and_255_are_bits(clouds: Callable[..., np.ndarray]) -> None:
-    assert unpacked_content([clouds(n_frames=40) * np.uint8(255)])[:3] == ("bits", 0, 255)
-
-
 @pytest.mark.parametrize("flux", [2.0, 0.3, 0.01])
 @pytest.mark.parametrize("n", [4, 64, 255])
 def test_counts_of_any_height_are_sums(clouds: Callable[..., np.ndarray], n: int, flux: float) -> None:
@@ -130,59 +95,9 @@ def test_counts_of_any_height_are_sums(clouds: Callable[..., np.ndarray], n: int
     assert found == ("sums", sums.min(), sums.max(), sums.size)
 
 
-def test_sums_with_hot_pixels_are_sums(clouds: Callable[..., np.ndarray]) -> None:
-    frames = clouds(0.05, n_frames=510)
-    frames[:, np.random.default_rng(0).random(frames.shape[1:]) < 0.03] = 1
-    assert unpacked_content([summed(frames, 255)]).holds == "sums"
-
-
-@pytest.mark.parametrize("axis", [1, 2])
-@pytest.mark.parametrize("order", ["big", "little"])
-@pytest.mark.parametrize("flux", [3.0, 0.3, 0.003])
-def test_packed_pixels_are_neither(clouds: Callable[..., np.ndarray], axis: int, order: Any, flux: float) -> None:
-    assert unpacked_content([np.packbits(clouds(flux, n_frames=64), axis=axis, bitorder=order)]) is None
-
-
-@pytest.mark.parametrize("side", [1, 2, 4, 8])
-def test_packed_chequers_are_no_numbers(side: int) -> None:
-    y, x = np.mgrid[:64, :96]
-    chequers = np.repeat(((x // side + y // side) % 2).astype(np.uint8)[None], 16, axis=0)
-    assert unpacked_content([np.packbits(chequers, axis=2)]) is None
-
-
-@pytest.mark.parametrize("value", [0, 1, 255])
-def test_single_value_tells_nothing(value: int) -> None:
-    frames = np.zeros((20, 8, 8), np.uint8)
-    frames[:, 3, 4] = value  # as of one hot pixel
-    assert unpacked_content([frames]) is None
-
-
 def test_last_axis_is_that_of_the_frames_where_values_are_most_alike(clouds: Callable[..., np.ndarray]) -> None:
     frames = clouds(n_frames=512)
     for content in (frames, summed(frames, 2)):
         assert not frames_are_last([content], content.shape)
         moved = last(content)
         assert frames_are_last([moved], moved.shape)
-
-
-def test_last_axis_of_packed_frames_is_found(clouds: Callable[..., np.ndarray]) -> None:
-    frames = clouds(n_frames=1024)
-    packed = np.packbits(frames, axis=2)
-    for axis, holds in enumerate(("pixels of a column", "pixels of a row", "frames")):
-        assert not packed_frames_are_last([packed], packed.shape, holds)
-        stored = np.packbits(last(frames), axis=axis)
-        assert packed_frames_are_last([stored], stored.shape, holds)
-
-
-def test_last_axis_of_fast_packed_frames_is_found_by_the_axis_that_is_packed(clouds: Callable[..., np.ndarray]) -> None:
-    frames = last(clouds(n_frames=1024)[::5, :, :32])  # 1 px a frame
-    stored = np.packbits(frames, axis=1)
-    assert packed_frames_are_last([stored], stored.shape, "pixels of a row")
-
-
-def test_wide_short_noise_has_its_frames_first() -> None:
-    alarms = [
-        frames_are_last([np.random.default_rng(seed).integers(0, 2, (24, 32, 128), np.uint8)], (24, 32, 128))
-        for seed in range(100)
-    ]
-    assert not any(alarms)

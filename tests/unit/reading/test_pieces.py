@@ -1,6 +1,5 @@
 """Frames in pieces, pixels in another order, and samples of them."""
 
-import gzip
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -70,16 +69,6 @@ def test_spans_that_go_on_from_another_are_fetched_ahead_once() -> None:
         read(pieces, start, start + 2)
     assert len(fetched.settled()) > 30
     assert len(fetched.spans) == len(set(fetched.spans))
-
-
-def test_a_bounded_number_of_pieces_is_kept() -> None:
-    fetched = Fetched()
-    pieces = Pieces(STARTS, fetched)
-    read(pieces, 0, 1000)
-    read(pieces, 0, 10)
-    assert fetched.spans.count(FrameSpan(0, 10)) == 2
-    read(pieces, 990, 1000)
-    assert fetched.spans.count(FrameSpan(990, 1000)) == 1
 
 
 def test_a_piece_that_failed_is_fetched_again() -> None:
@@ -152,51 +141,6 @@ PLAIN = {
 @pytest.mark.parametrize("scene", PLAIN)
 def test_no_order_is_found_in_noise_plain_light_and_regular_patterns(scene: str, flux: float) -> None:
     assert other_order(samples_of(detected(np.broadcast_to(flux * PLAIN[scene], (256, 64, 96)), 1))) is None
-
-
-@pytest.mark.parametrize(
-    "frames",
-    [
-        np.zeros((64, 16, 32), np.uint8),
-        np.ones((64, 16, 32), np.uint8),
-        *(
-            np.random.default_rng(0).integers(0, 2, shape, np.uint8)
-            for shape in ((3, 64, 96), (64, 1, 96), (64, 64, 8), (64, 1, 1))
-        ),
-    ],
-    ids=["dark", "saturated", "3 frames", "1 row", "8 columns", "1 pixel"],
-)
-def test_no_order_is_found_in_dark_and_saturated_frames_and_too_few_pixels(frames: np.ndarray) -> None:
-    assert other_order(samples_of(frames)) is None
-
-
-def test_short_capture_is_sampled_whole() -> None:
-    assert [(span.start, span.stop) for span in sampled_spans(100, 64)] == [(0, 100)]
-
-
-def test_long_capture_is_sampled_from_start_to_end_within_its_budget() -> None:
-    spans = sampled_spans(100_000, 254 * 62)
-    assert spans[0].start == 0
-    assert len(spans) == 1 or spans[-1].stop == 100_000
-    assert sum(map(len, spans)) * 254 * 62 <= 3 * 1024**2
-
-
-def test_large_frames_are_sampled_by_their_first_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.reading.npy._VALUES", 16 * 8 * 5)
-    frames = np.random.default_rng(0).integers(0, 256, (50, 8, 40), np.uint8)
-    np.save(tmp_path / "cube.npy", frames)
-    (found,) = sampled_frames(tmp_path / "cube.npy", npy_header(tmp_path / "cube.npy"))
-    np.testing.assert_array_equal(found, frames[:16, :, :5])
-
-
-def test_compressed_capture_is_sampled_from_its_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.reading.npy._VALUES", 1000)
-    frames = np.random.default_rng(0).integers(0, 2**16, (50, 8, 40), np.uint16)
-    np.save(tmp_path / "cube.npy", frames)
-    header = npy_header(tmp_path / "cube.npy")
-    (tmp_path / "cube.npy.gz").write_bytes(gzip.compress((tmp_path / "cube.npy").read_bytes()))
-    (found,) = sampled_frames(tmp_path / "cube.npy.gz", header)
-    np.testing.assert_array_equal(found, frames[:3])
 
 
 def test_file_that_is_cut_short_is_not_sampled(tmp_path: Path) -> None:

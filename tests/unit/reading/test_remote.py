@@ -2,7 +2,6 @@
 
 import gzip
 import json
-import os
 import socket
 import sys
 from collections.abc import Callable
@@ -12,10 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, InputError, SpecError, Url, capture_plan, discover, info, parse_spec, run
-from photonpano.pipeline.components import build_source
-from photonpano.reading import read_range, size_of
-from photonpano.record.contents import changes, fingerprint
+from photonpano import FrameSpan, InputError, Url, discover, parse_spec, run
+from photonpano.reading import read_range
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (3000, 64, 32), np.uint8)
 FRAME_BYTES = 64 * 32
@@ -65,23 +62,6 @@ def test_a_capture_in_order_is_read_once(server: Any, cube: Path) -> None:
         for span in source.info.span.blocks(7):
             source.counts(span)
         assert server.bytes_sent("cube.npy") <= cube.stat().st_size + 7 * FRAME_BYTES
-
-
-def test_frames_of_an_object_store_are_those_of_the_file(object_store: Any, cube: Path) -> None:
-    with opened("s3://bucket/cube.npy") as source:
-        np.testing.assert_array_equal(source.packed(FrameSpan(5, 2500)), FRAMES[5:2500])
-
-
-def test_values_and_sums_are_read_over_http(server: Any, cube: Path) -> None:
-    np.save(cube.with_name("bits.npy"), FRAMES[:200] & 1)
-    np.save(cube.with_name("sums.npy"), FRAMES.astype(np.uint16))
-    with opened(f"{server.address}/bits.npy", "npy", holds="bits") as source:
-        np.testing.assert_array_equal(source.frames(FrameSpan(3, 190)), FRAMES[3:190] & 1)
-    with opened(f"{server.address}/sums.npy", "npy", holds="sums", frames_per_sum=300, frame_axis="first") as source:
-        np.testing.assert_array_equal(source.frames(FrameSpan(3, 2900)), FRAMES[3:2900])
-    np.save(cube.with_name("last.npy"), np.moveaxis(FRAMES[:300] & 1, 0, -1).copy())
-    with pytest.raises(InputError, match="scattered"):
-        opened(f"{server.address}/last.npy", "npy", holds="bits", frame_axis="last")
 
 
 def test_files_of_a_camera_are_found_in_a_bucket(object_store: Any, cube: Path) -> None:
@@ -134,19 +114,6 @@ def test_no_server_is_told_from_no_file() -> None:
     )
 
 
-def test_missing_bucket_key_and_rights_are_told_apart(object_store: Any, cube: Path) -> None:
-    (cube.parents[1] / "private").mkdir()
-    assert problem("s3://bucket/none.npy") == "there is no s3://bucket/none.npy; check the server or bucket, and the path"
-    assert problem("s3://none/cube.npy") == "there is no s3://none/cube.npy; check the server or bucket, and the path"
-    assert problem("s3://private/cube.npy").startswith(
-        "s3://private/cube.npy may not be read: its server refuses access; give credentials in the environment"
-    )
-    (cube.parent / "scan").mkdir()
-    (cube.parent / "scan" / "f0.bin").write_bytes(b"0")
-    with pytest.raises(InputError, match="s3://bucket/scan is a folder; name the file in it"):
-        size_of(Url("s3://bucket/scan"))
-
-
 @pytest.mark.parametrize(("scheme", "library", "extra"), [("s3", "s3fs", "s3"), ("https", "aiohttp", "http")])
 def test_missing_extra_is_named(scheme: str, library: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, library, None)
@@ -156,37 +123,6 @@ def test_missing_extra_is_named(scheme: str, library: str, extra: str, monkeypat
         f"{scheme}://bucket/cube.npy needs {library}, which is not installed: "
         f'pip install "photonpano[{extra}]" (in a checkout: pip install ".[{extra}]")'
     )
-
-
-def test_url_is_recognised_and_described(server: Any, cube: Path, small_capture: Path) -> None:
-    cube.write_bytes(small_capture.read_bytes())
-    found = info(capture_plan(f"{server.address}/cube.npy"))
-    assert (found.source, found.n_frames) == ("packed-npy", 300)
-    assert found.spec["source"]["with"] == {"path": f"{server.address}/cube.npy"}
-    with pytest.raises(SpecError, match=rf"^source.with.path: there is no {server.address}/none.npy; check"):
-        capture_plan(f"{server.address}/none.npy")
-    with pytest.raises(SpecError, match=r"no source recognises http://.*/cube.tiff, a URL; name the one that reads it"):
-        capture_plan(f"{server.address}/cube.tiff")
-
-
-def test_source_of_files_refuses_a_url(server: Any) -> None:
-    with pytest.raises(SpecError, match=r"ms:/|http://.*/capture.ubi.h5 is a URL, and this must be a file: download it"):
-        capture_plan(f"{server.address}/capture.ubi.h5", source="ubicept-h5")
-
-
-def test_changes_at_a_url_are_seen(server: Any, cube: Path) -> None:
-    def now() -> Any:
-        plan = capture_plan(f"{server.address}/cube.npy", corrections=[])
-        with build_source(plan) as source:
-            return fingerprint(plan, source)
-
-    before = now()
-    (file,) = before["files"]
-    assert (file["path"], file["bytes"]) == (f"{server.address}/cube.npy", cube.stat().st_size)
-    assert file["etag"]
-    assert changes(before, now()) == []
-    os.utime(cube, (0, 0))
-    assert changes(before, now()) == [f"{server.address}/cube.npy has another content, by its ETag"]
 
 
 def test_finished_run_at_a_url_is_taken_while_unchanged_and_records_no_secrets(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from photonpano import FrameSpan, Group
-from photonpano.record.run_warnings import level_warnings
+from photonpano.record.run_json import level_warnings
 from photonpano.values import Ambiguity
 
 

@@ -8,7 +8,7 @@ import pytest
 from photonpano.geometry import FrameTrajectory, translation
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.level import Timeline
-from photonpano.record.run_warnings import motion_warnings, timeline_warnings
+from photonpano.record.run_json import motion_warnings, timeline_warnings
 from photonpano.values import FrameSpan
 
 

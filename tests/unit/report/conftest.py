@@ -16,8 +16,8 @@ from photonpano.photometry import BinaryResponse
 from photonpano.residuals.block_sums import GXX, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.halves import Agreements, Halves
 from photonpano.residuals.measure import Residuals
+from photonpano.residuals.patterns import Shaking
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.shaking import Shaking
 from photonpano.testing import KnownMotion
 
 FRAME_SHAPE = (254, 496)

@@ -4,7 +4,6 @@ import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,7 @@ from photonpano.geometry import FrameTrajectory, nearest_rotations, steps_px
 from photonpano.merging import chunks_of
 from photonpano.merging.panorama import RenderedPanorama, plan_canvas
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.motion.level import Timeline
 from photonpano.pipeline.run_folder import run_folder
-from photonpano.report import render_report
-from photonpano.report.viewer import shared_instant
 from photonpano.residuals.halves import Halves
 from photonpano.residuals.measure import Residuals
 from photonpano.residuals.refinement import Explained, bounded_std_px, residual_ratio, unexplained_px
@@ -112,34 +108,3 @@ def test_memory_for_a_frame_is_little_more_than_its_motion(
 ) -> None:
     """A homography takes 72 bytes."""
     assert bytes_a_frame(work, ends) < most
-
-
-def test_writing_results_takes_no_more_than_another_motion(ends: tuple[End, End], tmp_path: Path) -> None:
-    assert bytes_a_frame(lambda end: end.written(tmp_path / str(end.n_frames)), ends) < 100
-
-
-def test_page_of_a_long_run_is_no_larger(ends: tuple[End, End]) -> None:
-    short, long = (len(render_report(end.record, end.explained, end.panorama)) for end in ends)
-    assert long < 1.1 * short
-
-
-def test_time_of_a_group_does_not_take_a_look_at_all_frames() -> None:
-    timeline = Timeline.regular(10 * LONG)
-    tracemalloc.start()
-    try:
-        assert timeline.times(123.25) == 123.25
-        assert tracemalloc.get_traced_memory()[1] < 10_000
-    finally:
-        tracemalloc.stop()
-
-
-def test_instant_that_the_viewer_shows_is_found_without_comparing_all_exposures(ends: tuple[End, End]) -> None:
-    instants = np.arange(0.0, LONG, 16)
-    level: Any = SimpleNamespace(located=SimpleNamespace(instants=instants))
-    tracemalloc.start()
-    try:
-        assert shared_instant(ends[1].motion, [level, level]) == ends[1].motion.reference
-        # A table of the distances between all of them would take 200 MB.
-        assert tracemalloc.get_traced_memory()[1] < 2_000_000
-    finally:
-        tracemalloc.stop()

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from photonpano import FrameSpan, Group, LocationError, NotLocated
+from photonpano import FrameSpan, Group, NotLocated
 from photonpano.motion.diagnosis import UntiedError
 from photonpano.report import figures, render_failure, render_report
-from photonpano.report.page import failure_groups
 from photonpano.values import Edge
 
 
@@ -76,19 +75,6 @@ def test_page_is_self_contained_and_deterministic(record, explained, panorama):
     assert page.count("<svg") == 8
 
 
-@pytest.mark.parametrize(("share", "end"), [(0.0, ""), (0.012, "; 1.2 % of the pixels are saturated")])
-def test_page_shows_dynamic_range(record, text, share, end):
-    assert "dynamic range" not in text()
-    measured = {"dynamic_range_db": 71.2, "measurable_range_db": 99.9, "saturated_share": share}
-    assert f"dynamic range 71 dB of 100 dB measurable{end} " in text(panorama=record["panorama"] | measured)
-
-
-def test_page_names_tone_in_place_of_white(record, text):
-    found = text(spec=record["spec"] | {"render": {"tone": "local"}})
-    assert "shown with the tone local" in found
-    assert "white is" not in found
-
-
 def test_page_shows_facts_warnings_and_failures(text, panorama):
     found = text()
     height, width = panorama.canvas.shape
@@ -123,16 +109,6 @@ def test_page_shows_facts_warnings_and_failures(text, panorama):
         assert sentence in found
 
 
-def test_page_counts_pairs_by_locator_if_a_fallback_located_some(record, text):
-    assert "located by" not in text()
-    for level, counts in zip(record["levels"], ((39, 0), (67, 1), (150, 6)), strict=True):
-        level["located_by"] = dict(zip(("direct", "opencv-sift"), counts, strict=True))
-    found = text()
-    assert "Level 1:" not in found
-    assert "Level 2: 67 pairs located by direct , 1 pair located by opencv-sift ." in found
-    assert "Level 3: 150 pairs located by direct , 6 pairs located by opencv-sift ." in found
-
-
 def test_page_has_the_resolved_spec_and_a_row_for_each_level_with_names_for_a_phone(record, page):
     tree = ElementTree.fromstring(page())
     assert YAML(typ="safe").load("".join(tree.find(".//pre").itertext())) == record["spec"]
@@ -165,32 +141,6 @@ def test_page_escapes_all_input(record, page):
     check_self_contained(found)
     assert "<script>" not in found
     assert text_of(found).count('<script>alert("1")</script>') == 13
-
-
-def test_page_lists_gaps_of_the_motion(page, text):
-    whole = page(motion={"located": np.ones(10_000, bool)})
-    assert "All frames were located." in text_of(whole)
-    assert "Shaded" not in whole
-    found = text(motion={"located": np.arange(10_000) % 100 > 0})
-    assert "100 frames of 10,000 were not located: 0; 100; 200;" in found
-    assert "1,000; 1,100 and 88 further spans" in found
-
-
-def test_page_omits_time_without_frame_rate(record, explained, panorama):
-    record["source"]["frame_rate_hz"] = None
-    page = render_report(record, explained, panorama)
-    check_self_contained(page)
-    assert "10,000 binary frames of 254x496 px. 14 March" in text_of(page)
-    assert "time (" not in page
-
-
-def test_page_has_title_without_spec_file_and_reduces_large_panorama(page, text, panorama):
-    large = replace(panorama, picture=np.repeat(panorama.picture, 2, axis=1))
-    found = text(large, spec_file=None)
-    assert "A run without a spec file" in found
-    assert "From " not in found
-    assert "Reduced for this page; panorama.png has all pixels." in found
-    assert "Reduced for this page" not in page()
 
 
 @pytest.fixture
@@ -231,16 +181,6 @@ def test_page_of_failed_run_shows_exposures_that_did_not_match(failed, record, e
     ]
 
 
-def test_page_of_failed_run_escapes_its_reasons_and_has_its_message_alone_if_it_failed_otherwise(failed):
-    page = render_failure(failed | {"warnings": [HOSTILE]}, untied(reason=HOSTILE))
-    check_self_contained(page)
-    assert "<script>" not in page
-    page = render_failure(failed, LocationError("frames reach the horizon\n  and more"))
-    check_self_contained(page)
-    assert "The run failed: frames reach the horizon. and more The run folder" in text_of(page)
-    assert "<svg" not in page
-
-
 def test_page_says_verdict_in_words(record, text):
     record["motion"] = {"std_px": 0.1234, "worst_std_px": 1.5, "worst_frame": 9874}
     expected = (
@@ -263,26 +203,6 @@ def test_page_says_verdict_in_words(record, text):
     assert "Not tested: whether it moves (20 spans)" in text(verdict=trusted | {"untested": ["whether it moves (20 spans)"]})
 
 
-def test_page_lists_a_folder_once(page):
-    names = [f"exposures/level-1-{k:04d}.png" for k in range(4000)] + ["colmap/0/images.txt"]
-    found = page(files={name: {"bytes": 1024, "sha256": "0" * 64} for name in names})
-    links = [element.attrib["href"] for element in ElementTree.fromstring(found).iter("a")]
-    assert links == ["./exposures/", "./run.json", "./colmap/"]
-    assert "exposures/ 3.91 MiB 4,000 files: the exposures of each level, linear flux and pictures" in text_of(found)
-    assert "colmap/ 1 KiB 1 file" in text_of(found)
-
-
-def test_page_links_files_of_the_run(page):
-    names = ["strange #1?.txt", "panorama.tiff", "report.html", *(f"image-{k:02d}.png" for k in range(40))]
-    found = page(files={name: {"bytes": 2048, "sha256": "0" * 64} for name in names})
-    check_self_contained(found)
-    links = [element.attrib["href"] for element in ElementTree.fromstring(found).iter("a")]
-    assert links[:3] == ["./panorama.tiff", "./run.json", "./image-00.png"]
-    assert len(links) == 30
-    assert "And 13 files more; run.json lists all." in text_of(found)
-    assert 'href="./strange%20%231%3F.txt"' in page(files={"strange #1?.txt": {"bytes": 5, "sha256": "0" * 64}})
-
-
 def test_report_imports_no_library_before_it_draws_and_never_pyplot():
     code = (
         "import sys, photonpano.report; print(sorted(sys.modules)); "
@@ -293,23 +213,3 @@ def test_report_imports_no_library_before_it_draws_and_never_pyplot():
     assert not {"jinja2", "matplotlib", "ruamel.yaml"} & set(before)
     assert "matplotlib.figure" in after
     assert "matplotlib.pyplot" not in after
-
-
-def failure(start: int, reason: str) -> dict:
-    return {"moving": [start, start + 5], "fixed": [start + 5, start + 10], "reason": reason}
-
-
-def test_failure_groups_ignore_numbers_in_reasons():
-    levels = [
-        {"level": 1, "failures": [failure(0, "too dark"), *(failure(k, f"only {k} of -3.5 agree") for k in range(5))]},
-        {"level": 2, "failures": [failure(9, "too dark"), failure(19, "too dark")]},
-    ]
-    groups = failure_groups(levels)
-    assert [(group.level, len(group.failures), group.reason) for group in groups] == [
-        (1, 5, "only 0 of -3.5 agree"),
-        (1, 1, "too dark"),
-        (2, 2, "too dark"),
-    ]
-    assert [group.alike for group in groups] == [False, True, True]
-    assert [group.more for group in groups] == [2, 0, 0]
-    assert [pair["moving"][0] for pair in groups[0].examples] == [0, 1, 2]

@@ -8,11 +8,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from photonpano.geometry import Canvas, transform_points
+from photonpano.geometry import Canvas
 from photonpano.report import figures
-from photonpano.report.pose_page import path_views, scene_views, viewpoints
+from photonpano.report.pose_page import path_views, scene_views
 from photonpano.residuals.block_sums import BLOCK_PX, GX_R, GXX
-from photonpano.values import Light, PoseEstimate, ScenePoints
+from photonpano.values import PoseEstimate, ScenePoints
 
 CANVAS = Canvas(300, 1240, np.eye(3))
 
@@ -30,61 +30,10 @@ def test_figures_use_colour_variables_of_page(residuals):
         assert len(svg) < 120_000
 
 
-def test_light_is_drawn_only_if_it_changes(residuals):
-    assert figures.light_over_time(residuals) is None
-    svg = figures.light_over_time(replace(residuals, light=np.linspace(0.5, 1.5, len(residuals.spans))))
-    ElementTree.fromstring(svg)
-    assert "light / mean" in svg
-
-
-def test_flicker_is_drawn_only_where_places_have_their_own():
-    gain = np.ones(100)
-    assert figures.flicker_over_panorama(None, Canvas(60, 90, np.eye(3))) is None
-    assert figures.flicker_over_panorama(Light.of_frames(gain), Canvas(60, 90, np.eye(3))) is None
-    waves, maps = np.zeros((2, 100)), np.stack([np.linspace(0, 0.8, 90 * 60).reshape(60, 90)] * 2).astype(np.float32)
-    svg = figures.flicker_over_panorama(Light(gain, waves, maps, np.eye(3), 0.1, gain), Canvas(60, 90, np.eye(3)))
-    ElementTree.fromstring(svg)
-    assert "flicker / mean light" in svg
-    assert "phase (degrees)" in svg
-
-
-def test_flicker_of_large_panorama_is_that_of_the_middles_of_its_squares(monkeypatch):
-    asked = []
-
-    def even(_: Light, canvas: Canvas) -> list[np.ndarray]:
-        asked.append(canvas)
-        return [np.ones(canvas.shape)] * 2
-
-    monkeypatch.setattr(figures, "amplitudes_on", even)
-    light = Light(np.ones(9), np.zeros((2, 9)), np.zeros((2, 3, 3), np.float32), np.eye(3), 0.1, np.ones(9))
-    figures.flicker_over_panorama(light, Canvas(500, 1000, np.eye(3)))
-    assert asked[0].shape == (100, 200)
-    np.testing.assert_allclose(transform_points(asked[0].transform, [[2.0, 2.0]]), [[0, 0]], atol=1e-12)
-
-
-def test_spectrum_of_noise_is_one(residuals):
-    frequencies, power = figures.spectrum_over_noise(residuals)
-    assert (len(frequencies), frequencies[-1]) == (len(power), pytest.approx(1 / 32, rel=0.01))
-    # Interpolation is expected to add 0.015 px to a noise of 0.03 px.
-    assert power.mean() == pytest.approx(1 / (1 + 0.015**2 / 0.03**2), rel=0.1)
-
-
 def test_spectrum_peaks_at_period_of_tremor(tremor):
     frequencies, power = figures.spectrum_over_noise(tremor)
     assert 1 / frequencies[power.argmax()] == pytest.approx(100, rel=0.02)
     assert power.max() > 100
-
-
-def test_spectrum_ignores_spans_without_information(tremor):
-    normal = tremor.normal.copy()
-    normal[::7] = 0
-    frequencies, power = figures.spectrum_over_noise(replace(tremor, normal=normal))
-    assert 1 / frequencies[power.argmax()] == pytest.approx(100, rel=0.02)
-
-
-@pytest.mark.parametrize(("rate", "label"), [(None, "cycles per frame"), (96_800.0, "frequency (Hz)")])
-def test_spectrum_names_its_unit(residuals, rate, label):
-    assert label in figures.shifts_over_time(residuals, rate)
 
 
 def test_shifts_of_blocks_are_drawn_if_significant(residuals):
@@ -148,32 +97,6 @@ def estimate_of() -> Callable[..., PoseEstimate]:
     return estimate_of
 
 
-def test_viewpoints_are_above_and_behind_what_is_wide_and_deep() -> None:
-    rng = np.random.default_rng(1)
-    shown = rng.normal(0, [3, 0.2, 1], (400, 3))
-    above, behind = viewpoints(shown, facing_ahead(shown[:5]))
-    assert (above.name, behind.name) == ("from above", "from behind")
-    for each in (above, behind):
-        np.testing.assert_allclose(each.axes @ each.axes.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(each.axes) == pytest.approx(1)
-        assert each.axes[0] @ [1, 0, 0] > 0.9, "x points to the right"
-    ahead, down = above.axes @ [0, 0, 1], behind.axes @ [0, 1, 0]
-    assert ahead[1] > 0.8, "from above, what is ahead is up"
-    assert down[1] < -0.8
-
-
-def test_far_things_look_smaller_and_what_is_behind_the_viewer_is_left_out() -> None:
-    shown = np.random.default_rng(1).normal(0, [3, 0.2, 1], (400, 3))
-    view, _ = viewpoints(shown, facing_ahead(shown[:5]))
-    right, _, towards = view.axes
-    places = view.middle + np.array([right, right - 2 * towards, right + 2 * towards, right + 2 * view.distance * towards])
-    seen, larger = view.project(places)
-    assert seen[0].tolist() == pytest.approx([1, 0])
-    assert seen[1, 0] == pytest.approx(view.distance / (view.distance + 2))
-    assert seen[2, 0] == pytest.approx(view.distance / (view.distance - 2)) == pytest.approx(larger[2])
-    assert np.isnan(seen[3]).all()
-
-
 @pytest.mark.parametrize("straight", [False, True])
 def test_views_name_their_ends_and_sides(estimate_of: Callable[..., PoseEstimate], straight: bool) -> None:
     estimate = estimate_of(lost=slice(50, None), straight=straight)
@@ -182,14 +105,3 @@ def test_views_name_their_ends_and_sides(estimate_of: Callable[..., PoseEstimate
         assert {"frame 0", "frame 49"} <= set(texts)
         assert len([text for text in texts if text.startswith("from ")]) == 1
         assert not re.search(r"\b(nan|inf)\b", re.sub(r"base64,[^\"]*", "", view))
-
-
-def test_lost_frames_are_a_gap_in_the_path(estimate_of: Callable[..., PoseEstimate]) -> None:
-    whole, torn = (path_views(estimate_of(lost=lost), SHAPE)[0] for lost in (slice(0), slice(20, 30)))
-    # Each step of the path is a shape, and so is each edge of a frustum; 10 lost frames are 11 steps.
-    assert whole.count("<path") - torn.count("<path") == 11
-
-
-def test_size_of_a_view_does_not_grow_with_the_points(estimate_of: Callable[..., PoseEstimate]) -> None:
-    few, many = (len(scene_views(estimate_of(n_points=number), SHAPE)[0]) for number in (200, 50_000))
-    assert many < 6 * few

@@ -1,8 +1,6 @@
 import base64
-import re
 import zlib
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,21 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-import photonpano.report
-from photonpano import FrameSpan, Group, Panorama, StreamInfo, VirtualExposure
-from photonpano.capture import before, in_light
-from photonpano.geometry import Canvas, rescaling, translation
-from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
-from photonpano.merging.panorama import RenderedPanorama
-from photonpano.motion.frame_motion import FrameMotion
-from photonpano.photometry import BinaryResponse
-from photonpano.report import OpenCapture, render_report, viewer
-from photonpano.report.preview import still_exposure
-from photonpano.testing import KnownMotion, MemorySource
-from photonpano.values import CELL_PX, Background, Light
-
-SCRIPT = Path(photonpano.report.__file__).parent / "templates" / "viewer.js"
-RANGE = DynamicRange(CanvasNoise(BinaryResponse()))
+from photonpano import Group, VirtualExposure
+from photonpano.capture import with_background
+from photonpano.report import OpenCapture, viewer
+from photonpano.testing import MemorySource
+from photonpano.values import CELL_PX, Background
 
 
 def decoded(linear: dict) -> np.ndarray:
@@ -47,22 +35,6 @@ def test_linear_data_keeps_flux_to_a_sixth_of_a_percent(shape):
     np.testing.assert_allclose(found[~np.isnan(flux)], flux[~np.isnan(flux)], rtol=1.6e-3)
 
 
-def test_linear_data_of_a_large_panorama_is_reduced_over_what_was_seen(monkeypatch):
-    monkeypatch.setattr(viewer, "LINEAR_VALUES", 600)
-    flux = np.full((40, 60), 0.5, np.float32)
-    flux[:, 31:] = np.nan
-    found = decoded(viewer.linear_data(flux, 1.0))[..., 0]
-    assert found.shape == (20, 30)
-    np.testing.assert_allclose(found[:, :15], 0.5, rtol=1e-3)
-    assert np.isnan(found[:, 16:]).all()
-
-
-@pytest.mark.parametrize("flux", [np.full((4, 5), np.nan, np.float32), np.zeros((4, 5), np.float32)])
-def test_linear_data_of_darkness_is_finite(flux):
-    found = viewer.linear_data(flux, 1.0)
-    assert 0 < found["low"] < found["high"] < np.inf
-
-
 def test_path_has_outlines_on_the_panorama(motion, panorama):
     path = viewer.path_data(motion, panorama)
     start = path["frames"][path["start"]]
@@ -80,15 +52,6 @@ def test_path_has_outlines_on_the_panorama(motion, panorama):
     np.testing.assert_allclose(np.array(halved["outlines"]), outlines, atol=1.1)
 
 
-def test_maps_are_transparent_where_nothing_was_seen(panorama):
-    coverage, uncertainty = viewer.panorama_maps(panorama)
-    weight = panorama.thumbnail.weight
-    assert coverage["low"] == 0
-    assert coverage["high"] == pytest.approx(np.quantile(weight[weight > 0], 0.99), rel=1e-3)
-    assert uncertainty["unit"].startswith("% of the flux")
-    assert coverage["box"] == [0, 0, panorama.canvas.width, panorama.canvas.height]
-
-
 def test_shared_instant_is_near_an_exposure_of_each_level(motion):
     levels = [
         SimpleNamespace(located=SimpleNamespace(instants=np.array(instants)))
@@ -104,44 +67,6 @@ def decoded_picture(uri: str) -> np.ndarray:
     return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE).astype(float)
 
 
-@pytest.mark.parametrize("instant", [10.0, 12.5])
-def test_views_of_an_instant_show_one_place(instant):
-    """A scene that moves by 3 px a frame; the exposure is at half the size of a frame, and of a nearby instant."""
-    scene = cv2.GaussianBlur(np.random.default_rng(0).random((80, 160)), (0, 0), 3).astype(np.float32)
-    scene = (scene - scene.min()) / np.ptp(scene)
-    shape, n_frames, here = (40, 64), 20, 11
-    homographies = np.array([translation(3.0 * k, k) for k in range(n_frames)])
-
-    def seen(place: float, scale: float) -> np.ndarray:
-        size = round(shape[1] * scale), round(shape[0] * scale)
-        to_scene = translation(3.0 * place, place) @ rescaling(1 / scale)
-        return cv2.warpPerspective(scene, to_scene, size, flags=cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR)
-
-    class Source:
-        info = StreamInfo(n_frames, *shape, None)
-        response = BinaryResponse()
-
-    flux = seen(instant, 0.5)
-    exposure = VirtualExposure(flux, np.ones_like(flux), Group(FrameSpan(0, 20), instant), 0.5, Source.response)
-    level = SimpleNamespace(
-        level=SimpleNamespace(number=1),
-        located=SimpleNamespace(instants=np.array([instant]), solution=SimpleNamespace(located=np.array([True]))),
-        exposures=SimpleNamespace(merged=lambda _: exposure),
-    )
-    located, trajectory = np.ones(n_frames, bool), KnownMotion(lambda k: translation(3.0 * k, k))
-    motion = FrameMotion(trajectory, FrameSpan(0, n_frames), homographies, located, np.zeros(n_frames), 0, shape)
-    canvas = Canvas(80, 160, np.eye(3))
-    whole = Panorama(scene, np.ones_like(scene), np.eye(3))
-    rendered = RenderedPanorama(canvas, whole, 1, np.zeros((80, 160), np.uint8), 1.0, 1.0, 0.1, 0.1 * scene, RANGE)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(viewer, "still_exposure", lambda _, span: seen(span.start, 1.0))
-        views = viewer.views_of_instant(here, motion, rendered, Source, [level])
-    assert [view["name"] for view in views] == ["One frame", "Plain average", "Level 1", "Panorama"]
-    frame, _, level_view, panorama = (decoded_picture(view["uri"])[8:-8, 8:-8] for view in views)
-    assert np.corrcoef(frame.ravel(), panorama.ravel())[0, 1] > 0.97
-    assert np.corrcoef(level_view.ravel(), panorama.ravel())[0, 1] > 0.97
-
-
 def capture_of_a_person(hidden_cells: int) -> OpenCapture:
     """Frames of noise as large as those of the fixtures, of which some cells at the left hide the background."""
     shape, instant = (254, 496), 30.0
@@ -155,7 +80,7 @@ def capture_of_a_person(hidden_cells: int) -> OpenCapture:
     located = SimpleNamespace(instants=np.array([instant]), solution=solution)
     exposures = SimpleNamespace(merged=lambda _: exposure)
     level: Any = SimpleNamespace(level=SimpleNamespace(number=1), located=located, exposures=exposures)
-    return OpenCapture(before(source, found), [level])
+    return OpenCapture(with_background(source, found), [level])
 
 
 def test_pictures_of_frames_have_all_photons():
@@ -164,35 +89,3 @@ def test_pictures_of_frames_have_all_photons():
     assert {each["hidden"] for each in found} == {0.5}
     seen = decoded_picture(found[20]["uri"])
     assert seen[:, :100].mean() == pytest.approx(seen[:, 140:].mean(), rel=0.05)
-
-
-def test_frame_in_dim_light_is_seen_by_itself():
-    source = in_light(MemorySource(np.ones((4, 20, 30), bool)), Light.of_frames(np.array([1.2, 0.5, 1.1, 1.2])))
-    assert np.isfinite(still_exposure(source, FrameSpan(1, 2))).all()
-
-
-@pytest.mark.parametrize(("hidden_cells", "width"), [(31, 1400), (31, 400), (0, 1400)])
-def test_hidden_parts_are_tinted_if_there_are_any(
-    browser_page: Any, record, explained, panorama, tmp_path: Path, hidden_cells: int, width: int
-):
-    path = tmp_path / "report.html"
-    path.write_text(render_report(record, explained, panorama, capture=capture_of_a_person(hidden_cells)), encoding="utf-8")
-    browser_page.open(path, width)
-    browser_page.wait_for('document.querySelector("#viewer.live")')
-    text = browser_page.run("document.querySelector('.scrubber').textContent")
-    assert re.findall(r"hidden parts: (\d+) % of this picture", text) == (["50"] if hidden_cells else [])
-    boxes = """[...document.querySelectorAll('.seen img')].map(
-      (each) => (({x, y, width, height}) => [x, y, width, height])(each.getBoundingClientRect()))"""
-    browser_page.wait_for("[...document.querySelectorAll('.seen img')].every((each) => each.complete)")
-    picture, *tints = browser_page.run(boxes)
-    assert tints == ([picture] if hidden_cells else [])
-    assert browser_page.run("document.documentElement.scrollWidth") == width
-    if hidden_cells:
-        browser_page.run("document.querySelector('.hidden-parts').click()")
-        assert browser_page.run(boxes)[1] == [0, 0, 0, 0]
-    assert (browser_page.messages, browser_page.requests) == ([], [])
-
-
-def test_script_can_stand_in_a_page():
-    text = SCRIPT.read_text(encoding="utf-8")
-    assert not any(end in text for end in ("]]>", "</script", "{{", "{%", "{#", "http"))

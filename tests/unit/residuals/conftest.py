@@ -9,8 +9,8 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.residuals.block_sums import GXX, GYY, N_SUMS, M, R, V, n_blocks
 from photonpano.residuals.halves import Halves
 from photonpano.residuals.measure import Residuals
+from photonpano.residuals.patterns import Shaking
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.shaking import Shaking
 
 SHAPE, N_SPANS, SPAN = (128, 192), 200, 10
 N_FRAMES = N_SPANS * SPAN

@@ -73,18 +73,9 @@ def test_jump_is_found_in_dim_light(cuts_of: Callable[..., tuple[Cut, ...]]) -> 
     assert abs(cut.frame - JUMP) <= 1
 
 
-@pytest.mark.parametrize("period", [40, 76, 160])
-def test_tremor_that_the_loop_missed_is_no_jump(cuts_of: Callable[..., tuple[Cut, ...]], period: int) -> None:
-    assert cuts_of(PAN_PX + 1.5 * np.sin(2 * np.pi * FRAMES / period), PAN_PX) == ()
-
-
 def test_sudden_turn_is_no_jump(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
     true_px = 0.4 * np.abs(FRAMES - JUMP)
     assert cuts_of(true_px, smoothed(true_px)) == ()
-
-
-def test_motion_that_explains_the_photons_is_not_searched(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
-    assert cuts_of(PAN_PX, PAN_PX) == ()
 
 
 def test_jump_behind_dark_frames_is_cut_in_their_middle(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
@@ -92,27 +83,6 @@ def test_jump_behind_dark_frames_is_cut_in_their_middle(cuts_of: Callable[..., t
     [cut] = cuts_of(true_px, smoothed(true_px), dark=dark)
     assert (cut.frame, cut.dark) == (325, dark)
     np.testing.assert_allclose(cut.shift_px, [-40, 0], atol=2.5)
-
-
-def test_dark_frames_without_jump_are_not_cut(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
-    assert cuts_of(PAN_PX, PAN_PX, dark=FrameSpan(300, 350)) == ()
-
-
-def test_jump_is_found_within_tremor(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
-    tremor_px = 1.5 * np.sin(2 * np.pi * FRAMES / 160)
-    [cut] = cuts_of(PAN_PX + tremor_px + 4 * AFTER, smoothed(PAN_PX + 4 * AFTER) + tremor_px, flux=0.3)
-    assert abs(cut.frame - JUMP) <= 2
-
-
-def test_nothing_is_said_of_a_jump_along_edges(cuts_of: Callable[..., tuple[Cut, ...]], street: np.ndarray) -> None:
-    """Edges along one diagonal show how far the image moves along the other one."""
-    y, x = np.indices(street.shape)
-    waves = np.random.default_rng(5).uniform(0, 2 * np.pi, 40)
-    edges = sum(np.sin((x + y) / period + phase) for period, phase in zip(np.geomspace(2, 20, 40), waves, strict=True))
-    true_px = PAN_PX + 8 * AFTER
-    [cut] = cuts_of(true_px, smoothed(true_px), scene=0.5 + 0.45 * np.tanh(edges / 4))
-    assert cut.frame == JUMP
-    np.testing.assert_allclose(cut.shift_px, [-4, -4], atol=1)
 
 
 class Stages:

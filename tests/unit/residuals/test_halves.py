@@ -11,7 +11,7 @@ from photonpano import FrameSpan
 from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory, canvas_of, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.residuals.halves import Agreements, Halves, halves_of
+from photonpano.residuals.halves import Halves, halves_of
 from photonpano.testing.captures import detected, seen_along, textured
 
 SHAPE, N_FRAMES = (64, 96), 400
@@ -39,7 +39,7 @@ def scene() -> np.ndarray:
 
 @pytest.mark.parametrize("flux", [0.3, 0.02])
 def test_coherence_along_the_true_motion_is_one_but_for_its_noise(halves: Callable, scene: np.ndarray, flux: float) -> None:
-    found = [halves(flux * scene, seed=seed) for seed in range(12)]
+    found = [halves(flux * scene, seed=seed) for seed in range(5)]
     inner = slice(4, -4)  # at the ends, a half is a few frames
     scores = np.array([((each.cuts.coherence - 1) / each.cuts.std_coherence)[inner] for each in found])
     assert 0.7 < np.sqrt(np.mean(scores**2)) < 1.4
@@ -80,14 +80,6 @@ def test_bare_edges_tie_nothing_along_them(halves: Callable, scene: np.ndarray, 
     assert min(abs(found.angles_deg[middle] - angle), abs(found.angles_deg[middle] - angle - 180)) < 3
 
 
-def test_tremor_that_the_motion_lacks_blurs_both_halves_alike(halves: Callable, scene: np.ndarray) -> None:
-    """It makes gradients weak, and the shift unsure, but lowers no coherence."""
-    shaken = PAN @ np.array([translation(2 * np.sin(2 * frame), 2 * np.cos(2 * frame)) for frame in range(N_FRAMES)])
-    blurred, sharp = halves(0.3 * scene, shaken, PAN).cuts, halves(0.3 * scene).cuts
-    assert (blurred.std_px > 1.5 * sharp.std_px).mean() > 0.9
-    assert np.median(blurred.coherence) > 0.99
-
-
 def test_stretch_that_sees_a_bare_edge_is_tied_to_nothing_where_the_path_returns(halves: Callable, scene: np.ndarray) -> None:
     """Frames on both sides of each cut see the same places, so that no cut shows it."""
     wall = 0.3 * scene
@@ -103,21 +95,3 @@ def test_stretch_that_sees_a_bare_edge_is_tied_to_nothing_where_the_path_returns
     tied_px = found.tied_px(np.ones(N_FRAMES, dtype=bool))
     assert tied_px[frames.astype(int)].min() > 20
     assert tied_px[[0, N_FRAMES // 2, N_FRAMES - 1]].max() < 1
-
-
-def test_short_captures_have_no_cuts(halves: Callable, memory_source: type, scene: np.ndarray) -> None:
-    source, homographies = memory_source(detected(seen_along(0.3 * scene, PAN[:10], SHAPE), 0)), PAN[:10]
-    located = np.ones(10, dtype=bool)
-    motion = FrameMotion(FrameTrajectory(homographies), FrameSpan(0, 10), homographies, located, np.full(10, 0.1), 5, SHAPE)
-    found = halves_of(source, motion, canvas_of(homographies, SHAPE, 1.0), Context())
-    assert not len(found.cuts.firsts)
-    np.testing.assert_array_equal(found.tied_px(located), np.zeros(10))
-
-
-def test_each_side_of_a_weak_cut_lies_off_by_the_share_of_the_other() -> None:
-    """Of 10 px between 20 and 60 frames, 7.5 are an error of the 20, and 2.5 of the 60."""
-    one = np.ones(2)
-    cuts = Agreements(np.array([20.0, 50.0]), one, 0.01 * one, np.array([[0.1, 10.0], [0.1, 0.2]]), 90 * one)
-    found = Halves(cuts, Halves.none().stretches)
-    tied_px = found.tied_px(np.ones(80, dtype=bool))
-    np.testing.assert_allclose(tied_px[[0, 19, 20, 79]], [7.5, 7.5, 2.5, 2.5])

@@ -12,13 +12,12 @@ from photonpano.capture import capture_of, seen_through
 from photonpano.execution.context import Context
 from photonpano.geometry import Camera, FrameTrajectory, rotation_matrices, translation
 from photonpano.merging.panorama import View, plan_canvas, render
-from photonpano.photometry import IntensityResponse
-from photonpano.residuals.lens import lens_distortion
 from photonpano.residuals.measure import Residuals, measure
-from photonpano.residuals.prediction import Prediction, Predictions
+from photonpano.residuals.patterns import lens_distortion
+from photonpano.residuals.prediction import Predictions
 from photonpano.residuals.refinement import bounded_std_px, residual_ratio, unexplained_px
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, Scene, recorded
-from photonpano.values import FloatArray, Panorama
+from photonpano.values import FloatArray
 
 SHAPE = (48, 80)
 FRAMES = 800
@@ -89,44 +88,6 @@ def test_steps_are_the_tremor_that_the_motion_lacks() -> None:
     assert bounded_std_px(np.full(FRAMES, 10.0), found).min() == 10
 
 
-def test_spans_are_shorter_than_the_shaking_of_single_frames() -> None:
-    usual, shaking = residuals_of(), residuals_of(1.0, period=4.2)
-    assert usual.shaking.size_px == 0
-    assert shaking.shaking.size_px == pytest.approx(1 / np.sqrt(2), rel=0.4)
-    assert shaking.shaking.period_frames == pytest.approx(4.2, rel=0.1)
-    assert max(map(len, shaking.spans)) <= 2 < min(map(len, usual.spans))
-    # Frames may be off by what they shake, wherever they are.
-    assert unexplained_px(shaking, FRAMES).min() >= shaking.shaking.size_px
-
-
-def test_bounded_std_px_at_an_extrapolated_end_is_what_the_photons_allow() -> None:
-    found = residuals_of()
-    std_px = np.full(FRAMES, 0.1)
-    std_px[-40:] = np.linspace(0.1, 10, 40)
-    std_px[:5] = np.inf
-    bounded = bounded_std_px(std_px, found)
-    np.testing.assert_array_equal(bounded[:700], std_px[:700])
-    assert bounded[-40:].max() < 1
-    assert (bounded[-40:] >= 0.1).all()
-
-
-def test_bounded_std_px_of_frames_that_show_nothing_stays_as_it_was() -> None:
-    found = residuals_of()
-    dark = (found.instants > 400) & (found.instants < 600)
-    gradient = found.gradient.copy()
-    gradient[dark, -1] = -found.normal[dark, -1, -1]
-    frames = np.arange(FRAMES)
-    bounded = bounded_std_px(np.where((frames > 450) & (frames < 640), 10.0, 0.1), replace(found, gradient=gradient))
-    assert bounded[460:580].min() == 10
-    assert bounded[630:].max() < 1
-
-
-def test_measure_does_not_depend_on_threads() -> None:
-    one, two = residuals_of(), residuals_of(threads=3)
-    for name in ("normal", "gradient", "reduced_chi2", "blocks", "block_chi2", "pixel_gain", "cell_chi2"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), name)
-
-
 def test_predicted_view_is_the_scene_and_its_variance() -> None:
     source = capture()
     trajectory = FrameTrajectory(np.array([shaken(frame, 0) for frame in range(FRAMES)]))
@@ -188,34 +149,6 @@ def test_panorama_explains_frames_of_a_full_turn(projection: str, distortion: tu
     assert ratio.mean() == pytest.approx(1, abs=0.01)
 
 
-LARGE = (254, 496)
-
-
-@pytest.mark.parametrize("projection", ["planar", "cylindrical", "spherical"])
-@pytest.mark.parametrize("distortion", [(0, 0, 0, 0), (-0.11, 0.03, 0, 0)], ids=["pinhole", "lens"])
-def test_prediction_lies_where_the_camera_looks(projection: str, distortion: tuple[float, ...]) -> None:
-    camera = Camera.of(430, LARGE, distortion)
-    turn = rotation_matrices(np.array([[0.03, 0.25, 0.1]]))
-    trajectory = FrameTrajectory(camera.homographies(np.concatenate([rotation_matrices(np.zeros((1, 3))), turn])))
-    canvas = plan_canvas(trajectory, FrameSpan(0, 2), LARGE, 1.0, 2**30, view=View(projection, camera=camera, turns=True))
-    homography = trajectory.at([1])[0]
-    y, x = np.mgrid[: LARGE[0], : LARGE[1]].astype(np.float64)
-    pixels = np.concatenate([camera.ideal(np.stack([x, y], axis=-1)), np.ones((*LARGE, 1))], axis=-1)
-    places = canvas.pixels(pixels @ (canvas.plane_to_rays @ homography).T)
-    for axis, size in enumerate((canvas.width, canvas.height)):
-        ramp = np.arange(size, dtype=np.float32) + 1
-        flux = np.ascontiguousarray(np.broadcast_to(ramp if axis == 0 else ramp[:, None], canvas.shape))
-        panorama = Panorama(flux, np.full(canvas.shape, 100, np.float32), canvas.transform)
-        prediction = Prediction.of(panorama, canvas, IntensityResponse(1.0, 0.0, 1e6, 0.0), trajectory, LARGE, camera=camera)
-        mean, variance = prediction.predicted(1)
-        known = np.isfinite(variance)
-        assert known.mean() > 0.9
-        error = np.abs(mean[known] - 1 - places[..., axis][known])
-        # 0.008 px are the levels of a texture. A plane is 1.6 times enlarged where the camera looks aside.
-        assert error.mean() < 0.009
-        assert error.max() < 0.045
-
-
 BENT = (96, 128)
 
 
@@ -246,15 +179,6 @@ def test_lens_distortion_is_found_with_its_sign(k1: float) -> None:
     # A distortion bends the ends of a path most.
     start, *_, end = distortion.bend_px
     assert min(start, end) > 2 * distortion.bend_px.min()
-
-
-def test_lens_distortion_is_not_significant_without_a_lens() -> None:
-    assert found(0.0).sigmas < 4
-
-
-def test_lens_distortion_needs_blocks() -> None:
-    still = np.tile(np.eye(3), (10, 1, 1))
-    assert lens_distortion(np.zeros((2, 2, 2)), np.tile(np.eye(2), (2, 2, 1, 1)), still, (32, 32)) is None
 
 
 @pytest.mark.parametrize(("number", "generator"), [(2, [[0, -1], [1, 0]]), (3, [[1, 0], [0, 1]])], ids=["roll", "zoom"])

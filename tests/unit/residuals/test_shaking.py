@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from photonpano.residuals.shaking import find_shaking, scatter_px
+from photonpano.residuals.patterns import find_shaking, scatter_px
 
 WINDOWS, FRAMES, SPAN = 16, 36, 12
 NOISE_PX = 0.1
@@ -38,17 +38,7 @@ def test_noise_does_not_shake() -> None:
     assert {each.span_frames for each in found if not each.size_px} == {SPAN}
 
 
-def test_motion_that_a_span_follows_does_not_shake() -> None:
-    frames = np.arange(FRAMES)[:, None]
-    assert scatter_px(noisy(2) + 0.2 * frames, VARIANCES, SPAN) == 0
-
-
 def test_directions_without_texture_hide_no_shaking_of_the_other() -> None:
     variances = VARIANCES * [1, 1e4]
     assert scatter_px(noisy(3, 4.0) * [1, 100], variances, SPAN) == pytest.approx(0.5, rel=0.2)
     assert scatter_px(noisy(3, 4.0), np.full(VARIANCES.shape, np.inf), SPAN) == 0
-
-
-@pytest.mark.parametrize("size", [1, 2, FRAMES + 1])
-def test_spans_without_scatter_shake_by_nothing(size: int) -> None:
-    assert scatter_px(noisy(4, 4.0), VARIANCES, size) == 0

@@ -12,25 +12,25 @@ from scipy import ndimage
 from photonpano import FrameSpan
 from photonpano.geometry import Camera
 from photonpano.motion.graph import Freed, Rival
-from photonpano.motion.level import DARK_JUMP, UNCUT_JUMP
 from photonpano.motion.loop import LevelResult
 from photonpano.motion.models import SAME_LENS_PX, MotionModel
-from photonpano.residuals import tested_run
 from photonpano.residuals.block_sums import GX_R, GXX, GY_R, GYY, M, R
+from photonpano.residuals.findings import Findings, Jump
 from photonpano.residuals.halves import Agreements, Halves
-from photonpano.residuals.lens import LensDistortion
 from photonpano.residuals.measure import Residuals
+from photonpano.residuals.patterns import LensDistortion, Shaking
 from photonpano.residuals.refinement import Explained, residual_ratio
-from photonpano.residuals.shaking import Shaking
-from photonpano.residuals.tested_run import RIVAL
-from photonpano.residuals.verdict import NARROW, judge, second_place_px
-from photonpano.values import Ambiguity, Decision, Edge, Located, Reason
+from photonpano.residuals.verdict import NARROW, judge
+from photonpano.values import Ambiguity, Edge, Located
 
 SHAPE, N_SPANS, SPAN = (128, 192), 200, 10
-N_FRAMES = N_SPANS * SPAN
 
 
 Made = dict[str, Any]
+
+
+def jump(start: int, stop: int) -> Jump:
+    return Jump(start, 7.0, 20.0, FrameSpan(start, stop))
 
 
 def squares(residuals: Residuals, **values: float) -> Made:
@@ -174,13 +174,6 @@ def test_residuals_like_noise_are_trusted(explained: Explained, change: Callable
     assert (verdict.status, verdict.reasons, verdict.notes, verdict.residual_ratio) == ("trusted", (), (), 1.05)
 
 
-def test_scatter_of_shifts_beyond_noise_is_a_note_and_an_unknown_one_is_not(explained: Explained) -> None:
-    [note] = judge(replace(explained, ratio=24.0), ()).notes
-    assert (note.what, note.figure) == ("the image moves within groups by more than the motion that was found", 24)
-    verdict = judge(replace(explained, ratio=float("nan")), ())
-    assert (verdict.status, verdict.residual_ratio) == ("trusted", None)
-
-
 @pytest.mark.parametrize(("n_spans", "doubtful"), [(20, True), (60, False)])
 def test_motion_of_a_capture_that_is_too_short_for_any_test_is_doubtful(
     explained: Explained, n_spans: int, doubtful: bool
@@ -195,14 +188,6 @@ def test_motion_of_a_capture_that_is_too_short_for_any_test_is_doubtful(
         "whether the image moves within groups by more",
         "whether frames shake faster",
     ] * doubtful
-
-
-def test_scene_that_no_block_saw_often_is_not_tested(explained: Explained) -> None:
-    residuals = replace(explained.residuals, cell_count=np.full_like(explained.residuals.cell_count, 15))
-    verdict = judge(replace(explained, residuals=residuals), ())
-    assert (verdict.status, len(verdict.untested)) == ("trusted", 1)
-    assert verdict.untested[0].endswith("(no place was seen 16 times)")
-    assert judge(explained, ()).untested == ()
 
 
 @pytest.mark.parametrize(
@@ -302,12 +287,6 @@ def test_advice_is_not_what_the_run_does_already(
     assert found == {"the lens distorts the frames, which bends the motion": lens, NARROW: turn}
 
 
-def test_photons_that_differ_by_little_light_are_trusted(explained: Explained) -> None:
-    """0.2 variances of 100 photons are 4 % of the light."""
-    residuals = replace(explained.residuals, reduced_chi2=explained.residuals.reduced_chi2 + 0.2)
-    assert judge(replace(explained, residuals=residuals), ()).status == "trusted"
-
-
 @pytest.mark.parametrize(("lacks", "doubtful"), [(2.5, False), (3.5, True)])
 def test_halves_that_do_not_agree_for_half_of_the_time_are_doubtful(explained: Explained, lacks: float, doubtful: bool) -> None:
     """One cut is far off, as where something passes; the median counts. Cuts that show too little say nothing."""
@@ -317,12 +296,6 @@ def test_halves_that_do_not_agree_for_half_of_the_time_are_doubtful(explained: E
     verdict = judge(replace(explained, halves=Halves(cuts, cuts)), ())
     assert [reason.figure for reason in verdict.reasons] == [pytest.approx(lacks)] * doubtful
     assert all(reason.where.endswith(", before frame 1000") for reason in verdict.reasons)
-
-
-def test_things_that_pass_the_background_tell_how_far_the_camera_travels(explained: Explained) -> None:
-    levels = [level_with(parallax=parallax) for parallax in (0.0412, 0.003)]
-    [reason] = judge(explained, levels, [Decision("movers", 0.6, "")]).reasons
-    assert reason.where.endswith("if what is near stands still, the camera travelled by about 0.04 of its distance")
 
 
 @pytest.mark.parametrize(
@@ -341,83 +314,23 @@ def test_camera_that_pairs_contradict_by_ten_expected_errors_is_doubtful(
     assert [reason.where for reason in reasons] == ([] if says is None else [says])
 
 
-@pytest.mark.parametrize(("along", "doubtful"), [(6.0, True), (0.8, False), (0.1, False)])
-@pytest.mark.parametrize("angle", [0, 37, 90])
 @pytest.mark.parametrize(
-    ("ties", "place"), [("cuts", "before and after 1500"), ("stretches", "frames 1500 to 1999 and all others")]
-)
-def test_motion_along_an_edge_is_doubtful(
-    explained: Explained, ties: str, place: str, angle: int, along: float, doubtful: bool
-) -> None:
-    """Of one of two cuts or stretches, the photons tell the motion across the edge to 0.1 px, and little of that along it."""
-    firsts, one = np.array([500.0, 1500.0]), np.ones(2)
-    weak = Agreements(firsts, one, 0.01 * one, np.array([[0.05, 0.06], [0.1, along]]), np.array([12.0, angle]))
-    strong = replace(weak, std_px=np.full((2, 2), 0.05))
-    halves = replace(Halves(strong, strong), **{ties: weak})
-    motion = replace(explained.motion, std_px=np.hypot(explained.motion.std_px, along))
-    reasons = judge(replace(explained, halves=halves, motion=motion), []).reasons
-    assert [reason.figure for reason in reasons] == [pytest.approx(along, rel=1e-3)] * doubtful
-    assert all(place in reason.where and f", at {angle} degrees" in reason.where for reason in reasons)
-
-
-@pytest.mark.parametrize(("n_pairs", "where"), [(2, []), (3, ["px to the second place; 3 of 30 pairs of level 1"])])
-def test_level_is_ambiguous_from_three_pairs_on(explained: Explained, n_pairs: int, where: list[str]) -> None:
-    levels = [level_with(n_ambiguous=n_pairs)]
-    assert second_place_px(tested_run.TestedRun(explained, levels, ())) == 40 * len(where)
-    uncertain = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + 40 * len(where)))
-    assert [reason.where for reason in judge(uncertain, levels).reasons] == where
-
-
-@pytest.mark.parametrize(
-    ("change_px", "what_to_do"), [(None, "use more light"), (0.9, "use more light"), (6.4, "let it converge")]
-)
-def test_error_of_motion_that_has_not_converged_is_not_for_want_of_light(
-    explained: Explained, change_px: float | None, what_to_do: str
-) -> None:
-    uncertain = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + 3))
-    [reason] = judge(uncertain, [level_with(change_px=change_px)]).reasons
-    assert reason.what_to_do.startswith(what_to_do)
-    assert ("changed the motion by 6.4 px" in reason.where) == (change_px == 6.4)
-
-
-@pytest.mark.parametrize(
-    ("decisions", "figure", "where"),
+    ("findings", "figure", "where"),
     [
-        ([Decision("standing_share", 0.6, "")], 0.6, "share of the parts that show motion or rest"),
-        (
-            [Decision(DARK_JUMP, "frames 3 to 5", ""), Decision(DARK_JUMP, "frames 9 to 12", "")],
-            2,
-            "frames 3 to 5, frames 9 to 12",
-        ),
+        (Findings(standing_share=0.6), 0.6, "share of the parts that show motion or rest"),
+        (Findings(cuts=(jump(3, 6), jump(9, 13))), 2, "frames 3 to 5, frames 9 to 12"),
     ],
 )
-def test_decisions_are_doubtful(explained: Explained, decisions: list[Decision], figure: float, where: str) -> None:
-    [reason] = judge(explained, (), decisions).reasons
+def test_findings_are_doubtful(explained: Explained, findings: Findings, figure: float, where: str) -> None:
+    [reason] = judge(explained, (), findings).reasons
     assert (reason.figure, reason.where) == (figure, where)
-    assert not judge(explained, (), [Decision("standing_share", 0.4, "")]).reasons
-
-
-@pytest.mark.parametrize("decision", [Decision(RIVAL, 40.0, "px between both"), Decision(UNCUT_JUMP, 5.0, "px before frame 3")])
-def test_why_the_motion_is_not_known_is_named(explained: Explained, decision: Decision) -> None:
-    """Their distances are in the expected errors."""
-    assert not judge(explained, (), [replace(decision, value=0.5)]).reasons
-    uncertain = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + float(decision.value)))
-    [reason] = judge(uncertain, (), [decision]).reasons
-    assert (reason.figure, reason.where) == (decision.value, decision.reason)
-    assert reason.what != "the expected error of the motion is large"
+    assert not judge(explained, (), Findings(standing_share=0.4)).reasons
 
 
 def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained) -> None:
     """A thing that fills the middle of all frames passes for the scene, and what is seen beside it for what hides that."""
-    found = [judge(explained, (), [Decision("movers", share, "")]).reasons for share in (0.48, 0.52)]
+    found = [judge(explained, (), Findings(hidden_share=share)).reasons for share in (0.48, 0.52)]
     assert [[reason.figure for reason in reasons] for reasons in found] == [[], [0.52]]
-
-
-def test_a_third_that_is_left_out_may_be_the_scene_if_as_much_of_the_rest_changes(explained: Explained) -> None:
-    changing = replace(explained.residuals, cell_chi2=np.full_like(explained.residuals.cell_chi2, 9))
-    verdicts = [judge(each, (), [Decision("movers", 0.33, "")]) for each in (explained, replace(explained, residuals=changing))]
-    named = [[reason.what.startswith("much of what the frames show") for reason in verdict.reasons] for verdict in verdicts]
-    assert named == [[], [True, False]]
 
 
 @pytest.mark.parametrize(("grain", "moves_px", "doubtful"), [(1, 0, True), (0, 0, False), (1, 3, False)])
@@ -432,9 +345,3 @@ def test_image_that_stands_still_is_doubtful_if_it_has_the_grain_of_a_sensor(
     still = replace(explained, motion=replace(explained.motion, homographies=homographies), residuals=residuals)
     whats = [reason.what for reason in judge(still, ()).reasons]
     assert ("the image stands still, and has the fine grain of a sensor whose pixels differ" in whats) is doubtful
-
-
-def test_reason_is_a_sentence() -> None:
-    reason = Reason("the light changes", 0.1234, 0.03, "most at frame 7", "keep it steady")
-    assert str(reason) == "the light changes (most at frame 7): 0.123, trusted up to 0.03; keep it steady"
-    assert str(replace(reason, where="")) == "the light changes: 0.123, trusted up to 0.03; keep it steady"

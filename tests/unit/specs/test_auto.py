@@ -5,7 +5,7 @@ import logging
 import pytest
 from pydantic import Field
 
-from photonpano import Config, Recognised, Requirement, SourceContribution, SpecError, SpecPath
+from photonpano import Config, Recognised, SourceContribution, SpecError, SpecPath
 from photonpano.specs import load_spec, parse_spec
 from photonpano.values import Decision
 
@@ -54,12 +54,7 @@ def test_auto_is_the_source_that_recognises_the_path(folder, catalog):
     plan = parsed(folder, catalog, path="cube.npy", frame_rate_hz=96800)
     named = {"use": "packed-npy", "with": {"path": str(folder / "cube.npy"), "frame_rate_hz": 96800}}
     assert plan.document == parse_spec({"version": 1, "source": named}, directory=folder, catalog=catalog).document
-    assert plan.decisions == (Decision("source", "packed-npy", "cube.npy was recognised: its name ends in .npy"),)
-
-
-def test_auto_resolved_document_records_no_decision_again(folder, catalog):
-    again = parse_spec(parsed(folder, catalog, path="cube.npy").document, catalog=catalog)
-    assert again.decisions == ()
+    assert plan.recognised == Decision("source", "packed-npy", "cube.npy was recognised: its name ends in .npy")
 
 
 def test_written_keys_override_recognised_keys(folder, catalog):
@@ -87,27 +82,6 @@ def test_unrecognised_path_lists_problems_of_sources_with_its_ending(folder, cat
     assert others == [f"  {name}: {path} is not mine" for name in heard]
 
 
-def test_unrecognised_ending_lists_known_endings(folder, catalog):
-    (folder / "cube.txt").touch()
-    said = message_of(folder, catalog.including(*FUSSY[1:]), "source: {use: auto, with: {path: cube.txt}}")
-    assert said.splitlines()[1:] == ["  the names of files of captures end in .bin, .dat and .data"]
-
-
-@pytest.mark.parametrize(
-    ("names", "looks"),
-    [
-        ([], "an empty folder"),
-        (["b", "a"], "a folder of a and b"),
-        (["d", "c", "b", "a"], "a folder of a, b, c and more"),
-    ],
-)
-def test_unrecognised_folder_is_described_by_its_files(folder, catalog, names, looks):
-    (folder / "odd").mkdir()
-    for name in names:
-        (folder / "odd" / name).touch()
-    assert f"no source recognises odd, {looks}; " in message_of(folder, catalog, "source: {use: auto, with: {path: odd}}")
-
-
 def test_path_recognised_by_several_sources_is_an_error(folder, catalog):
     also = toy("greedy", lambda path: Recognised({"path": path}, "it is there"))
     said = message_of(folder, catalog.including(also), "source: {use: auto, with: {path: cube.npy}}")
@@ -127,20 +101,6 @@ def test_recognise_that_raises_is_logged_and_other_sources_are_tried(folder, cat
     complaint = f"recognise of the source 'sulky' of {__name__} unreleased raised LookupError: not today"
     assert caplog.messages == [complaint]
     assert complaint in message_of(folder, catalog.including(sulky), "source: {use: auto, with: {path: cube.dat}}")
-
-
-@pytest.mark.parametrize(
-    ("answer", "broken"),
-    [
-        ({}, "a dict, expected a Recognised or None"),
-        (Recognised(None, "it is odd"), "keys of type NoneType, expected a mapping"),
-        (Recognised(["path"], "it is odd"), "keys of type list, expected a mapping"),
-    ],
-)
-def test_recognise_that_returns_wrong_type_is_named(folder, catalog, answer, broken):
-    said = message_of(folder, catalog.including(toy("odd", lambda _: answer)), "source: {use: auto, with: {path: cube.dat}}")
-    complaint = f"recognise of the source 'odd' of {__name__} unreleased returned {broken}"
-    assert said.splitlines()[1:] == [f"  {complaint}"]
 
 
 def test_wrong_key_of_recognised_source_names_source_and_reason(folder, catalog):
@@ -168,13 +128,3 @@ def test_wrong_key_of_recognised_source_names_source_and_reason(folder, catalog)
 )
 def test_auto_with_wrong_path_is_an_error_at_its_place(folder, catalog, text, said):
     assert message_of(folder, catalog, text).splitlines()[-1] == said
-
-
-def test_recognised_source_without_its_library_names_the_extra(folder, catalog):
-    missing = (Requirement("no_such_library", "photonpano[heavy]"),)
-    needy = toy("needy", lambda path: Recognised({"path": path}, "it is heavy"), requires=missing)
-    said = message_of(folder, catalog.including(needy), "source: {use: auto, with: {path: cube.dat}}")
-    assert said == (
-        "scan.yaml:2:15: source.use: the source 'needy' needs no_such_library, which is not installed: pip install "
-        '"photonpano[heavy]" (in a checkout: pip install ".[heavy]") (cube.dat was recognised as needy: it is heavy)'
-    )

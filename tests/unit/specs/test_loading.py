@@ -1,8 +1,6 @@
 """What becomes of a spec: defaults, corrections and outcomes."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +9,9 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML, YAMLError
 
-from photonpano import Config, ExporterContribution, PluginError, SpecError
-from photonpano.plugins.description import snippet
+from photonpano import Config, ExporterContribution, SpecError
 from photonpano.plugins.registry import Catalog
-from photonpano.specs import builtin, json_schema, load_spec, parse_spec
+from photonpano.specs import json_schema, load_spec, parse_spec
 
 MINIMAL = {"version": 1, "source": {"use": "simulator"}}
 
@@ -62,19 +59,6 @@ def test_default_that_is_not_installed_is_left_out_unless_it_is_named(gone, sect
         assert message.startswith(problem)
 
 
-def test_default_fallback_of_two_plugins_is_an_error_unless_fallbacks_are_named(catalog):
-    twice = Catalog((*catalog.rows, catalog.find("locator", "opencv-sift")))
-    (message,) = messages(MINIMAL | {"levels": [{"locate": {"with": {"max_steps": 5}}}]}, catalog=twice)
-    assert message.startswith("locate.fallback.0: the locator 'opencv-sift' is offered by ")
-    parse_spec(MINIMAL | {"locate": {"fallback": []}}, catalog=twice)
-
-
-def test_building_an_alias_is_an_error():
-    for alias in (*builtin.photonpano_sources(), *builtin.photonpano_locators()):
-        with pytest.raises(PluginError, match=r"^this name stands for other components, "):
-            alias.build(None, None)
-
-
 @pytest.mark.parametrize(
     ("suffix", "message"),
     [
@@ -87,13 +71,6 @@ def test_exporter_refuses_suffix_that_is_no_file_of_its_own(suffix, message):
     with pytest.raises(ValueError, match="toy") as caught:
         ExporterContribution(name="toy", summary="Toy", config=Config, suffix=suffix, build=lambda *_: None)
     assert str(caught.value) == message
-
-
-def test_snippet_of_a_refiner_is_a_section_of_a_spec(catalog):
-    drift = catalog.find("refiner", "drift").contribution
-    assert snippet(drift) == "refine:\n  use: drift\n  with:\n    knots: 4  # of the spline\n"
-    plan = parse_spec(f"version: 1\nsource: {{use: simulator}}\n{snippet(drift)}", catalog=catalog)
-    assert [choice.contribution for choice in plan.refine] == [drift]
 
 
 def test_paths_count_from_the_folder_of_the_spec(catalog, tmp_path, monkeypatch):
@@ -132,13 +109,6 @@ def test_default_run_folder_follows_a_capture_that_is_chosen_by_override(catalog
     assert folder("source.with.path=night/cube.npy") == Path("runs/scan-night-cube")
     assert folder(f"source.with.path={tmp_path}/day/cube.npy") == Path("runs/scan-day-cube")
     assert folder("source.with.path=other.npy", f"output.directory={tmp_path}/mine") == Path("mine")
-
-
-def test_parse_spec_accepts_numpy_numbers_tuples_and_paths(catalog, tmp_path):
-    source = {"use": "simulator", "with": {"flux": np.float32(0.5), "n_frames": np.int64(7), "size": (3, 4)}}
-    plan = parse_spec({"version": 1, "source": source, "output": {"directory": tmp_path}}, catalog=catalog)
-    assert (plan.source.config.flux, plan.source.config.n_frames, plan.source.config.size) == (0.5, 7, (3, 4))
-    assert plan.output.directory == tmp_path
 
 
 def test_problems_of_python_data_have_no_lines(catalog):
@@ -182,39 +152,8 @@ def test_load_spec_of_other_file_is_an_error(catalog, tmp_path, monkeypatch):
     }
 
 
-def test_load_spec_of_unreadable_file_is_an_error(catalog, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("loop.yaml").symlink_to("loop.yaml")
-    with pytest.raises(SpecError, match=r"^loop\.yaml: cannot be read: "):
-        load_spec("loop.yaml", catalog=catalog)
-
-
-def test_load_spec_accepts_byte_order_mark_and_windows_line_ends(catalog, tmp_path):
-    path = tmp_path / "scan.yaml"
-    path.write_bytes(b"\xef\xbb\xbfversion: 1\r\nsource: {use: simulator}\r\nrun: {seed: x}\r\n")
-    with pytest.raises(SpecError, match=r"scan\.yaml:3:13: run\.seed"):
-        load_spec(path, catalog=catalog)
-
-
-def test_reading_specs_imports_nothing_heavy():
-    code = (
-        "import sys, photonpano.specs, photonpano.plugins.registry\n"
-        "heavy = {'cv2', 'scipy', 'skimage', 'matplotlib', 'tifffile', 'PIL', 'jinja2', 'torch'}\n"
-        "sys.exit(', '.join(sorted(heavy & sys.modules.keys())) or 0)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (result.returncode, result.stderr) == (0, "")
-
-
 def spec(*corrections: Any) -> dict[str, Any]:
     return {"version": 1, "source": {"use": "simulator"}, "corrections": list(corrections)}
-
-
-def test_correction_paths_are_relative_to_spec(catalog: Catalog, tmp_path: Path) -> None:
-    np.save(tmp_path / "bad.npy", np.zeros((2, 2), bool))
-    plan = parse_spec(spec({"mask": {"file": "bad.npy"}}), directory=tmp_path, catalog=catalog)
-    assert plan.document["corrections"] == [{"mask": {"file": str(tmp_path / "bad.npy"), "frames": None}}]
-    assert parse_spec(plan.document, catalog=catalog).corrections == plan.corrections
 
 
 def test_missing_correction_file_is_an_error_at_its_place(catalog: Catalog, tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """YAML, read into plain values with their places."""
 
-import json
 import string
 
 import pytest
@@ -89,20 +88,6 @@ def test_merged_keys_have_places_where_they_are_written():
         "b.q": 2,
         "b.q.s": 2,
     }
-
-
-keys = st.text(string.ascii_letters, min_size=1, max_size=5)
-texts = st.text("aé𐀀 1.:#-'\"\n\t", max_size=8)
-scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | texts
-documents = st.recursive(
-    scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys, inner, max_size=3), max_leaves=12
-)
-
-
-@given(documents)
-def test_yaml_reader_reads_json(document):
-    """JSON is YAML, up to whole floats such as 1e16, which are read as integers."""
-    assert read(json.dumps(document, ensure_ascii=False)).plain() == document
 
 
 @given(st.text(string.ascii_letters + string.digits + " \n:-[]{},&*!|>'\"#%@`?<", max_size=40))

@@ -22,14 +22,13 @@ from photonpano import (
     LocationError,
     NotLocated,
     Refined,
-    Requirement,
     discover,
     testing,
 )
 from photonpano.geometry import from_parameters, inverse, normalised, parameters, step_motions, translation
 from photonpano.merging import MergeRenderer
 from photonpano.testing import KnownMotion, MemorySource, SourceConformance
-from photonpano.testing.conformance import Conformance, StageConformance, models_in
+from photonpano.testing.conformance import Conformance
 from photonpano.testing.motions import REFERENCE, SHAPE, capture
 
 from .conftest import known_path
@@ -464,19 +463,3 @@ def test_check_of_all_kinds_fails(fails: Callable[..., bool], check: str, build:
 )
 def test_component_that_changes_its_arguments_is_found(fails: Callable[..., bool], kit: Any, check: str, build: Build) -> None:
     assert fails(kit, f"test_{check}", build)
-
-
-def test_check_is_skipped_if_it_does_not_apply_or_a_library_is_missing(fails: Callable[..., bool]) -> None:
-    missing = {"requires": (Requirement("no_such_library", "photonpano[none]"),)}
-    with pytest.raises(pytest.skip.Exception, match=r'toy needs no_such_library: pip install "photonpano\[none\]"'):
-        fails(testing.ResamplerConformance, "test_groups_depend_on_arguments_only", Hundreds, missing)
-    with pytest.raises(pytest.skip.Exception, match="compensates = False"):
-        fails(testing.MergerConformance, "test_merge_compensates_known_motion", merger, compensates=False)
-    with pytest.raises(pytest.skip.Exception, match=r"motions = \(\)"):
-        fails(testing.LocatorConformance, "test_unseen_pixels_have_no_influence", locator, motions=())
-    assert not fails(testing.LocatorConformance, "test_different_places_are_not_located", locator, motions=(), shape=(48, 64))
-
-
-def test_models_in_finds_nested_models() -> None:
-    assert models_in(WithOpenPart) == [WithOpenPart, Open]
-    assert issubclass(testing.MergerConformance, StageConformance)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, Located, NotLocated, Refined, testing
+from photonpano import FrameSpan, Group, NotLocated, Refined, testing
 from photonpano.geometry import translation
 
 from .strange import KINDS, NOTHING, SHAPE, Around, Outcome, around, holed, instead, require_named
@@ -195,26 +193,6 @@ def test_kit_refuses_what_a_run_refuses(
     assert fails(KITS[kind], check, build, record, config=config), (what, clause)
 
 
-def test_identity_at_a_later_level_names_locator(misbehaving: Callable[..., Outcome]) -> None:
-    """Level 1 succeeds, so the motion is known at level 2."""
-
-    def at_later_levels(found: Any, moving: Any, fixed: Any, initial: Any) -> Any:
-        return found if initial is None else Located(np.eye(3))
-
-    def plain(inner: Any) -> Any:
-        changed = around("register", at_later_levels)(inner)
-        return type("Plain", (), {"describe": inner.describe, "register": staticmethod(changed.register)})()
-
-    outcome = misbehaving("locator", plain, levels=2)
-    require_named(outcome, "locator", "broke its contract at level 2: got the identity where the motion known so far moves")
-
-
-def test_source_with_fewer_frames_than_info_says_is_an_error(misbehaving: Callable[..., Outcome]) -> None:
-    outcome = misbehaving("source", info(n_frames=400))
-    assert (outcome.code, outcome.files) == (1, [])
-    assert outcome.printed.endswith("were requested, but the capture has 160 frames (0 to 159)\n")
-
-
 @pytest.mark.parametrize(
     "moved",
     [lambda frame: translation(1e6 * frame, 0), lambda frame: translation(30 * (-1) ** frame, 0)],
@@ -229,16 +207,3 @@ def test_refiner_that_makes_the_motion_worse_is_kept_out(
     (refinement,) = outcome.record["refinements"]
     assert (refinement["use"], refinement["rounds"]) == ("strange", [])
     assert refinement["kept_out"]
-
-
-def test_double_precision_is_converted(misbehaving: Callable[..., Outcome]) -> None:
-    assert misbehaving("merger", answer("merge", flux=lambda it: it.flux.astype(float))).code == 0
-    assert misbehaving("renderer", answer("render", flux=lambda it: it.flux.astype(float))).code == 0
-
-
-def test_record_converts_numpy_and_non_finite_numbers(misbehaving: Callable[..., Outcome], tmp_path: Path) -> None:
-    """A locator that loses the first pair, with evidence of numpy types."""
-    lost = [NotLocated("shy", {"matches": np.int64(7), "score": np.float32(0.5), "ncc": np.nan, "found": np.True_})]
-    assert misbehaving("locator", around("register", lambda found, *_: lost.pop() if lost else found)).code == 0
-    (failure,) = json.loads((tmp_path / "run" / "run.json").read_text())["levels"][0]["failures"]
-    assert failure["evidence"] == {"matches": 7, "score": 0.5, "ncc": None, "found": True}

@@ -6,40 +6,13 @@ import sys
 import numpy as np
 import pytest
 
-from photonpano import Config, ExecutorContribution, FrameSpan, InputError, LocationError
+from photonpano import Config, ExecutorContribution, LocationError
 from photonpano.execution import LocalExecutor
-from photonpano.geometry import translation
-from photonpano.testing import ExecutorConformance, KnownMotion, MemorySource, Scene, photographed, recorded
-from photonpano.testing.captures import ReadOnlySource
-from photonpano.testing.conformance import fingerprint, in_threads
+from photonpano.testing import ExecutorConformance, KnownMotion, Scene, photographed, recorded
 from photonpano.testing.executors import N_FRAMES, capture
 
 SHAPE = (30, 44)
 STILL = KnownMotion(lambda _: np.eye(3))
-
-
-def test_scene_view_moved_by_whole_pixels_has_same_values():
-    scene = Scene()
-    here, there = scene.view(np.eye(3), SHAPE), scene.view(translation(3, -2), SHAPE)
-    np.testing.assert_allclose(there[2:, :-3], here[:-2, 3:], rtol=1e-9)
-
-
-def test_scene_view_is_the_flux_at_the_points_that_pixels_see():
-    points = {"affine": [[34.2, 10.6], [36.8, 10.2]], "perspective": [[34.2, 10.6], [36.8 / 1.01, 10.2 / 1.01]]}
-    for name, bend in (("affine", 0), ("perspective", 0.01)):
-        seen = Scene().view(np.array([[2.6, 0.4, 33], [-0.4, 1.8, 5.2], [bend, 0, 1]]), SHAPE)
-        np.testing.assert_allclose(seen[3, :2], Scene().flux(points[name]), rtol=1e-9)
-
-
-def test_scene_flux_spans_given_range():
-    flux = Scene(flux=(0.2, 0.7)).view(np.eye(3), (200, 200))
-    assert 0.2 < flux.min() < 0.25
-    assert 0.65 < flux.max() < 0.7
-
-
-def test_scenes_of_different_seeds_are_uncorrelated():
-    views = [Scene(seed).view(np.eye(3), (100, 100)).ravel() for seed in (0, 1)]
-    assert abs(np.corrcoef(views)[0, 1]) < 0.2
 
 
 def test_recorded_frames_follow_detection_model():
@@ -60,28 +33,6 @@ def test_photographed_exposure_has_photon_noise():
     np.testing.assert_array_equal(exposure.weight, np.where(unseen, 0, 2000))
     z = (exposure.flux - known) / np.sqrt(np.expm1(known) / 2000)
     assert np.nanstd(z) == pytest.approx(1, abs=0.1)
-
-
-@pytest.mark.parametrize("kind", [MemorySource, ReadOnlySource])
-def test_memory_source_returns_its_frames(kind):
-    frames = recorded(Scene(), STILL, 20, SHAPE)
-    with kind(frames) as source:
-        np.testing.assert_array_equal(source.frames(FrameSpan(3, 9)), frames[3:9])
-        np.testing.assert_array_equal(source.counts(FrameSpan(3, 9)), frames[3:9].sum(axis=0))
-        assert source.counts(FrameSpan(0, 1)).flags.writeable == (kind is MemorySource)
-        with pytest.raises(InputError):
-            source.counts(FrameSpan(19, 21))
-
-
-def test_fingerprint_distinguishes_bytes():
-    exposures = [photographed(np.full(SHAPE, 0.3), seed=seed) for seed in (0, 0, 1)]
-    prints = [fingerprint({"of": [exposure, np.nan]}) for exposure in exposures]
-    assert prints[0] == prints[1] != prints[2]
-    assert fingerprint(np.zeros(2)) != fingerprint(np.zeros(2, np.float32))
-
-
-def test_in_threads_runs_all_threads():
-    assert in_threads(lambda number: number) == [0, 1, 2, 3]
 
 
 class NoConfig(Config):
@@ -192,12 +143,3 @@ def test_pytest_plugin_imports_pytest_only():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     package = ["lazy_loader", "photonpano", "photonpano.testing", "photonpano.testing.pytest_plugin"]
     assert done.stdout.split() == package
-
-
-def test_package_does_not_import_pytest():
-    code = "import sys, photonpano, photonpano.testing, photonpano.api.cli; sys.exit('pytest' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_pytest_plugin_is_registered(request):
-    assert request.config.pluginmanager.has_plugin("photonpano")

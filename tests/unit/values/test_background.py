@@ -15,12 +15,6 @@ def hidden_at(*places: tuple[int, int, int]) -> Background:
     return Background(np.array([10.0, 20.0, 30.0, 40.0]), shown, np.ones_like(shown), SHAPE)
 
 
-def test_frames_are_hidden_where_an_instant_next_to_them_is() -> None:
-    background = hidden_at((1, 0, 2))
-    hidden = [bool(not background.cells(FrameSpan(frame, frame + 1))[0, 2]) for frame in (5, 12, 20, 25, 31)]
-    assert hidden == [False, True, True, True, False]
-
-
 def test_spans_are_hidden_where_any_instant_in_them_is() -> None:
     assert not hidden_at((1, 0, 2), (2, 1, 1)).cells(FrameSpan(0, 50))[[0, 1], [2, 1]].any()
 
@@ -31,8 +25,3 @@ def test_pixels_are_those_of_cells_of_8_px_and_the_last_ones_are_cut_off() -> No
     assert pixels is not None
     np.testing.assert_array_equal(np.argwhere(pixels == 0), [(y, x) for y in range(16, 20) for x in range(24, 30)])
     assert background.pixels(FrameSpan(40, 50)) is None
-
-
-def test_parts_keep_their_instants() -> None:
-    background = hidden_at((1, 0, 2))
-    assert not background.part(FrameSpan(15, 50)).cells(FrameSpan(5, 6))[0, 2]

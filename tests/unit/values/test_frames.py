@@ -7,12 +7,6 @@ from photonpano import FrameSpan, Group, InputError, StreamInfo
 from photonpano.values import true_spans
 
 
-def test_frame_span_has_length_and_centre() -> None:
-    span = FrameSpan(10, 14)
-    assert (len(span), span.centre, str(span)) == (4, 11.5, "frames 10 to 13")
-    assert FrameSpan(7, 8).centre == 7
-
-
 @pytest.mark.parametrize(("start", "stop"), [(-1, 3), (3, 3), (4, 3)])
 def test_frame_span_refuses_empty_range(start: int, stop: int) -> None:
     with pytest.raises(ValueError, match=rf"0 <= start < stop, got \[{start}, {stop}\)"):
@@ -40,17 +34,6 @@ def test_stream_info_require_refuses_frames_beyond_the_end() -> None:
     with pytest.raises(InputError) as caught:
         stream.require(FrameSpan(90, 101))
     assert str(caught.value) == "frames 90 to 100 were requested, but the capture has 100 frames (0 to 99)"
-
-
-def test_spread_covers_the_whole_capture() -> None:
-    stream = StreamInfo(1000, 4, 6, None)
-    assert stream.spread(3, 10) == [FrameSpan(0, 10), FrameSpan(495, 505), FrameSpan(990, 1000)]
-    assert stream.spread(100, 10) == [stream.span]
-
-
-def test_blocks_cover_the_span() -> None:
-    assert FrameSpan(10, 17).blocks(3) == [FrameSpan(10, 13), FrameSpan(13, 16), FrameSpan(16, 17)]
-    assert FrameSpan(10, 17).blocks(100) == [FrameSpan(10, 17)]
 
 
 @pytest.mark.parametrize("value", [FrameSpan(0, 1), Group(FrameSpan(0, 1), 0), StreamInfo(1, 1, 1, None)])

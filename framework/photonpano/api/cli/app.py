@@ -31,7 +31,7 @@ _COMMANDS = {
     "clean": ("run_folders", "Remove what killed processes have left."),
     "convert": ("copies", "Convert binary frames to a packed .npy file or a zarr array."),
     "dark": ("copies", "Measure dark counts and hot pixels, with the lens covered."),
-    "explain": ("looks", "Print a spec with all defaults, explained in comments."),
+    "explain": ("specs", "Print a spec with all defaults, explained in comments."),
     "preview": ("looks", "Merge frames into pictures, to look at a capture."),
     "schema": ("specs", "Print the JSON Schema of specs, for editors."),
     "simulate": ("simulated", "Write a simulated capture with its truth to a packed .npy file."),

@@ -6,26 +6,34 @@ Each record is a pickle with a digest, in a file of its own that is written whol
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import json
 import logging
 import os
 import pickle
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+import photonpano
 from photonpano.errors import InputError, OutputError, PhotonpanoError
 from photonpano.execution.context import Checkpoints, KeepNothing, Progress
 from photonpano.files.folders import atomic_path
-from photonpano.pipeline.checkpoints.fingerprint import Fingerprint, differences
+from photonpano.pipeline.components import scale_of
+from photonpano.record.contents import changed_files, changes
+from photonpano.record.run_json import library_versions, plugin_records, read_record
+from photonpano.record.schema import CaptureRecord, RunRecord
+from photonpano.specs.plan import Choice, Plan
 from photonpano.text import byte_size, counted
-from photonpano.values import Decision
+from photonpano.values import Decision, Journal
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +48,8 @@ _DIGEST_BYTES = hashlib.sha256().digest_size  # a record begins with the SHA-256
 _SPARE = 8  # free space, in sizes of a record, that must remain for the results
 FLUSH_S = 5.0  # time between writes of a log: a kill loses at most this much work
 _END = "end"
+Fingerprint = dict[str, Any]
+_STAGES = ("resample", "merge", "locate", "interpolate")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +65,10 @@ class Continuation:
 class Work:
     """The work of a run; its `checkpoints` keep what the run finds."""
 
-    def __init__(self, folder: Path | None, now: Fingerprint, decisions: list[Decision], keep: bool) -> None:
+    def __init__(self, folder: Path | None, now: Fingerprint, keep: bool) -> None:
         self._folder, self._now, self._keep = folder, now, keep
         self._store = None if folder is None else Store(folder)
-        self._kept = None if self._store is None else Kept(self._store, decisions)
+        self._kept = None if self._store is None else Kept(self._store)
         self.checkpoints: Checkpoints = self._kept or KeepNothing()
         self._finished = False
 
@@ -94,9 +104,7 @@ def path_of(run_folder: Path) -> Path:
 
 
 @contextmanager
-def work_folder(
-    run_folder: Path, now: Fingerprint, decisions: list[Decision], how: Continuation, progress: Progress
-) -> Iterator[Work]:
+def work_folder(run_folder: Path, now: Fingerprint, how: Continuation, progress: Progress) -> Iterator[Work]:
     """Open the work folder of a run, whose lock is held; `InputError` if levels before `how.from_level` cannot be taken.
 
     What it holds stays after an interruption or an error. Where nothing can be kept, a warning says so, and the run goes on.
@@ -105,13 +113,13 @@ def work_folder(
     _require_levels(folder, now, how.from_level)
     try:
         _prepare(folder, now, how, progress)
-        work = Work(folder, now, decisions, how.keep or how.from_level is not None)
+        work = Work(folder, now, how.keep or how.from_level is not None)
     except (OutputError, OSError) as error:
         reason = error.strerror or error if isinstance(error, OSError) else error
         logger.warning(
             "%s: what the run finds cannot be kept (%s); if it is interrupted, all of it is computed again", folder, reason
         )
-        work = Work(None, now, decisions, keep=False)
+        work = Work(None, now, keep=False)
     try:
         yield work
     except BaseException as error:
@@ -288,38 +296,36 @@ class Store:
 class Kept:
     """Checkpoints in a store: see `photonpano.execution.context.Checkpoints`.
 
-    Decisions that components take while they work are kept with the results, and taken again when these are found.
+    Decisions of components are kept with the results that they were taken for, and taken again when these are found.
     """
 
-    def __init__(
-        self, store: Store, decisions: list[Decision], given: tuple[Any, ...] = (), logs: list[KeptLog] | None = None
-    ) -> None:
+    def __init__(self, store: Store, given: tuple[Any, ...] = (), logs: list[KeptLog] | None = None) -> None:
         """Open the checkpoints of a run; all results depend on `given`, beside what the whole store is for."""
-        self._store, self._decisions, self._given = store, decisions, given
+        self._store, self._given = store, given
         self._logs: list[KeptLog] = [] if logs is None else logs
 
-    def once(self, step: str, compute: Callable[[], ResultT], *given: Any) -> ResultT:
+    def once(self, step: str, compute: Callable[[], ResultT], *given: Any, decisions: Journal | None = None) -> ResultT:
         """See `photonpano.execution.context.Checkpoints`."""
-        name = self._name(step, given)
+        name, decisions = self._name(step, given), [] if decisions is None else decisions
         if (found := self._store.load(name)) is not None:
             kept: ResultT
-            kept, decisions = found
-            self._decisions += decisions
+            kept, taken = found
+            decisions += taken
             return kept
-        before = len(self._decisions)
+        before = len(decisions)
         result = compute()
-        self._store.save(name, (result, self._decisions[before:]))
+        self._store.save(name, (result, decisions[before:]))
         return result
 
-    def log(self, step: str, *given: Any) -> KeptLog:
+    def log(self, step: str, *given: Any, decisions: Journal | None = None) -> KeptLog:
         """See `photonpano.execution.context.Checkpoints`."""
-        log = KeptLog(self._store, self._name(step, given), self._decisions)
+        log = KeptLog(self._store, self._name(step, given), [] if decisions is None else decisions)
         self._logs.append(log)
         return log
 
     def within(self, *given: Any) -> Kept:
         """See `photonpano.execution.context.Checkpoints`."""
-        return Kept(self._store, self._decisions, (*self._given, *given), self._logs)
+        return Kept(self._store, (*self._given, *given), self._logs)
 
     def flush(self) -> None:
         """Write what the logs have not written yet."""
@@ -333,7 +339,7 @@ class Kept:
 class KeptLog:
     """Results of a step with many of them, in files of what was found within some seconds: see `context.Log`."""
 
-    def __init__(self, store: Store, name: str, decisions: list[Decision]) -> None:
+    def __init__(self, store: Store, name: str, decisions: Journal) -> None:
         self._store, self._name, self._decisions = store, name, decisions
         self._restored: list[Decision] = []
         self._first_decision = len(decisions)
@@ -407,3 +413,138 @@ def _parts(value: Any) -> Iterator[bytes]:
             yield from _parts(item)
     else:
         yield f"{value!r} ".encode()
+
+
+def run_fingerprint(plan: Plan, capture: CaptureRecord, frame_shape: tuple[int, int]) -> Fingerprint:
+    """Return what the results of a run depend on, as plain data; neither the threads nor the run folder.
+
+    Returns:
+        `versions`, `code` and `capture`, on which everything depends; `common`, the parts of the spec on which it does;
+            `levels`, a list; and `rest`, what only the steps after the last level depend on.
+    """
+    document = plan.document
+    rest = {
+        "refine": [_component(choice) for choice in plan.refine],
+        "render": {**document["render"], **_component(plan.renderer), "code": _code([plan.renderer])},
+        "memory": int(plan.run.memory),
+        "formats": [{**_component(choice), "code": _code([choice])} for choice in plan.formats],
+    }
+    found = {
+        "versions": {"photonpano": importlib.metadata.version("photonpano"), **library_versions(plan)},
+        "code": _code([plan.source], photonpano),
+        "capture": capture,
+        "common": {
+            "source": _component(plan.source),
+            "corrections": document.get("corrections"),
+            **{section: document[section] for section in ("motion", "camera", "light", "graph")},
+            "run.seed": plan.run.seed,
+            "render.reference": document["render"]["reference"],
+        },
+        "levels": [_level(plan, number, frame_shape) for number in range(1, len(plan.levels) + 1)],
+        "rest": rest,
+    }
+    as_read: Fingerprint = json.loads(json.dumps(found))
+    return as_read
+
+
+def differences(before: Fingerprint, now: Fingerprint, levels: int | None = None) -> list[str]:
+    """Return what differs between two fingerprints, a clause each; with `levels`, only what these levels depend on."""
+    found = [
+        f"the version of {path} was {old} and is {new}" for path, old, new in _changed(before["versions"], now["versions"])
+    ]
+    found += [f"the code of {path} has changed" for path, _, _ in _changed(before["code"], now["code"])]
+    found += changes(before["capture"], now["capture"])
+    found += _settings(before["common"], now["common"])
+    if levels is None and len(before["levels"]) != len(now["levels"]):
+        found.append(f"there were {len(before['levels'])} levels and are {len(now['levels'])}")
+    for number, (old, new) in enumerate(zip(before["levels"][:levels], now["levels"][:levels], strict=False), start=1):
+        found += _settings(old, new, f" at level {number}")
+    return found if levels is not None else found + _settings(before["rest"], now["rest"])
+
+
+def finished_run(plan: Plan, capture: CaptureRecord) -> RunRecord | None:
+    """Return the record in the run folder of a plan, if it is of this spec, capture and software, and unchanged."""
+    try:
+        record = read_record(plan.output.directory)
+        same = (
+            record["photonpano"] == importlib.metadata.version("photonpano")
+            and record["libraries"] == library_versions(plan)
+            and record["plugins"] == plugin_records(plan)
+            and _without_machine(record["spec"]) == _without_machine(plan.document)
+            and not changes(record["capture"], capture)
+            and all((plan.output.directory / name).exists() for name in record["files"])
+            and not changed_files(plan.output.directory)
+            and (plan.output.keep is None or record["spec"]["output"].get("keep") == plan.output.keep)
+        )
+        return record if same and record["verdict"] is not None else None
+    except (InputError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def _without_machine(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a spec as plain data, without what results do not depend on: the run folder, threads, and executor."""
+    run = {key: value for key, value in document["run"].items() if key not in ("threads", "executor")}
+    plain: dict[str, Any] = json.loads(json.dumps({**document, "run": run}))
+    plain.pop("output", None)
+    return plain
+
+
+def _level(plan: Plan, number: int, frame_shape: tuple[int, int]) -> dict[str, Any]:
+    level = plan.levels[number - 1]
+    choices = {stage: getattr(level, stage) for stage in _STAGES}
+    return {
+        "scale": scale_of(plan, number, frame_shape),
+        **{stage: _component(choice) for stage, choice in choices.items()},
+        "fallback": [_component(choice) for choice in level.fallbacks],
+        "code": _code([*choices.values(), *level.fallbacks]),
+    }
+
+
+def _component(choice: Choice) -> dict[str, Any]:
+    return {
+        "use": choice.contribution.name,
+        "plugin": f"{choice.origin.plugin} {choice.origin.version}",
+        "with": choice.config.model_dump(mode="json"),
+    }
+
+
+def _code(choices: Sequence[Choice], *packages: Any) -> dict[str, str]:
+    """Return hashes of the Python files of plugins, by package: while its author works on a plugin, its version stays."""
+    built_by = (sys.modules.get(choice.contribution.build.__module__.partition(".")[0]) for choice in choices)
+    return {
+        module.__name__: _hash_of(module.__file__) for module in (*packages, *built_by) if getattr(module, "__file__", None)
+    }
+
+
+@cache
+def _hash_of(file: str) -> str:
+    """Hash a module; of a package, all its Python files."""
+    path, found = Path(file), hashlib.blake2b(digest_size=16)
+    files = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
+    for each in files:
+        found.update(f"{each.relative_to(path.parent)}\0".encode())
+        found.update(hashlib.sha256(each.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def _settings(before: Any, now: Any, where: str = "") -> list[str]:
+    return [
+        f"the code of {path.removeprefix('code.')} has changed"
+        if path.startswith("code.")
+        else f"{path} was {_short(old)} and is {_short(new)}{where}"
+        for path, old, new in _changed(before, now)
+    ]
+
+
+def _changed(before: Any, now: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield the places where two values of plain data differ, with both values; None stands for nothing."""
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for key in dict.fromkeys([*before, *now]):
+            yield from _changed(before.get(key), now.get(key), f"{path}.{key}" if path else key)
+    elif before != now:
+        yield path, before, now
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,19 +1,18 @@
 """Jobs of a batch: one in this process, and those in processes of their own, however they end."""
 
 import importlib
-import logging
 import pickle
 import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import BatchRow, Location, LocationError, Reason, Url, Verdict
+from photonpano import BatchRow, Location
 from photonpano.api import batch_running as running
 from photonpano.api.batch_jobs import Job, SpecText, capture_override
 from photonpano.api.batch_running import rows_of, run_job
@@ -102,18 +101,6 @@ def test_run_is_scored_and_not_repeated(job_of: Callable[[Location], Job], scan:
     assert (again.was_finished, again.true_error_px, again.seconds) == (True, row.true_error_px, row.seconds)
 
 
-def test_capture_at_a_url_is_run_without_a_score(
-    job_of: Callable[[Location], Job], scan: Path, file_server: Callable[..., Any]
-) -> None:
-    with file_server(scan.parent) as server:
-        job = job_of(Url(f"{server.address}/{scan.name}?key=secret"))
-        row = run_job(job)
-        assert (row.status, row.n_frames, row.true_error_px) == ("done", 200, None), row.reason
-        assert run_job(job).was_finished
-    assert str(row.capture) == f"{server.address}/{scan.name}"
-    assert "secret" not in (row.directory / "run.json").read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -140,25 +127,6 @@ def test_capture_that_cannot_be_used_says_why(
     assert not row.directory.exists()
 
 
-def test_run_that_is_not_located_has_a_page(job_of: Callable[[Location], Job], tmp_path: Path) -> None:
-    noise = np.random.default_rng(0).random((200, 64, 96)) < 0.01
-    np.save(tmp_path / "cube.npy", np.packbits(noise, axis=-1))
-    row = run_job(job_of(tmp_path / "cube.npy"))
-    assert (row.status, row.report) == ("failed", tmp_path / "out" / "cube.failed.html")
-    assert "could be located" in row.reason
-    assert row.report.exists()
-
-
-def test_error_and_warnings_of_a_run_are_its_reason(
-    job_of: Callable[[Location], Job], found: Callable[[Any], None], small_capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found(LocationError("none of the pairs could be located"))
-    logger = logging.getLogger("photonpano.pipeline")
-    plan = SpecText.plan
-    monkeypatch.setattr(SpecText, "plan", lambda *arguments: (logger.warning("odd pixels"), plan(*arguments))[1])
-    assert run_job(job_of(small_capture)).reason == "none of the pairs could be located\nwarning: odd pixels"
-
-
 def test_run_without_a_usable_truth_is_done(
     job_of: Callable[[Location], Job], small_capture: Path, small_run: RunResult, found: Callable[[Any], None], tmp_path: Path
 ) -> None:
@@ -172,30 +140,11 @@ def test_run_without_a_usable_truth_is_done(
     assert row.reason.splitlines()[-1].startswith("no score: ")
 
 
-def test_poses_have_doubts_and_errors_of_positions(
-    job_of: Callable[[Location], Job],
-    small_capture: Path,
-    small_run: RunResult,
-    found: Callable[[Any], None],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    verdict = Verdict.of([Reason("the path is straight", 2, 1, "", "turn")], None)
-    found(RunResult(Path("nowhere"), small_run.record | {"poses": {"std_position": 0.01}, "motion": None}, verdict))
-    monkeypatch.setattr(running, "evaluate_poses", lambda *_: SimpleNamespace(ate_share=0.02))
-    row = run_job(job_of(small_capture))
-    assert (row.verdict, row.reason) == ("doubtful", "the path is straight: 2, trusted up to 1; turn")
-    assert (row.expected_position_error, row.true_position_error) == (0.01, 0.02)
-    assert (row.expected_error_px, row.true_error_px, row.thumbnail) == (None, None, None)
-
-
 def test_each_way_to_end_is_a_row(odd: ModuleType, tmp_path: Path) -> None:
     ways = {
         "os.kill(os.getpid(), signal.SIGKILL)": r"the run was killed \(SIGKILL\), as the system does when memory runs out; .*",
-        "os.abort()": r"the run crashed \(SIGABRT\): printed by a library; a library or a plugin is to blame, .*",
         "os._exit(3)": r"the run ended with the exit code 3: printed by a library; .*",
-        "raise KeyboardInterrupt": r"the run crashed \(SIGINT\): KeyboardInterrupt; .*",
         "raise ValueError('odd')": r"ValueError: odd \(a defect of photonpano or of a plugin\)",
-        "raise MemoryError": r"there is not enough memory; lower run\.memory, or the number of jobs",
         "": r"1:1: source\.use: required: .*",
     }
     changes = list(rows_of([odd.job(way, tmp_path) for way in ways], 1))

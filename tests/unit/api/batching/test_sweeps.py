@@ -1,7 +1,6 @@
 """The captures, the settings and the summary of a batch."""
 
 import csv
-import io
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import BatchRow, InputError, OutputError, SpecError, discover
+from photonpano import BatchRow, InputError, SpecError, discover
 from photonpano.api.batch import Batch, prepare_batch
-from photonpano.api.batch_jobs import combinations, find_captures, folder_name
-from photonpano.api.batch_running import require_own, write_summary
+from photonpano.api.batch_jobs import find_captures, folder_name
+from photonpano.api.batch_running import write_summary
 
 Find = Callable[..., dict[str, Path]]
 
@@ -64,27 +63,6 @@ def find(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Find:
 def test_captures_are_named_after_their_files(find: Find, given: list[str], named: dict[str, str]) -> None:
     assert {name: str(path) for name, path in find(*given).items()} == named
     assert list(find(*given)) == list(named)
-
-
-def test_folders_by_dots_hidden_files_and_names_like_patterns_are_found(find: Find) -> None:
-    Path("bins/frames").mkdir()
-    Path("day/.c.npy").touch()
-    assert list(find("bins/frames/..")) == ["bins"]
-    assert list(find("day/*.npy")) == ["a", "b"], "hidden files match no pattern"
-    Path("night/[ab].npy").touch()
-    assert list(find("night/[ab].npy")) == ["[ab]"]
-    Path("day").rename("day [1]")
-    Path("day [1]/list.txt").write_text("*.npy\n", encoding="utf-8")
-    assert list(find(lists=("day [1]/list.txt",))) == ["a", "b"]
-
-
-def test_list_counts_from_its_folder_and_one_on_standard_input_from_the_current_one(
-    find: Find, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Path("day/list.txt").write_text("# of Monday\n\n  a.npy  \n../night/*.npy\n", encoding="utf-8-sig")
-    assert find(lists=("day/list.txt",)) == {"a": Path("day/a.npy"), "c": Path("day/../night/c.npy")}
-    monkeypatch.setattr("sys.stdin", io.StringIO("day/a.npy\n"))
-    assert find(lists=("-",)) == {"a": Path("day/a.npy")}
 
 
 def test_all_problems_come_at_once(find: Find) -> None:
@@ -147,25 +125,6 @@ def test_every_combination_has_a_folder_of_its_own(prepare: Callable[..., Batch]
     ]
 
 
-@pytest.mark.parametrize(
-    ("changes", "swept", "common", "keys"),
-    [
-        (["camera.centre_px=[3, 4]"], [], ["camera.centre_px=[3, 4]"], {}),
-        (["refine=[]"], [], ["refine=[]"], {}),
-        (["locate.use=[direct, opencv-sift]"], [], [], {"locate.use": ["direct", "opencv-sift"]}),
-        ([], ["camera.centre_px=[3, 4],[5, 6]"], [], {"camera.centre_px": [[3, 4], [5, 6]]}),
-        ([], ["run.seed=[1, 2, 1]"], [], {"run.seed": [1, 2]}),
-        ([], ["levels=[{}],[{}, {scale: 1}]"], [], {"levels": [[{}], [{}, {"scale": 1}]]}),
-    ],
-)
-def test_list_sweeps_keys_that_take_none(
-    prepare: Callable[..., Batch], changes: list[str], swept: list[str], common: list[str], keys: dict[str, list[Any]]
-) -> None:
-    batch = prepare(changes=changes, swept=swept)
-    assert list(batch.common) == common
-    assert [dict(row.settings) for row in batch.rows if row.name == "cube"] == combinations(keys)
-
-
 def test_all_problems_come_before_anything_runs(prepare: Callable[..., Batch]) -> None:
     with pytest.raises(SpecError) as caught:
         prepare(changes=["run.sed=1"], swept=["resample.with.gruop_size=20,25", "levels=2,9", "run.seed=0,-1"])
@@ -202,16 +161,6 @@ def test_wrong_settings_are_refused(prepare: Callable[..., Batch], changes: list
         prepare(changes=changes, swept=swept)
     [problem] = problems(caught)
     assert problem.startswith(message)
-
-
-def test_source_without_a_file_is_refused(prepare: Callable[..., Batch]) -> None:
-    with pytest.raises(SpecError, match=r"source\.use: this source reads no file or folder"):
-        prepare({"version": 1, "source": {"use": "simulator"}})
-
-
-def test_spec_with_poses_can_be_prepared(prepare: Callable[..., Batch]) -> None:
-    pytest.importorskip("pycolmap")
-    assert len(prepare({"version": 1, "source": {"use": "auto"}, "pose": {"use": "colmap-averages"}}).rows) == 2
 
 
 def test_names_of_folders_are_safe_and_differ() -> None:
@@ -283,16 +232,6 @@ def test_every_status_is_a_row(tmp_path: Path) -> None:
     assert "<code>run.seed=1</code>" in page
 
 
-def test_poses_have_errors_of_positions(tmp_path: Path) -> None:
-    found = {"expected_error_px": None, "true_error_px": None, "psnr_db": None, "thumbnail": None}
-    rows = [row("room", tmp_path, **DONE | found | {"expected_position_error": 0.0123, "true_position_error": 0.02})]
-    table, page = summary(tmp_path, rows)
-    assert (table[0]["expected_position_error"], table[0]["expected_error_px"]) == ("0.0123", "")
-    assert "1.23 %" in page
-    assert "PSNR" not in page
-    assert "in per cent of the length of the path" in page
-
-
 @pytest.mark.parametrize(("n_captures", "thin", "legend"), [(2, 0, ["scan-0", "scan-1"]), (6, 2 * 6, ["median"])])
 def test_sweep_is_drawn_over_its_values(tmp_path: Path, n_captures: int, thin: int, legend: list[str]) -> None:
     key = "resample.with.group_size"
@@ -322,27 +261,3 @@ def test_runs_of_a_capture_are_ranked_by_how_well_they_explain_the_photons(tmp_p
         (name, size) for name in "ba" for size in ("100", "25", "50", "200")
     ]
     assert "ranked: trusted before doubtful, then by chi-square" in page
-
-
-def test_values_that_are_no_numbers_are_named_and_a_sweep_without_results_has_no_figure(tmp_path: Path) -> None:
-    key = "locate.use"
-    rows = [row("scan", tmp_path, {key: name}, **DONE) for name in ("direct", "opencv-sift")]
-    page = summary(tmp_path, rows, (key,))[1]
-    assert ">direct</text>" in page
-    assert ">opencv-sift</text>" in page
-    assert "<svg" not in summary(tmp_path, [row("scan", tmp_path, {"run.seed": 1})], ("run.seed",))[1]
-
-
-def test_summary_of_something_else_is_not_replaced(tmp_path: Path) -> None:
-    require_own(tmp_path)
-    summary(tmp_path, [row("good", tmp_path, **DONE)])
-    require_own(tmp_path)
-    (tmp_path / "summary.csv").write_text("month,sum\n", encoding="utf-8")
-    with pytest.raises(OutputError, match=r"summary\.csv is no summary of a batch, and would be replaced"):
-        require_own(tmp_path)
-
-
-def test_name_that_is_not_unicode_is_written(tmp_path: Path) -> None:
-    table, page = summary(tmp_path, [row("caf\udce9", tmp_path, **DONE)])
-    assert table[0]["name"] == "caf\\udce9"
-    assert "caf\\udce9" in page

@@ -14,12 +14,9 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from ruamel.yaml import YAML
 
-from photonpano.photometry import srgb_to_linear
-from photonpano.specs import load_spec, parse_spec
+from photonpano.specs import parse_spec
 from photonpano.values import Reason
-from photonpano_simulator.travel import read_truth, sharp_view
 
 SPEC = "version: 1\nsource: {use: packed-npy, with: {path: covered.npy}}\n"
 
@@ -47,17 +44,6 @@ def test_info_group_size_is_that_of_run(cube: Path, invoke: Callable[..., Any]) 
         ),
         "group_size": (facts["group_size"], facts["group_size_reason"]),
     }
-
-
-def test_info_finds_hot_and_saturated_pixels(folder: Path, invoke: Callable[..., Any]) -> None:
-    rng = np.random.default_rng(0)
-    frames = rng.random((600, 64, 64)) < 0.1
-    frames[:, rng.random((64, 64)) < 0.02] = True
-    frames[:, :8] = True
-    np.save(folder / "cube.npy", np.packbits(frames, axis=-1))
-    facts = json.loads(invoke("info", "cube.npy", "--json").stdout)
-    assert facts["hot_share"] == pytest.approx(0.02 * 7 / 8, abs=0.006)
-    assert facts["saturated_share"] == pytest.approx(frames.all(axis=0).mean())
 
 
 def test_dark_counts_and_masks_are_those_of_the_camera(folder: Path, invoke: Callable[..., Any]) -> None:
@@ -90,27 +76,6 @@ def test_preview_writes_pictures_and_films(invoke: Callable[..., Any]) -> None:
         assert (film.n_frames, film.size) == (10, (160, 96))
 
 
-def test_simulate_prints_files_and_spec_section(finished: Path) -> None:
-    assert (finished / "simulate.err").read_text() == ""
-    size = (finished / "cube.truth.npz").stat().st_size
-    assert (finished / "simulate.out").read_text() == (
-        "cube.npy        384.1 kB  200 binary frames of 96x160 at 96,800 Hz\n"
-        f"cube.truth.npz  {size / 1000:.1f} kB  the truth: motion and scene\n"
-        "\n"
-        "In a spec in this folder:\n"
-        "\n"
-        "source: {use: packed-npy, with: {path: cube.npy, frame_rate_hz: 96800}}\n"
-        "\n"
-        "To score a run of it: photonpano evaluate RUN --truth cube.truth.npz\n"
-    )
-
-
-def test_simulate_prints_valid_spec_section(finished: Path) -> None:
-    line = next(line for line in (finished / "simulate.out").read_text().splitlines() if line.startswith("source:"))
-    plan = parse_spec(f"version: 1\n{line}\n", directory=finished)
-    assert plan.source.contribution.name == "packed-npy"
-
-
 def test_run_prints_only_verdict_paths_and_warnings_into_pipe(finished: Path) -> None:
     record = json.loads((finished / "run" / "run.json").read_text())
     refined = [line for line in (finished / "run.out").read_text().splitlines(keepends=True) if line.startswith("refined ")]
@@ -127,11 +92,6 @@ def test_run_prints_only_verdict_paths_and_warnings_into_pipe(finished: Path) ->
     warnings = [f"warning: {warning}\n" for warning in record["warnings"]]
     lines = (finished / "run.err").read_text().splitlines(keepends=True)
     assert [line for line in lines if " after " not in line] == [*reasons, *warnings]  # a slow machine has lines of progress
-
-
-def test_check_run_agrees_with_run(finished: Path, invoke: Callable[..., Any]) -> None:
-    result = invoke("check-run", finished / "run")
-    assert result.stdout.splitlines()[0] == (finished / "run.out").read_text().splitlines()[0]
 
 
 def test_evaluate_table_agrees_with_json(finished: Path, invoke: Callable[..., Any]) -> None:
@@ -154,80 +114,6 @@ def test_evaluate_table_agrees_with_json(finished: Path, invoke: Callable[..., A
         "PSNR below the oracle": f"{scores['below_oracle_db']:.2f} dB",
     }
     assert scores["corner_error_px"]["mean"] < 1
-
-
-def test_schema_is_printed_or_written(folder: Path, invoke: Callable[..., Any]) -> None:
-    printed = json.loads(invoke("schema").stdout)
-    assert {"version", "source", "levels"} <= set(printed["properties"])
-    assert invoke("schema", "--output", "schema.json").stdout == "schema.json\n"
-    assert json.loads((folder / "schema.json").read_text()) == printed
-
-
-@pytest.mark.parametrize(
-    "changes", [["levels=until-converged"], ["resample.with.group_size=auto"], ["levels=[{scale: 0.5}, {}]", "run.seed=3"]]
-)
-def test_explanation_is_the_same_spec(folder: Path, invoke: Callable[..., Any], changes: list[str]) -> None:
-    printed = invoke("explain", "capture.yaml", *(word for change in changes for word in ("--set", change))).stdout
-    assert YAML(typ="safe").load(printed) == parse_spec(printed).document == load_spec("capture.yaml", changes).document
-
-
-def test_printed_sections_are_parts_of_specs(finished: Path, invoke: Callable[..., Any]) -> None:
-    snippet = invoke("plugins", "show", "packed-npy").stdout.split("\n\n")[-1].replace('"<path>"', "cube.npy")
-    spec = invoke("info", finished / "cube.npy").stdout.partition("start from:\n")[2]
-    for text in (f"version: 1\n{snippet}", spec):
-        assert parse_spec(text, directory=finished).source.contribution.name == "packed-npy"
-
-
-TRAVEL = """
-version: 1
-source:
-  use: travel-simulator
-  with: {scene: {kind: planes}, n_frames: 25, frame_shape: [24, 32], focal_px: 25, sensor: {dark_rate: 0.3}}
-"""
-
-
-@pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    Path("depth.yaml").write_text(TRAVEL)
-    return tmp_path
-
-
-def test_sharp_frames_are_views_without_noise(here: Path, invoke: Callable[..., Any]) -> None:
-    done = invoke("simulate", "depth.yaml", "-o", "cube.npy", "--sharp-every", "10")
-    assert done.exit_code == 0, done.output
-    assert [file.name for file in sorted(Path("cube.sharp").iterdir())] == [f"frame_0000{n}.png" for n in ("00", "10", "20")]
-    lines = done.stdout.splitlines()
-    assert lines[2].startswith("cube.sharp ")
-    assert lines[2].endswith("3 frames without noise")
-    assert lines[-1] == "To score a run with `pose` of it: photonpano evaluate RUN --truth cube.truth.npz"
-    truth = read_truth("cube.truth.npz")
-    levels = np.stack([cv2.imread(f"cube.sharp/frame_0000{n}.png", cv2.IMREAD_UNCHANGED) for n in (10, 20)])
-    flux = np.stack([sharp_view(truth, n) for n in (10, 20)])
-    assert levels.dtype == np.uint8
-    unsaturated = levels < 255
-    shown = srgb_to_linear((levels[unsaturated] / 255).astype(np.float32))
-    white = np.median(flux[unsaturated] / shown)
-    np.testing.assert_allclose(shown * white, flux[unsaturated], atol=0.012 * white)
-
-
-@pytest.mark.parametrize("steps", [("out.npy",), ("out.zarr", "out.npy"), ("out.zarr --compress", "out.npy")], ids=" ".join)
-def test_convert_copies_bits(cube: Path, invoke: Callable[..., Any], steps: tuple[str, ...]) -> None:
-    if "--compress" in steps[0]:
-        pytest.importorskip("numcodecs", reason="compression needs photonpano[zarr]")
-    for source, words in zip(("cube.npy", "out.zarr"), steps, strict=False):
-        assert invoke("convert", source, *words.split()).exit_code == 0
-    assert (cube.parent / "out.npy").read_bytes() == cube.read_bytes()
-
-
-def test_convert_applies_corrections_of_option(cube: Path, invoke: Callable[..., Any]) -> None:
-    assert (
-        invoke("convert", "cube.npy", "out.npy", "--correct", "{crop: {columns: [0, 43]}}", "--correct", "flip-lr").exit_code
-        == 0
-    )
-    frames = np.unpackbits(np.load(cube), axis=-1)
-    found = np.unpackbits(np.load(cube.parent / "out.npy"), axis=-1, count=43)
-    np.testing.assert_array_equal(found, frames[:, :, 42::-1])
 
 
 SLOWLY = """
@@ -269,24 +155,6 @@ def test_convert_continues_after_interrupt(cube: Path, invoke: Callable[..., Any
     assert result.stderr == f"out.npy.part holds {there} frames of this capture: continuing from there\n"
     assert (cube.parent / "out.npy").read_bytes() == cube.read_bytes()
     assert not part.exists()
-
-
-def test_convert_leaves_no_truth_of_another_capture(cube: Path, invoke: Callable[..., Any]) -> None:
-    (truth := cube.with_name("out.truth.npz")).write_bytes(b"that of another one")
-    assert invoke("convert", "cube.npy", "out.npy").stderr == (
-        "error: out.truth.npz is there already; choose another name, or replace it with --overwrite\n"
-    )
-    assert invoke("convert", "cube.npy", "out.npy", "--overwrite").stderr == (
-        "error: out.truth.npz is the truth of the capture that out.npy would replace; move it away, or choose another name\n"
-    )
-    assert truth.read_bytes() == b"that of another one"
-
-
-def test_convert_keeps_the_truth_that_both_share(cube: Path, invoke: Callable[..., Any]) -> None:
-    (truth := cube.with_name("cube.truth.npz")).touch()
-    assert invoke("convert", "cube.npy", "cube.zarr", "--with", "frame_rate_hz=96800").exit_code == 0
-    assert truth.exists()
-    truth.unlink()
 
 
 def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any]) -> None:

@@ -1,7 +1,5 @@
 """Help, options, progress, verbosity and completion."""
 
-import errno
-import importlib.util
 import io
 import logging
 import os
@@ -9,23 +7,16 @@ import re
 import shlex
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
-import photonpano
-from photonpano.api.cli import progress
 from photonpano.api.cli.app import commands
 from photonpano.api.cli.progress import Bars, Lines, progress_for_stderr
-from photonpano.api.cli.signatures import capture_plan
 from photonpano.api.cli.verbosity import is_quiet, is_verbose
-from photonpano.api.command import WrongArgumentError
-from photonpano.errors import SpecError
 from photonpano.execution.context import Quiet
 
 HEAVY = {"numpy", "pydantic", "cv2", "scipy", "skimage", "matplotlib", "rich", "photonpano_core", "photonpano_opencv"}
@@ -69,52 +60,10 @@ def test_help_explains_every_option_and_its_example_parses(name: str, invoke: Ca
         pass
 
 
-def test_short_help_is_not_cut(invoke: Callable[..., Any]) -> None:
-    assert "..." not in invoke("--help").stdout.replace("[ARGS]...", "")
-    assert "..." not in invoke("plugins", "--help").stdout.replace("[ARGS]...", "")
-
-
-def test_version_is_printed(invoke: Callable[..., Any]) -> None:
-    assert invoke("--version").stdout == f"photonpano {photonpano.__version__}\n"
-
-
 @pytest.fixture
 def cube(folder: Path) -> Path:
     np.save(folder / "cube.npy", np.zeros((20, 8, 2), np.uint8))
     return folder / "cube.npy"
-
-
-def test_capture_plan_resolves_path_from_current_folder(cube: Path) -> None:
-    with capture_plan(Path("cube.npy")) as plan:
-        pass
-    assert (plan.source.contribution.name, plan.source.config.path) == ("packed-npy", cube)
-
-
-def test_capture_plan_reads_option_values_as_yaml(cube: Path) -> None:
-    corrections = ["rot90", "{crop: {rows: [2, null]}}"]
-    with capture_plan(Path("cube.npy"), "packed-npy", ["frame_rate_hz=1e3", "width=13"], corrections) as plan:
-        pass
-    assert (plan.source.config.frame_rate_hz, plan.source.config.width) == (1000, 13)
-    assert plan.document["corrections"] == ["rot90", {"crop": {"rows": [2, None], "columns": [None, None]}}]
-
-
-def test_capture_plan_applies_options_to_spec(cube: Path) -> None:
-    Path("scan.yml").write_text("version: 1\nsource: {use: auto, with: {path: cube.npy, frame_rate_hz: 7}}\nlevels: 2\n")
-    with capture_plan(Path("scan.yml"), None, ["width=13"], ["rot90"]) as plan:
-        pass
-    assert (plan.source.config.frame_rate_hz, plan.source.config.width, len(plan.levels)) == (7, 13, 2)
-    assert plan.document["corrections"] == ["rot90"]
-    with pytest.raises(SpecError), capture_plan(Path("scan.yml"), "nobody"):
-        pass
-
-
-def test_missing_library_of_recognised_source_names_no_option(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *args: None if name == "av" else found(name, *args))
-    (folder / "film.mp4").write_bytes(b"....ftypisom")
-    with pytest.raises(WrongArgumentError) as caught, capture_plan(Path("film.mp4")):
-        pass
-    assert str(caught.value).startswith("the source 'video' needs av, which is not installed: pip install ")
 
 
 class Terminal(io.StringIO):
@@ -142,59 +91,6 @@ def test_progress_draws_bars_only_on_terminal(
     assert isinstance(progress_for_stderr(), expected)
 
 
-def test_bar_shows_stage_count_and_rate() -> None:
-    screen = io.StringIO()
-    bars = Bars(Console(file=screen, width=100, force_terminal=True, color_system=None))
-    with bars.stage("level 2: locate [all]", 1200, "exposures") as advance:
-        advance(600)
-        advance(600)
-    *_, last = screen.getvalue().split("level 2: locate [all]")
-    assert "1200/1200" in last
-    assert "exposures/s" in last
-
-
-def test_note_is_printed_unchanged() -> None:
-    screen = io.StringIO()
-    bars = Bars(Console(file=screen, width=20, force_terminal=True, color_system=None, markup=False, highlight=False))
-    bars.note("level 1: [bold] " + "a long line " * 5)
-    assert screen.getvalue() == "level 1: [bold] " + "a long line " * 5 + "\n"
-
-
-def test_line_is_printed_at_each_interval_and_none_for_short_stage(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(progress, "INTERVAL_S", 0.2)
-    monkeypatch.setattr(progress, "_LEAST_S", 0.1)
-    lines = Lines()
-    for _ in range(3):
-        with lines.stage("short", 1, "frames") as advance:
-            advance(1)
-    with lines.stage("level 2: locate", 1200, "exposures") as advance:
-        advance(1)  # the first takes longer, for loops are compiled, and says nothing of the others
-        time.sleep(0.3)
-        advance(399)
-        time.sleep(0.5)
-        advance(800)
-    lines.note("level 2: done")
-    first, *later = capsys.readouterr().err.splitlines()
-    assert re.fullmatch(r"level 2: locate: 1 of 1,200 exposures after [\d.]+ (s|ms)", first)
-    after_400 = [line for line in later if line.startswith("level 2: locate: 400 of 1,200 exposures after ")]
-    assert after_400
-    assert after_400[-1].endswith(" left")
-
-
-def test_progress_survives_closed_standard_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Closed(io.StringIO):
-        def write(self, text: str) -> int:
-            raise BrokenPipeError
-
-    monkeypatch.setattr("sys.stderr", Closed())
-    lines = Lines(notes=True, stages=True)
-    with lines.stage("level 1", 1, "exposures") as advance:
-        advance(1)
-    lines.note("level 1: done")
-
-
 SIMULATE = ("simulate", "capture.yaml", "--output", "cube.npy", "--set", "source.with.n_frames=40")
 
 
@@ -209,13 +105,6 @@ def nothing_stays() -> Any:
 
 
 TIMES = re.compile(r"^(.*?) +([\d.]+) +.*%$")  # a row: title, seconds
-
-
-@pytest.mark.parametrize("place", ["before the command", "after it"])
-@pytest.mark.usefixtures("folder")
-def test_verbose_prints_each_stage(invoke: Callable[..., Any], place: str) -> None:
-    result = invoke("-v", *SIMULATE) if place == "before the command" else invoke(*SIMULATE, "-v")
-    assert re.fullmatch(r"writing cube\.npy: 40 frames in [\d.]+ m?s\n", result.stderr)
 
 
 def test_verbose_prints_decisions_of_run(folder: Path, invoke: Callable[..., Any], finished: Path) -> None:
@@ -265,25 +154,6 @@ def test_log_is_appended_to_and_holds_stages_and_errors(folder: Path, invoke: Ca
     assert messages[1] == "writing cube.npy: begins"
     assert messages[2].startswith("writing cube.npy: 40 frames in ")
     assert messages[4] == "nowhere.yaml: there is no such file"
-
-
-class FullDisk(io.RawIOBase):
-    """A file on a disk without room."""
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, _: Any) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def test_full_disk_ends_log_and_not_the_command(
-    folder: Path, invoke: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(logging.FileHandler, "_open", lambda _: io.TextIOWrapper(io.BufferedWriter(FullDisk()), "utf-8"))
-    result = invoke(*SIMULATE, "--log", "night.log")
-    reason = f"OSError: [Errno {errno.ENOSPC}] No space left on device"
-    assert (result.exit_code, result.stderr) == (0, f"warning: the log {folder / 'night.log'} ends here: {reason}\n")
 
 
 COMPLETES = """

@@ -200,7 +200,7 @@ SET_UPS: dict[str, Callable[[World], object]] = {
     "batches": World.batches,
     "out-is-a-file": lambda _: Path("out").touch(),
     "out-has-another-summary": lambda _: (Path("out").mkdir(), Path("out/summary.csv").touch()),
-    "trusted": lambda world: world.runs(TRUSTED, panorama=RANGE, decisions=[START, SIZE]),
+    "trusted": lambda world: world.runs(TRUSTED, panorama=RANGE, decisions=[START, SIZE], findings={"start": START}),
     "doubtful": lambda world: world.runs(DOUBTFUL),
     "three-shots": lambda world: world.runs(DOUBTFUL, TRUSTED, DOUBTFUL),
     "check-run-doubtful": lambda world: world.answer("check-run", RunCheck(DOUBTFUL)),

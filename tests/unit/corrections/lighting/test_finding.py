@@ -6,19 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, InputError
+from photonpano import FrameSpan
 from photonpano.corrections import Vignette, divided_by
-from photonpano.corrections.gains import SeenCells, _amplitudes, local_flicker, solve_gains
-from photonpano.corrections.lighting import (
-    PixelGain,
-    decision_of,
-    find_light,
-    flicker_frequency,
-    gain_of_frames,
-    measure_pixel_gain,
-)
+from photonpano.corrections.gains import SeenCells, local_flicker, solve_gains
+from photonpano.corrections.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
 from photonpano.execution.context import Context
-from photonpano.geometry import Camera, Canvas, FrameTrajectory, rotation_matrices, translation
+from photonpano.geometry import Canvas, translation
 from photonpano.merging.accumulate import gain_image
 from photonpano.merging.panorama import render
 from photonpano.testing import KnownMotion, MemorySource, Scene
@@ -29,14 +22,6 @@ MOTION = KnownMotion(lambda frame: translation(0.06 * float(frame), 0.01 * float
 STEADY = np.ones(N)
 DRIFT = 0.5 ** np.linspace(0, 1, N)
 FLICKER = 1 + 0.5 * np.cos(2 * np.pi * np.arange(N) / 90.5)
-
-
-class Turning(FrameTrajectory):
-    """Rotations of a camera, as homographies of all frames."""
-
-    def __init__(self, camera: Camera, homographies: np.ndarray) -> None:
-        super().__init__(homographies)
-        self.camera = camera
 
 
 def panned(
@@ -79,18 +64,6 @@ def test_gain_of_each_frame_is_measured(light: np.ndarray, period: float | None)
         assert "Hz" in decision.reason
 
 
-def test_frames_that_a_wrong_motion_sends_behind_the_plane_do_not_count() -> None:
-    def at(frame: float) -> np.ndarray:
-        found = MOTION.at([frame])[0].copy()
-        if 200 <= frame < 230:
-            found[2, 0] = -0.5
-        return found
-
-    found = find_light(panned(DRIFT), KnownMotion(at), Context(1))
-    assert found is not None
-    assert float(np.sqrt(np.mean((found.gain - DRIFT / DRIFT.mean()) ** 2))) < 0.02
-
-
 def test_lamps_of_two_phases_are_told_apart() -> None:
     scene, rng, shape = Scene(3, (0.1, 0.6)), np.random.default_rng(3), (32, 96)
     motion = KnownMotion(lambda frame: translation(0.03 * float(frame), 0))
@@ -114,36 +87,6 @@ def test_lamps_of_two_phases_are_told_apart() -> None:
         found = gain_image(light, FrameSpan(frame, frame + 1), motion.at([frame])[0], shape)[16]
         inside = (np.abs(x - 60) > 8) & (x > 20) & (x < 96)
         assert float(np.sqrt(np.mean((found - expected)[inside] ** 2))) < 0.08
-
-
-def test_drift_is_measured_along_a_turn_by_200_degrees() -> None:
-    camera, rng = Camera.of(50.0, SHAPE), np.random.default_rng(0)
-    rotations = rotation_matrices(np.linspace([0, -1.75, 0], [0, 1.75, 0], N))
-    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    rays = camera.directions(np.stack([x, y], axis=-1))
-    frames = np.empty((N, *SHAPE), np.uint8)
-    for first in range(0, N, 4):
-        across, down, _ = np.moveaxis(rays @ rotations[first + 2].T, -1, 0)
-        flux = 0.2 + 0.1 * np.sin(20 * across) * np.cos(17 * down) + 0.05 * np.sin(9 * across)
-        frames[first : first + 4] = rng.random((4, *SHAPE)) < -np.expm1(-flux * DRIFT[first : first + 4, None, None])
-    motion = Turning(camera, camera.homographies(rotations))
-    found = find_light(MemorySource(frames), motion, Context(1))
-    assert found is not None
-    assert float(np.sqrt(np.mean((found.gain - DRIFT / DRIFT.mean()) ** 2))) < 0.02
-
-
-def test_frequency_of_noise_is_none() -> None:
-    noise = np.random.default_rng(0).normal(1, 0.05, 400)
-    assert flicker_frequency(np.arange(400.0), noise) == 0
-
-
-@pytest.mark.parametrize("spans", [1, 2, 3, 4])
-def test_gain_is_measured_in_few_spans(spans: int) -> None:
-    """Of a short video of a dozen frames, of which few are located."""
-    instants, gain = np.arange(spans) + 0.5, 1 + 0.1 * np.arange(spans)
-    frames, std, frequency = gain_of_frames(instants, gain, np.full(spans, 1e-3), np.ones(spans), spans + 2)
-    assert (frequency, std.shape) == (0, (spans + 2,))
-    np.testing.assert_allclose(frames[[0, -1]], gain[[0, -1]], atol=0.01)
 
 
 FIELD, N_FIELD = (64, 96), 120
@@ -207,26 +150,6 @@ def test_divided_panorama_is_that_of_an_even_sensor(
     """Its contrast is that of the scene, of which the flat field takes nothing."""
     divided, truth = rendered(recorded(uneven), measured(uneven)), rendered(recorded(False), None)
     assert np.std(divided) / np.mean(divided) == pytest.approx(np.std(truth) / np.mean(truth), rel=most)
-
-
-def test_camera_that_stands_still_is_refused(recorded: Callable[..., MemorySource]) -> None:
-    still = KnownMotion(lambda _: np.eye(3))
-    expected = r"^corrections: flat-field: photons and motion determine 0% of the variance of the gain, and 50% are needed;"
-    with pytest.raises(InputError, match=expected):
-        measure_pixel_gain(recorded(True, still), still, Context())
-
-
-def test_phase_of_flicker_is_found_from_a_third_of_a_period() -> None:
-    """Where a place is in view for less than a period, the waves of cosine and sine are not orthogonal there."""
-    n_times, amplitudes = 20, np.array([0.3, -0.2])
-    phase = 2 * np.arange(n_times) / n_times
-    cells, times = np.repeat(np.arange(81), n_times), np.tile(np.arange(n_times), 81)
-    waves = np.stack([np.cos(phase), np.sin(phase)])[:, times]
-    photons = 1e6 * (1 + amplitudes @ waves)
-    spans = tuple(FrameSpan(each, each + 1) for each in range(n_times))
-    seen = SeenCells(spans, cells, times, photons, np.full(len(cells), 1e6), Canvas(9, 9, np.eye(3)))
-    found = _amplitudes(seen, waves, np.full(len(cells), 1e6), np.ones(len(cells)))
-    assert found[:, 4, 4] == pytest.approx(amplitudes, abs=0.02)
 
 
 @pytest.mark.parametrize("phases", [(0.0, 2.0), (0.0, 0.0)], ids=["two lamps", "one light"])

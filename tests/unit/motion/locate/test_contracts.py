@@ -1,7 +1,5 @@
 """Locators that fail or break their contract, and fallbacks."""
 
-import gc
-import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -10,10 +8,8 @@ import numpy as np
 import pytest
 
 from photonpano import Group, Located, LocationError, NotLocated, PluginError, Trajectory
-from photonpano.contracts.information import why_undetermined
-from photonpano.contracts.requirements import BrokenContract, require_motion, require_near_knots
-from photonpano.geometry import jacobian, rescaled, translation
-from photonpano.motion.registration import BRIDGE
+from photonpano.contracts.requirements import BrokenContract, require_near_knots, why_undetermined
+from photonpano.geometry import translation
 from photonpano.specs.settings import GraphSettings
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -23,16 +19,6 @@ STILL = (
     "broke its contract at level 1: every pair that was located is exactly the identity, which a camera that stands still does "
     "not give; a failure is NotLocated"
 )
-
-
-def test_valid_motion_is_accepted() -> None:
-    for motion in (
-        Located(np.eye(3), np.eye(8)),
-        Located(rescaled(translation(3, 1), 2)),
-        Located(translation(3, 1), evidence={"inliers": np.int64(3), "ncc": np.float32(0.5)}),
-        NotLocated("lost", {"matches": 3}),
-    ):
-        assert require_motion(motion) is motion
 
 
 def failing_with(error: Exception) -> Callable[..., Any]:
@@ -82,25 +68,6 @@ def test_identity_of_every_pair_is_refused(
     assert str(caught.value) == message
 
 
-def test_nearly_the_identity_is_accepted_for_a_still_camera(run: Callable, make_level: Callable, pan: Callable) -> None:
-    def nearly(moving: Group, fixed: Group, found: Located) -> Located:
-        return replace(found, homography=found.homography @ translation(1e-4, 0))
-
-    assert run(make_level(pan(0.0), nearly)).n_located == 12
-
-
-def test_identity_is_accepted_for_small_motion_in_whole_pixels(run: Callable, make_level: Callable, known_motion: type) -> None:
-    """Slow at first: pairs are the identity in whole pixels, and the motion known so far is off by 2 px."""
-
-    def in_whole_pixels(moving: Group, fixed: Group, found: Located) -> Located:
-        return replace(found, homography=np.round(found.homography))
-
-    motion = known_motion(lambda frame: translation(0.001 * frame**2, 0))
-    found = run(make_level(motion, in_whole_pixels), known_motion(lambda frame: translation(0.2 * frame, 0)))
-    identities = [bool((edge.motion.homography == np.eye(3)).all()) for edge in found.edges]
-    assert identities == [True] * 2 + [False] * 9
-
-
 def informed(along_px: float, across_px: float) -> Located:
     """A shift whose expected errors along x and y differ."""
     std = np.array([1e-3, 1e-3, 1e-3, 1e-3, along_px, across_px, 1e-6, 1e-6])
@@ -124,13 +91,6 @@ def test_motion_that_the_images_do_not_determine_is_told(motion: Located, error:
     assert why_undetermined(motion, (40, 60)) == (sentence if error else None)
 
 
-def test_correlated_errors_of_small_size_are_determined() -> None:
-    """In pixels from the corner, the parameters of a motion of the middle are strongly correlated."""
-    points = np.array([[0, 0], [1e4, 0], [1e4, 1e4], [0, 1e4]], dtype=float)
-    to_points = jacobian(np.eye(3), points).reshape(8, 8)
-    assert why_undetermined(Located(np.eye(3), to_points.T @ to_points / 0.1**2), (40, 60)) is None
-
-
 def test_pair_that_stripes_leave_undetermined_is_not_located(run: Callable, make_level: Callable) -> None:
     """Along the stripes, every shift fits."""
 
@@ -151,14 +111,6 @@ PLACES = np.array([translation(5.0 * index, 0) for index in range(9)])
 
 def knots_kept(trajectory: Trajectory, std_px: float = 0.05) -> None:
     require_near_knots(trajectory, np.arange(0, 90, 10.0), PLACES, np.full(9, std_px), (40, 60))
-
-
-def test_trajectory_may_smooth_its_knots_and_miss_outliers(known_motion: type) -> None:
-    def smoothed(frame: float) -> np.ndarray:
-        return translation(0.5 * frame + 0.9 * np.sin(frame) + 300 * (frame > 55), 0)
-
-    knots_kept(known_motion(smoothed))
-    knots_kept(known_motion(lambda frame: translation(0.5 * frame + 15, 0)), std_px=2.0)
 
 
 @pytest.mark.parametrize(
@@ -215,22 +167,6 @@ def test_pair_with_an_implausible_motion_is_refused_or_given_to_a_fallback(
     assert found.failures == ()
 
 
-def test_failure_of_all_locators_joins_their_reasons(run: Callable, make_level: Callable, make_second: type) -> None:
-    def lost(reason: str, **evidence: float) -> Callable[..., Any]:
-        def answer(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
-            return NotLocated(reason, evidence) if 40 in (moving.span.start, fixed.span.start) else found
-
-        return answer
-
-    second = make_second(lost("2 matches", matches=2))
-    found = run(make_level(answer=lost("the overlap is 3 %", overlap=0.03), fallbacks={"second": second}))
-    (failure, *_) = found.failures
-    assert failure.locator == ""
-    assert failure.motion.reason == "toy: the overlap is 3 %; second: 2 matches"
-    assert failure.motion.evidence == {"toy.overlap": 0.03, "second.matches": 2}
-    assert [(edge.moving, edge.fixed) for edge in found.failures] == [(4, 3), (4, 2), (4, 1), (5, 4)]
-
-
 def test_fallback_is_not_believed_where_it_contradicts_pairs_of_the_locator_in_between(
     run: Callable, make_level: Callable, make_second: type
 ) -> None:
@@ -245,17 +181,6 @@ def test_fallback_is_not_believed_where_it_contradicts_pairs_of_the_locator_in_b
     reasons = {edge.moving - edge.fixed: edge.motion.reason for edge in found.failures}
     assert reasons[4] == "second: the motion is 32 px from that along the pairs of toy in between"
     assert 1 not in reasons
-
-
-def test_fallback_is_believed_where_the_locator_does_not_tie_the_exposures(
-    run: Callable, make_level: Callable, make_second: type
-) -> None:
-    def behind(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
-        return NotLocated("lost") if moving.span.start >= 60 > fixed.span.start else found
-
-    jump = make_second(lambda _, __, found: Located(translation(50, 0) @ found.homography))
-    found = run(make_level(answer=behind, fallbacks={"second": jump}), graph=GraphSettings(skips=(1.0, 2.0)))
-    np.testing.assert_allclose(found.homographies[6:, 0, 2] - found.homographies[5, 0, 2], 50 + 3 * np.arange(1, 7), atol=1e-6)
 
 
 def test_no_locator_describes_blank_exposures(
@@ -276,37 +201,3 @@ def test_no_locator_describes_blank_exposures(
     assert {(edge.locator, edge.motion.reason) for edge in found.failures} == {
         ("", "frames 40 to 49: no pixel detected a photon; is the shutter closed, or is it the wrong file?")
     }
-
-
-@pytest.mark.parametrize(
-    ("of", "most"),
-    # Those that may still be bridged to, the current one, and those described ahead.
-    [("locator", BRIDGE + 1 + 3), ("fallback", BRIDGE + 2)],
-)
-def test_features_are_described_once_and_released_after_their_last_pair(
-    run: Callable, make_level: Callable, failing: Callable, make_second: type, of: str, most: int
-) -> None:
-    described: list[Group] = []
-    alive: weakref.WeakSet[Any] = weakref.WeakSet()
-    n_alive: list[int] = []
-
-    class Features:
-        def __init__(self, group: Group) -> None:
-            self.group = group
-
-    class Watched(make_second):
-        def describe(self, exposure: Any) -> Features:
-            described.append(exposure.group)
-            features = Features(exposure.group)
-            alive.add(features)
-            gc.collect()
-            n_alive.append(len(alive))
-            return features
-
-    if of == "locator":
-        found = run(make_level(locator=Watched()), threads=1)
-    else:
-        found = run(make_level(answer=failing(*range(12)), fallbacks={"second": Watched()}), threads=1)
-        assert [edge.locator for edge in found.edges] == ["second"] * 11
-    assert sorted(described, key=lambda group: group.span) == list(found.groups)
-    assert max(n_alive) <= most < len(found.groups)

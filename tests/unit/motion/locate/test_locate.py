@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, Homography, Located, LocationError, NotLocated, PluginError
+from photonpano import Group, Homography, Located, LocationError, NotLocated, PluginError
 from photonpano.contracts.attribution import attributed
-from photonpano.geometry import corners, from_parameters, inverse, jacobian, normalised, rotation_matrices, translation
+from photonpano.geometry import corners, from_parameters, inverse, jacobian, normalised, translation
 from photonpano.motion.level import Level, NamedLocator
-from photonpano.motion.locate import _ambiguity
 from photonpano.specs.settings import GraphSettings
-from photonpano.values import Edge
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -44,47 +42,12 @@ def test_locator_starts_from_the_motion_known_so_far_in_pixels_of_exposures(
     np.testing.assert_allclose(initials[11:], [translation(2.5 * scale, 0)] * 11, atol=1e-12)
 
 
-def test_pairs_are_in_order_with_any_number_of_threads(run: Callable, make_level: Callable) -> None:
-    results = [run(make_level(), graph=GraphSettings(), threads=threads) for threads in (1, 2, 3)]
-    pairs = [[(edge.moving, edge.fixed) for edge in found.edges] for found in results]
-    assert pairs[0] == sorted(pairs[0])
-    assert pairs[0] == pairs[1] == pairs[2]
-    for found in results[1:]:
-        np.testing.assert_array_equal(found.homographies, results[0].homographies)
-
-
-def test_lost_exposure_is_bridged(run: Callable, make_level: Callable, failing: Callable) -> None:
-    found = run(make_level(answer=failing(4)))
-    tried = [(edge.moving, edge.fixed) for edge in found.edges if edge.moving in (4, 5)]
-    assert tried == [(4, 3), (4, 2), (4, 1), (5, 4), (5, 3)]
-    np.testing.assert_array_equal(np.flatnonzero(~found.solution.located), [4])
-    np.testing.assert_allclose(found.homographies[:, 0, 2], 0.3 * (found.instants - found.instants[5]), atol=1e-9)
-    assert len(found.failures) == 4
-    assert found.covered == FrameSpan(0, 120)
-
-
 def test_two_lost_exposures_are_bridged_and_three_are_not(run: Callable, make_level: Callable, failing: Callable) -> None:
     assert run(make_level(answer=failing(4, 5))).n_located == 10
     with pytest.raises(LocationError, match="so that frames 0 to 69 cannot be tied to the rest"):
         run(make_level(answer=failing(4, 5, 6)))
     found = run(make_level(answer=failing(4, 5, 6)), graph=GraphSettings(skips=(), disconnected="largest"))
     np.testing.assert_array_equal(np.flatnonzero(found.solution.located), [7, 8, 9, 10, 11])
-
-
-def test_covered_frames_reach_from_the_first_to_the_last_located_exposure(
-    run: Callable, make_level: Callable, failing: Callable
-) -> None:
-    assert run(make_level(answer=failing(0, 1, 11))).covered == FrameSpan(20, 110)
-
-
-def informed(**fields: Any) -> Callable[..., Located]:
-    return lambda _moving, _fixed, found: replace(found, **fields)
-
-
-def test_information_of_each_exposure_sums_that_of_its_pairs(run: Callable, make_level: Callable, pan: Callable) -> None:
-    """Each has pairs with the one before and the one after; the camera hardly moves, so that their information adds up."""
-    found = run(make_level(pan(1e-9), informed(information=np.diag([1e3, 1e3, 1e3, 1e3, 4, 4, 1e7, 1e7]))))
-    np.testing.assert_allclose(found.information[[0, 5, 11], 4, 4], [4, 8, 4], rtol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5, 2.0])
@@ -140,18 +103,6 @@ def hypothesising(make_level: Callable) -> Callable[..., Level]:
     return make
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_distant_pairs_of_the_first_level_start_from_the_nearest_ones(
-    run: Callable, hypothesising: Callable, scale: float, threads: int
-) -> None:
-    made = hypothesising(2.0, scale=scale)
-    run(made, graph=GraphSettings(), threads=threads)
-    initials = made.locators[0].component.initials
-    for pair, shift in {(1, 0): 2, (6, 4): 6, (6, 2): 12}.items():
-        np.testing.assert_allclose(initials[pair], translation(shift * scale, 0), atol=1e-9)
-
-
 def test_hypothesis_that_continues_the_motion_is_taken(run: Callable, hypothesising: Callable) -> None:
     made = hypothesising(-13.0, 4.0, 20.0, first=(2.0,))
     found = run(made)
@@ -160,33 +111,10 @@ def test_hypothesis_that_continues_the_motion_is_taken(run: Callable, hypothesis
     assert found.ambiguity is None
 
 
-@pytest.mark.parametrize(("turn_deg", "second"), [(0.0, True), (10.0, True), (30.0, False)])
-def test_part_of_a_frame_that_a_roll_moves_is_no_second_place(turn_deg: float, second: bool) -> None:
-    """A roll by 30 degrees moves the corners by 18 px beside the middle, one by 10 degrees by 6 px."""
-    middle = translation(*corners(SHAPE).mean(axis=0))
-    rolled = translation(5, 3) @ middle @ rotation_matrices(np.array([0, 0, np.radians(turn_deg)])) @ inverse(middle)
-    found = _ambiguity(1, {(1, 0): 10.0}, [Edge(1, 0, Located(rolled))], SHAPE)
-    assert (found is not None) == second
-
-
 def test_first_of_several_hypotheses_is_taken_and_named_as_ambiguous(run: Callable, hypothesising: Callable) -> None:
     found = run(hypothesising(4.0, -13.0))
     assert (found.ambiguity.level, found.ambiguity.pairs) == (1, ((1, 0),))
     assert found.ambiguity.alternative_px == pytest.approx(17)
-
-
-def test_exposure_that_is_not_located_is_passed_over_at_the_speed_before(run: Callable, hypothesising: Callable) -> None:
-    made = hypothesising(3.0, lost=(5,))
-    run(made, graph=GraphSettings())
-    np.testing.assert_allclose(made.locators[0].component.initials[6, 4], translation(6, 0), atol=1e-9)
-
-
-def test_fallback_without_hypotheses_gets_no_start_at_the_first_level(
-    run: Callable, hypothesising: Callable, make_level: Callable
-) -> None:
-    fallback = make_level().locators[0].component
-    run(hypothesising(3.0, lost=(5,), fallbacks={"other": fallback}))
-    assert fallback.initials == [None]
 
 
 def test_pair_that_does_not_overlap_by_the_motion_known_so_far_is_no_pair(
@@ -207,28 +135,3 @@ def test_hypotheses_that_are_no_homographies_are_refused(run: Callable, hypothes
         PluginError, match=r"^locator 'toy' of toys 1\.0 broke its contract at level 1: a homography (is|must be) "
     ):
         run(made, graph=GraphSettings())
-
-
-class Overlapping:
-    """Groups of 20 frames, each of which shares half of its frames with the next."""
-
-    def groups(self, n_frames: int, level: int) -> list[Group]:
-        return [Group(FrameSpan(start, start + 20), start + 9.5) for start in range(0, n_frames - 19, 10)]
-
-
-@pytest.mark.parametrize(("apart_fail", "n_located"), [(False, 11), (True, 7)])
-def test_shared_frames_do_not_locate_exposures_beyond_the_motion_known_so_far(
-    run: Callable, make_level: Callable, pan: Callable, apart_fail: bool, n_located: int
-) -> None:
-    """Their noise is shared, too, and agrees with any motion that both exposures were merged along."""
-
-    def answer(moving: Group, fixed: Group, found: Located) -> Located | NotLocated:
-        apart = moving.span.start >= fixed.span.stop
-        return NotLocated("no texture") if apart_fail and apart and moving.reference > 75 else found
-
-    level = make_level(answer=answer, resampler=Overlapping())
-    found = run(level, pan(0.25), known=FrameSpan(0, 75))
-    assert found.n_located == n_located
-    reasons = {edge.motion.reason for edge in found.failures if edge.moving == edge.fixed + 1}
-    assert reasons == {"the exposures share frames, and were merged along a motion that is not known there"}
-    assert run(level, pan(0.25), known=FrameSpan(0, 120)).n_located == 11

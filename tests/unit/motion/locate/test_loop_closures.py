@@ -160,36 +160,6 @@ def test_closure_of_different_places_is_refused(run: Callable, level: Callable, 
     np.testing.assert_array_equal(found.homographies, run(level(wrong, scale=scale), closure_overlap=None).homographies)
 
 
-def test_right_closures_stop_the_drift_although_others_are_refused(run: Callable, level: Callable) -> None:
-    def answer(moving: Group, fixed: Group, found: Located) -> Located:
-        wrong = is_closure(moving, fixed) and moving.span.start // 10 % 2
-        return (
-            replace(drifting(moving, fixed, found), homography=translation(7, 9)) if wrong else drifting(moving, fixed, found)
-        )
-
-    found = run(level(answer))
-    assert pairs_of(found.failures) == [pair for pair in PAIRS if pair[0] % 2]
-    assert found.solution.outliers == ()
-    assert drift_px(found) < 0.2
-
-
-def test_closure_that_no_locator_locates_keeps_its_reason(run: Callable, level: Callable) -> None:
-    found = run(level(at_closures(lambda _: NotLocated("3 matches", {"matches": 3}))))
-    assert pairs_of(found.failures) == PAIRS
-    assert {edge.motion.reason for edge in found.failures} == {"3 matches"}
-    assert found.n_located == N
-
-
-def test_closure_located_by_a_fallback_is_checked(run: Callable, level: Callable, make_level: Callable, pan: Callable) -> None:
-    lost = at_closures(lambda _: NotLocated("3 matches"))
-    still, astray = (make_level(pan(px_per_frame)).locators[0].component for px_per_frame in (0, 0.1))
-    found = run(level(lost, fallbacks={"second": still}))
-    assert {edge.locator for edge in found.closures} == {"second"}
-    found = run(level(lost, fallbacks={"second": astray}))
-    assert all("of this loop closure" in edge.motion.reason for edge in found.failures)
-    assert (len(PAIRS) - 2) <= len(found.failures) <= len(PAIRS)
-
-
 def test_similar_but_wrong_closure_is_dropped_as_outlier(run: Callable, level: Callable) -> None:
     """A shift by the period of the plane leaves the similarity as it is."""
 
@@ -221,45 +191,3 @@ def test_closures_that_agree_on_the_next_period_do_not_outvote_neighbours(run: C
     assert len(found.failures) >= len(PAIRS) - 2
     assert all(index >= len(found.edges) - len(found.closures) for index in found.solution.outliers)
     assert abs(float(found.homographies[-1, 0, 2] - found.homographies[0, 0, 2])) < 0.5
-
-
-@pytest.mark.parametrize("threads", [2, 4])
-def test_only_exposures_of_closures_are_merged_again_with_any_number_of_threads(
-    run: Callable, level: Callable, threads: int
-) -> None:
-    toy = level()
-    alone, several = run(toy, threads=1), run(level(), threads=threads)
-    assert toy.merger.merged[:N] == list(range(N))
-    assert toy.merger.merged[N:] == [index for pair in PAIRS for index in pair]
-    np.testing.assert_array_equal(several.homographies, alone.homographies)
-    np.testing.assert_array_equal(several.std_px, alone.std_px)
-    assert [(each.moving, each.fixed, each.locator) for each in several.edges] == [
-        (each.moving, each.fixed, each.locator) for each in alone.edges
-    ]
-    assert [each.motion.evidence for each in several.edges] == [each.motion.evidence for each in alone.edges]
-
-
-def test_exposure_of_several_closures_is_merged_again_once(run: Callable, level: Callable) -> None:
-    """Three sweeps over six places: the last has closures with both others."""
-    toy = level(motion=KnownMotion(lambda frame: translation(20 + 0.9 * abs((frame + 80) % 160 - 80), 20)))
-    found = run(toy, threads=1)
-    needed = {index for pair in pairs_of(found.closures) for index in pair}
-    assert len(pairs_of(found.closures)) > len(needed) / 2
-    assert sorted(toy.merger.merged[N:]) == sorted(needed)
-
-
-def test_exposures_of_closures_are_released_after_their_last_pair(run: Callable, level: Callable) -> None:
-    toy = level()
-    locator, most = toy.locators[0].component, 0
-    register = locator.register
-
-    def watched(*args: Any) -> Any:
-        nonlocal most
-        if len(toy.merger.merged) > N:
-            most = max(most, toy.merger.alive)
-        return register(*args)
-
-    locator.register = watched
-    run(toy)
-    assert most == 2
-    assert toy.merger.alive == 0

@@ -106,23 +106,3 @@ def test_resumed_run_repeats_nothing_that_was_kept(plan_of: Callable[..., Plan],
     for step in ("motion.loop.starting_motion", "residuals.refinement.measure", "merging.panorama.accumulate"):
         monkeypatch.setattr(f"photonpano.{step}", repeats)
     run(killed, resume=True)
-
-
-def test_last_level_with_other_settings_starts_from_the_first_and_a_finished_run_is_returned(
-    plan_of: Callable[..., Plan], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first = run(plan_of("scan"), keep_work=True)
-    other = {"levels": [{}, {"resample": {"with": {"group_size": 30}}}], "render": {"scale": 0.5}}
-    anew = run(plan_of("anew", **other))
-    with monkeypatch.context() as patch:
-        patch.setattr("photonpano.motion.loop.starting_motion", lambda *_: pytest.fail("level 1 was found before"))
-        again = run(plan_of("scan", **other), from_level=2)
-    assert bytes_of(again) == bytes_of(anew)
-    assert path_of(again.directory).is_dir()
-    monkeypatch.setattr("photonpano.pipeline.state.estimate_motion", lambda *_, **__: pytest.fail("it was finished"))
-    resumed = run(plan_of("scan", **other), resume=True)
-    assert (first.was_finished, again.was_finished, resumed.was_finished) == (False, False, True)
-    assert resumed.verdict == again.verdict
-    assert bytes_of(resumed) == bytes_of(anew)
-    with pytest.raises(pytest.fail.Exception, match="it was finished"):
-        run(plan_of("anew", render={"scale": 2.0}), resume=True)

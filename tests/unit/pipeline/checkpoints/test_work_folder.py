@@ -11,21 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, InputError, Located, NotLocated, parse_spec
+from photonpano import FrameSpan, Group, InputError, Located, parse_spec
 from photonpano.execution.context import Quiet
-from photonpano.pipeline.checkpoints.fingerprint import differences, run_fingerprint
 from photonpano.pipeline.checkpoints.work_folder import (
     Continuation,
-    Kept,
     Store,
     Work,
+    differences,
     digest,
-    finished,
     path_of,
+    run_fingerprint,
     work_folder,
 )
 from photonpano.record.schema import CaptureRecord
-from photonpano.values import Decision
 
 RESUMING = Continuation(resume=True)
 LEVEL = {"scale": 1.0, "locate": {"use": "direct", "with": {"blur_px": 0.8}}, "code": {"photonpano_direct": "aa"}}
@@ -72,7 +70,7 @@ def place(tmp_path: Path) -> Path:
 def working(
     place: Path, now: dict[str, Any] | None = None, how: Continuation | None = None, notes: Notes | None = None
 ) -> Iterator[Work]:
-    with work_folder(place, now or fingerprint(), [], how or Continuation(), notes or Notes()) as work:
+    with work_folder(place, now or fingerprint(), how or Continuation(), notes or Notes()) as work:
         yield work
 
 
@@ -93,19 +91,6 @@ def found(work: Work) -> dict[str, Any]:
     computed: list[int] = []
     work.checkpoints.once("refined", lambda: computed.append(1))
     return {name: results for name, results in logs.items() if results} | ({} if computed else {"refined": True})
-
-
-def test_finished_run_and_error_before_anything_is_found_leave_no_work_folder(place: Path) -> None:
-    notes = Notes()
-    with pytest.raises(InputError), working(place, notes=notes):
-        raise InputError("no photons")
-    assert list(place.parent.iterdir()) == []
-    assert notes.lines == []
-    with working(place) as work:
-        work.checkpoints.once("refined", lambda: 7)
-        assert path_of(place).is_dir()
-        work.finish()
-    assert list(place.parent.iterdir()) == []
 
 
 KEPT = {"level-1": [1], "refined": True}
@@ -183,27 +168,6 @@ def test_changed_run_starts_again_and_says_why(
     assert caplog.messages == [f"{path_of(place)}: the interrupted run is not continued, but started again: {reason}"]
 
 
-@pytest.mark.parametrize("content", ["", '{"format": 1}', "[" * 10_000, "\xff", "null"])
-def test_damaged_manifest_starts_again_and_says_why(place: Path, content: str, caplog: pytest.LogCaptureFixture) -> None:
-    interrupt(place)
-    (path_of(place) / "work.json").write_text(content, encoding="latin-1")
-    with working(place, how=RESUMING) as work:
-        assert found(work) == {}
-    assert caplog.messages == [
-        f"{path_of(place)}: the interrupted run is not continued, but started again: work.json is missing or damaged"
-    ]
-
-
-def test_kept_work_is_replaced_in_silence(place: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with working(place, how=Continuation(keep=True)) as work:
-        work.checkpoints.once("refined", lambda: 7)
-        work.finish()
-    assert path_of(place).is_dir()
-    with working(place) as work:
-        assert found(work) == {}
-    assert caplog.messages == []
-
-
 def test_from_level_takes_the_levels_before_it_alone(place: Path) -> None:
     interrupt(place, levels=3)
     changed = fingerprint(levels__2__scale=2.0, rest__render__scale=2.0)
@@ -250,12 +214,6 @@ def test_from_level_without_such_levels_is_an_error_and_changes_nothing(
         assert found(work) == {"refined": True} | {f"level-{each}": [each] for each in range(1, levels + 1)}
 
 
-def test_from_level_without_work_is_an_error(place: Path) -> None:
-    with pytest.raises(InputError) as error, working(place, how=Continuation(from_level=2)):
-        pass
-    assert str(error.value) == f"--from-level 2: there is no work folder {path_of(place)}; run with --keep-work first"
-
-
 @pytest.mark.parametrize("kind", ["folder", "file", "link"])
 def test_folder_of_somebody_else_is_left_alone(
     place: Path, tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
@@ -294,14 +252,6 @@ def test_folder_that_cannot_be_made_is_a_warning(
         f"{path_of(place)}: what the run finds cannot be kept (Permission denied); if it is interrupted, all of it is computed "
         "again"
     ]
-
-
-def test_leftovers_of_a_killed_process_are_removed(place: Path) -> None:
-    interrupt(place)
-    for name in (".level-1.aa.0000.0123abcd.partial.pickle", ".work.0123abcd.partial.json"):
-        (path_of(place) / name).write_text("cut sh")
-    with working(place, how=RESUMING):
-        assert sorted(path.name for path in path_of(place).iterdir() if path.name.startswith(".")) == []
 
 
 def test_digest_depends_on_every_value() -> None:
@@ -366,81 +316,6 @@ def test_full_disk_is_one_warning_and_leaves_room_for_the_results(
     assert not store.holds_something
     assert list(store.folder.iterdir()) == []
     assert store.save("a", VALUE)
-
-
-def test_result_that_cannot_be_kept_is_a_warning(store: Store, caplog: pytest.LogCaptureFixture) -> None:
-    assert not store.save("a", NotLocated("dark", {"why": lambda: None}))
-    assert "the run goes on, but if it is interrupted, this is computed again" in caplog.text
-    assert list(store.folder.iterdir()) == []
-
-
-def test_once_computes_a_result_once_and_repeats_its_decisions(store: Store) -> None:
-    calls, decisions = [], []
-
-    def compute() -> Located:
-        calls.append(1)
-        decisions.append(Decision("chunks", 3, "short"))
-        return VALUE
-
-    kept = Kept(store, decisions)
-    given = np.eye(3), "x"
-    for _ in range(2):
-        assert kept.once("step", compute, *given).residual_px == VALUE.residual_px
-    assert len(calls) == 1
-    assert decisions == 2 * [Decision("chunks", 3, "short")]
-    kept.once("step", compute, np.eye(3), "y")
-    kept.once("other", compute, *given)
-    kept.within("vignette").once("step", compute, *given)
-    assert len(calls) == 4
-    for _ in range(2):
-        assert kept.once("nothing", lambda: calls.append(1)) is None
-    assert len(calls) == 5
-
-
-@pytest.fixture
-def written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("photonpano.pipeline.checkpoints.work_folder.FLUSH_S", 0.0)
-
-
-def test_log_goes_on_after_the_last_result_that_was_written(store: Store, written_at_once: None) -> None:
-    log = Kept(store, []).log("level-1", "given")
-    for number in range(5):
-        log.add(number)
-    again = Kept(store, []).log("level-1", "given")
-    assert again.found == [0, 1, 2, 3, 4]
-    again.add(5)
-    assert Kept(store, []).log("level-1", "given").found == [0, 1, 2, 3, 4, 5]
-    assert Kept(store, []).log("level-1", "other").found == []
-    assert Kept(store, []).log("level-1-revisits", "given").found == []
-    assert not finished(store, "level-1")
-    again.finish()
-    assert finished(store, "level-1")
-
-
-def test_log_ends_before_a_damaged_file(store: Store, written_at_once: None, caplog: pytest.LogCaptureFixture) -> None:
-    log = Kept(store, []).log("level-1")
-    for number in range(4):
-        log.add(number)
-    (store.folder / f"{store.names('level-1')[2]}.pickle").write_bytes(b"nonsense")
-    log = Kept(store, []).log("level-1")
-    assert log.found == [0, 1]
-    assert "is damaged" in caplog.text
-    log.add(2)
-    # What comes after it was found from the same results, and is still right.
-    assert Kept(store, []).log("level-1").found == [0, 1, 2, 3]
-
-
-def test_log_repeats_decisions_unless_they_are_taken_again(store: Store, written_at_once: None) -> None:
-    first, second = Decision("chunk_frames", 3, "short"), Decision("other", 1, "why")
-    decisions: list[Decision] = []
-    log = Kept(store, decisions).log("level-1")
-    decisions += [first, second]
-    log.add(0)
-    later: list[Decision] = [Decision("source", "npy", "suffix")]
-    log = Kept(store, later).log("level-1")
-    later.append(first)
-    log.finish()
-    assert later[1:] == [first, second]
 
 
 @pytest.mark.parametrize(

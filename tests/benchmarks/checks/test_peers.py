@@ -16,7 +16,7 @@ from photonpano.evaluation import Truth
 from photonpano.geometry import translation
 from photonpano.testing.captures import textured
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "explanation" / "peers.md"
 SHAPE = (60, 90)
 

@@ -16,7 +16,7 @@ from photonpano.evaluation import Truth
 from photonpano.geometry import translation
 from photonpano_simulator.config import SimulatorConfig
 
-SCRIPT = Path(__file__).parents[1] / "benchmarks" / "trust.py"
+SCRIPT = Path(__file__).parents[1] / "trust.py"
 SHAPE = (60, 90)
 N = 240  # all of which align the planes
 
