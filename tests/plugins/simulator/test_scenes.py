@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from photonpano import InputError
-from photonpano_simulator import scenes
+from photonpano_simulator import scenes, travel_stage
 from photonpano_simulator.config import NightScene, PhotoScene, StreetScene
 from photonpano_simulator.scenes import Chance, Drawing, pictures_of, read_scene, scene_flux
-from photonpano_simulator.travel import stage
 
 
 def written(path: Path, image: np.ndarray) -> Path:
@@ -110,7 +109,7 @@ def test_files_of_scenes_have_no_unknown_key_or_picture(kind: str) -> None:
     picked = {name for mark in marks for value in mark.get("pick", {}).values() for name in names_in(value)}
     variables = {"opening", "beside", "below", "surface", "goods"}
     drawn = {"street", *picked}
-    for keys, entries in ((documented(scenes), marks), (documented(stage), things)):
+    for keys, entries in ((documented(scenes), marks), (documented(travel_stage), things)):
         for entry in entries:
             assert set(entry) <= keys, entry
             for key in ("draw", "front", "top"):
