@@ -1,4 +1,4 @@
-"""The figures of the report: of the motion, the coverage, the time of each stage, and of the residuals.
+"""The figures of the report: of the motion, the coverage, and of the residuals.
 
 Residuals are shown as maps of the reduced chi-square, as brightness and shifts over the sensor, over time, and as spectra.
 """
@@ -26,7 +26,6 @@ from photonpano.geometry import (
 from photonpano.merging.accumulate import amplitudes_on
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.record.schema import LevelRecord, PanoramaRecord
 from photonpano.report.drawing import (
     BAD,
     BAR_IN,
@@ -53,7 +52,6 @@ from photonpano.report.drawing import (
 from photonpano.residuals.block_sums import BLOCK_PX, M, R
 from photonpano.residuals.halves import Halves
 from photonpano.residuals.measure import Residuals
-from photonpano.text import duration
 from photonpano.values import FloatArray, FluxImage, Group, Light, SpanResiduals, true_spans
 
 if TYPE_CHECKING:
@@ -180,31 +178,6 @@ def tied_parts(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
         axes.tick_params(axis="y", colors=INK)
         mark_frames(axes, groups[0].span.start, groups[-1].span.stop)
         return svg_of(figure, "tied-parts")
-
-
-def stage_times(levels: Sequence[LevelRecord], panorama: PanoramaRecord | None) -> str:
-    """Draw the seconds of each stage of each level, and of the panorama."""
-    names = [f"level {level['level']}" for level in levels] + (["panorama"] if panorama else [])
-    with plain_figure(WIDTH_IN, 0.9 + 0.36 * len(names)) as figure:
-        [axes] = add_axes(figure, Margins(right=0.6, top=0.35))
-        ends = np.zeros(len(levels))
-        for (stage, name), colour in zip(STAGE_NAMES.items(), SERIES, strict=False):
-            seconds = np.array([level["seconds"].get(stage, 0.0) for level in levels])
-            axes.barh(names[: len(levels)], seconds, left=ends, height=0.62, color=colour, label=name)
-            ends = ends + seconds
-        totals = ends.tolist()
-        if panorama:
-            axes.barh(["panorama"], panorama["seconds"], height=0.62, color=SERIES[4], label="render")
-            totals.append(panorama["seconds"])
-        for name, total in zip(names, totals, strict=True):
-            axes.annotate(duration(total), (total, name), xytext=(5, 0), textcoords="offset points", va="center", color=MUTED)
-        axes.invert_yaxis()
-        axes.grid(visible=False, axis="y")
-        axes.spines["left"].set_visible(False)
-        axes.tick_params(axis="y", colors=INK)
-        axes.set_xlabel("seconds")
-        figure.legend(loc="upper left", ncols=5, handlelength=1, handleheight=1, columnspacing=1.4)
-        return svg_of(figure, "stage-times")
 
 
 def instants_of(n_frames: int, most: int = MAX_INSTANTS) -> NDArray[np.int64]:

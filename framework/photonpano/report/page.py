@@ -56,7 +56,6 @@ def render_report(
         **head_of(record),
         stages=figures.STAGE_NAMES,
         failures=failure_groups(record["levels"]),
-        stage_times=figures.stage_times(record["levels"], record["panorama"]) if record["levels"] else None,
         files=files,
         more_files=more_files,
         viewer=None if capture is None else viewer_data(record, explained, panorama, capture.source, capture.levels),

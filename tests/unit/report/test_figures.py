@@ -33,12 +33,11 @@ def lines(svg: str, colour: str) -> list[np.ndarray]:
     return [np.array(re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", path), dtype=float) for path in paths]
 
 
-def test_figures_use_colour_variables_of_page(record, motion, panorama):
+def test_figures_use_colour_variables_of_page(motion, panorama):
     svgs = [
         figures.path_over_time(motion, 96_800.0),
         figures.path_on_panorama(motion, panorama),
         figures.coverage_map(panorama.thumbnail.weight),
-        figures.stage_times(record["levels"], record["panorama"]),
     ]
     for svg in svgs:
         ElementTree.fromstring(svg)
