@@ -76,6 +76,37 @@ def test_dark_frames_are_not_located_and_cost_the_others_nothing(
     assert flux_of(tmp_path / "run") == pytest.approx(flux_of(tmp_path / "open"), rel=0.03)
 
 
+@pytest.mark.parametrize(("period", "n_dark"), [(2, 1), (30, 10)])
+def test_frames_between_flashes_of_a_lamp_are_no_data(
+    period: int, n_dark: int, simulated: Callable[..., Path], tmp_path: Path
+) -> None:
+    steady = simulated(path=PAN)
+    frames = np.load(steady)
+    unlit = np.arange(len(frames)) % period >= period - n_dark
+    frames[unlit] = 0
+    flashed = tmp_path / "cube.npy"
+    np.save(flashed, frames)
+    result = run_plan(parse_spec(spec_of(flashed), output=tmp_path / "run"))
+    n_unlit, first = int(unlit.sum()), period - n_dark
+    assert result.record["warnings"][0] == (
+        f"{n_unlit} of 300 frames, the first at {first}, show no light, as where a lamp flashes: they are left out, and the "
+        "flux is that of the other frames"
+    )
+    assert result.verdict is not None
+    assert [str(each) for each in result.verdict.reasons] == []
+    run_plan(parse_spec(spec_of(steady), output=tmp_path / "steady"))
+    assert flux_of(tmp_path / "run") == pytest.approx(flux_of(tmp_path / "steady"), rel=0.01)
+
+
+def test_dim_frames_are_light(simulated: Callable[..., Path], tmp_path: Path) -> None:
+    frames = np.load(simulated(path=PAN))
+    rng = np.random.default_rng(0)
+    kept = [np.packbits(rng.random((100, *frames.shape[1:], 8)) < 0.1)[: frames[200:].size].reshape(frames[200:].shape)]
+    frames[200:] &= kept[0]
+    np.save(tmp_path / "cube.npy", frames)
+    assert dark_spans(tmp_path / "cube.npy") == ()
+
+
 def flux_of(run: Path) -> float:
     import tifffile
 

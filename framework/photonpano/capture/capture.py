@@ -190,8 +190,8 @@ class Capture(Closing):
         return self.corrected(self.counts(span), len(span))
 
     def shown(self, spans: Iterable[FrameSpan]) -> list[FrameSpan]:
-        """Return the spans that hold no frame that is left out, such as one without light: its gain is 0."""
-        return [span for span in spans if self.light is None or self.light.shown[span.start : span.stop].all()]
+        """Return the spans that hold a frame that is not left out, as one without light is: its gain is 0."""
+        return [span for span in spans if self.light is None or self.light.shown[span.start : span.stop].any()]
 
     def times_counted(self, span: FrameSpan) -> float:
         """Return how often the photons of a span are counted, where frames are copies: the factor of the variance of its sum.

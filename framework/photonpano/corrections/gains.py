@@ -145,7 +145,8 @@ def _seen(
         cv2.GaussianBlur(image, (0, 0), 2 * _BLUR)[1::2, 1::2][:n_rows, :n_columns]
         for image in (np.maximum(summed.counts, 0), summed.weight)
     )
-    index = np.flatnonzero(weight > covered * len(span))
+    light = capture_of(source).light
+    index = np.flatnonzero(weight > covered * len(span) * (1.0 if light is None else light.mean(span)))
     frames = np.asarray(weight.ravel()[index], np.float32)
     exposure = 4 * half**2 * frames
     flux = source.response.flux(np.asarray(counts.ravel()[index] / frames, np.float32), exposure)

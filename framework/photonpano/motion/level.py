@@ -18,6 +18,7 @@ from photonpano.values import BoolArray, Decision, DecisionValue, FloatArray, Fr
 
 # Frames of the shortest part of a group that is kept beside a cut.
 _SHORTEST_PART = 4
+SHORTEST_DARK = 32  # frames without light in a row, between which the camera may move as it likes
 _SAMPLED = 8  # instants of a group at which its motion is looked at
 # In pixels of frames, as in the motion graph and in trajectories.
 FrameHomography = NewType("FrameHomography", FloatArray)
@@ -59,7 +60,7 @@ class Timeline:
 
     taken: FloatArray  # (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated
     cuts: tuple[Cut, ...] = ()  # where the image jumps, in order
-    dark: tuple[FrameSpan, ...] = ()  # frames without light, in order: no group holds them, and they are not located
+    unlit: tuple[FrameSpan, ...] = ()  # frames without light, in order: they count in no sum
     shots: tuple[FrameSpan, ...] = ()  # parts that no motion ties together, in order; groups are of the longest
 
     @classmethod
@@ -68,9 +69,14 @@ class Timeline:
         return cls(np.arange(n_frames, dtype=np.float64))
 
     @classmethod
-    def with_repeats(cls, repeated: BoolArray, dark: tuple[FrameSpan, ...] = ()) -> Timeline:
+    def with_repeats(cls, repeated: BoolArray, unlit: tuple[FrameSpan, ...] = ()) -> Timeline:
         """Return that of a capture without missing frames; (T,) True for frames that are copies of the frame before."""
-        return cls(np.cumsum(~repeated).astype(np.float64) - 1.0, dark=dark)
+        return cls(np.cumsum(~repeated).astype(np.float64) - 1.0, unlit=unlit)
+
+    @property
+    def dark(self) -> tuple[FrameSpan, ...]:
+        """Frames without light for so long that the camera may move as it likes: no group holds them, none is located."""
+        return tuple(span for span in self.unlit if len(span) >= SHORTEST_DARK)
 
     @property
     def copies(self) -> BoolArray | None:
@@ -83,7 +89,7 @@ class Timeline:
         """(T,) whether each frame shows the scene of the panorama, neither darkness nor another shot."""
         frames = np.arange(len(self.taken))
         shown = (self.shot.start <= frames) & (frames < self.shot.stop)
-        for span in self.dark:
+        for span in self.unlit:
             shown[span.start : span.stop] = False
         return shown
 
@@ -186,7 +192,7 @@ class Timeline:
     def _is_left_out(self, span: FrameSpan) -> bool:
         if span.start < self.shot.start or span.stop > self.shot.stop:
             return True
-        dark = [*self.dark, *(cut.dark for cut in self.cuts if cut.dark is not None)]
+        dark = [*self.unlit, *(cut.dark for cut in self.cuts if cut.dark is not None)]
         return any(each.start <= span.start and span.stop <= each.stop for each in dark)
 
 

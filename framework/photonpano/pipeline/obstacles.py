@@ -19,10 +19,10 @@ from photonpano.errors import InputError, LocationError, PhotonpanoError, descri
 from photonpano.execution.context import Context, Progress
 from photonpano.geometry import corners, inverse, transform_points
 from photonpano.locating.images import correlation_peaks
-from photonpano.merging import binned_mean, binning_of
+from photonpano.merging import binned_mean
 from photonpano.merging.accumulate import weights_of
 from photonpano.motion.graph import components
-from photonpano.motion.level import Timeline
+from photonpano.motion.level import SHORTEST_DARK, Timeline
 from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.tracking import DARK
 from photonpano.plugins.contributions import PartOfCapture
@@ -43,14 +43,16 @@ _REACH = 1 / 3  # largest shift that is looked at, as a share of the frame
 _FILTER_BLUR_PX = 1.0  # standard deviation of the Gaussian that blurs a colour filter array
 _STANDING = 0.3  # share of the frame from which what stands still is named
 _BLOCK_FRAMES, _FEW_FRAMES = 256, 16  # frames that are compared at a time, if they are packed and if not
-_ROW_STRIDE = 16  # frames are compared on every 16th row first
+_ROWS = 32  # rows of the frame on which frames are compared first
 # Frames that are repeated differ from the frame before by this many newly lit pixels, and as many that went dark: dark frames
 # are alike by chance, and so are saturated ones.
 _FEWEST_NEW = 20
-# Frames without light: at least so many in a row, in at most so many places, since light that goes off more often flickers.
-_SHORTEST_DARK, _MOST_DARK = 32, 8
+# Frames without light: the light goes off at once, or for so many frames in so few places that it does not flicker.
+_MOST_DARK = 8
 _FEW_PHOTONS = 100.0  # frames of fewer photons, on the rows that are compared, are averaged
-_SHAPELESS = 2.0  # most variance of binned pixels in the dark, relative to that of their counts: a scene, however dim, has more
+_LIT = 0.5  # light beside frames without any, relative to the usual light, from which on it has gone off at once
+_SHAPE_PX, _COLD = 15, 0.99  # binned pixels are compared with the mean around them; the share that is not hot
+_SHAPE_SIGMAS, _MOST_SHAPES = 5.0, 64  # from which on they show a scene; most spans that are looked at
 logger = logging.getLogger(__name__)
 ResultT = TypeVar("ResultT")
 
@@ -169,38 +171,54 @@ def timeline_of(source: Source, context: Context) -> Timeline:
         original = run.start - 1
         if original and not _differ(*_frames(capture, FrameSpan(original - 1, original + 1))):
             same[run.start : run.stop] = False
-    return Timeline.with_repeats(same, _dark_spans(capture, photons) if capture.is_packed else ())
+    return Timeline.with_repeats(same, _unlit_spans(capture, photons) if capture.is_packed else ())
 
 
-def _dark_spans(capture: Capture, photons: FloatArray) -> tuple[FrameSpan, ...]:
-    """Return the frames without light, as of a closed shutter, from the (T,) photons of some rows of each frame."""
+def _unlit_spans(capture: Capture, photons: FloatArray) -> tuple[FrameSpan, ...]:
+    """Return the frames without light, as of a closed shutter or a lamp that is off, from the (T,) photons of some rows."""
     usual = float(np.quantile(photons, 0.9))
     size = int(np.clip(_FEW_PHOTONS / max(usual, 1e-9), 1, len(photons)))
-    smooth = ndimage.uniform_filter1d(photons, size, mode="nearest")
-    runs = [run for run in true_spans(smooth < DARK * usual) if len(run) >= _SHORTEST_DARK]
-    return tuple(run for run in runs if _is_shapeless(capture, run)) if len(runs) <= _MOST_DARK else ()
+    light = ndimage.uniform_filter1d(photons, size, mode="nearest") / max(usual, 1e-9)
+    runs = true_spans(light < DARK)
+    closed = [run for run in runs if len(run) >= SHORTEST_DARK]
+    if len(closed) > _MOST_DARK:
+        closed = []
+    beside = np.pad(light, 1 + size, constant_values=1.0)
+    sides = [(beside[run.start : run.start + 1 + size], beside[run.stop + 1 + size : run.stop + 2 + 2 * size]) for run in runs]
+    off = [run for run, (before, after) in zip(runs, sides, strict=True) if min(before.max(), after.max()) > _LIT]
+    brief = [run for run in off if len(run) < SHORTEST_DARK]
+    unlit = [run for run in {*closed, *off}.difference(brief) if not _has_shape(capture, [run])]
+    if brief and not _has_shape(capture, brief[:: -(-len(brief) // _MOST_SHAPES)]):
+        unlit += brief
+    return tuple(sorted(unlit, key=lambda run: run.start))
 
 
-def _is_shapeless(capture: Capture, span: FrameSpan) -> bool:
-    """Return whether frames show nothing but noise. A dim part of the scene has a contrast."""
-    middle = int(span.centre)
-    part = FrameSpan(max(span.start, middle - _FRAMES // 4), min(span.stop, middle + _FRAMES // 4))
-    counts = binned_mean(capture, part) * len(part) * binning_of(capture) ** 2
-    counts = counts[np.isfinite(counts)]
-    mean = float(np.median(counts))
-    return robust_std(counts - mean) ** 2 < _SHAPELESS * max(mean, 1.0)
+def _has_shape(capture: Capture, spans: Sequence[FrameSpan]) -> bool:
+    """Return whether frames show a scene, however dim: it makes neighbouring pixels alike, and noise does not."""
+    alike = variance = 0.0
+    for span in spans:
+        mean = binned_mean(capture, span)
+        valid = np.isfinite(mean)
+        # Hot pixels, and a slow change of the dark counts over the sensor, are no scene.
+        counts = np.minimum(np.nan_to_num(mean), np.quantile(mean[valid], _COLD, method="lower")).astype(np.float64)
+        around = [ndimage.uniform_filter(each, _SHAPE_PX) for each in (counts * valid, valid.astype(np.float64))]
+        beyond = np.where(valid, counts - around[0] / np.maximum(around[1], 1e-9), 0)
+        for products in (beyond[1:] * beyond[:-1], beyond[:, 1:] * beyond[:, :-1]):
+            alike, variance = alike + float(products.sum()), variance + float((products**2).sum())
+    return bool(alike > _SHAPE_SIGMAS * np.sqrt(variance))
 
 
 def _compared(capture: Capture, span: FrameSpan) -> tuple[BoolArray, NDArray[np.integer]]:
     """Return whether each frame of a span but the first equals the one before it, and the photons of some rows of each."""
     frames = _frames(capture, span)
-    some = frames[:, ::_ROW_STRIDE]
+    stride = max(1, frames.shape[1] // _ROWS)
+    some = frames[:, ::stride]
     same = (some[1:] == some[:-1]).all(axis=(1, 2))
     for index in np.flatnonzero(same):
         same[index] = np.array_equal(frames[index], frames[index + 1])
     if not capture.is_packed:
         return np.asarray(same), np.zeros(len(span), np.int64)
-    usable, always = (each.valid[::_ROW_STRIDE] for each in (capture.masked_in(span), capture))
+    usable, always = (each.valid[::stride] for each in (capture.masked_in(span), capture))
     lit = np.bitwise_count(some & np.packbits(usable, axis=-1)).sum(axis=(1, 2), dtype=np.int64)
     return np.asarray(same), lit if usable is always else lit * always.sum() // max(int(usable.sum()), 1)
 

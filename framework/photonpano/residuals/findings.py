@@ -8,6 +8,8 @@ from photonpano.motion.level import Timeline
 from photonpano.text import listed
 from photonpano.values import Decision, FrameSpan
 
+_MOST_LISTED = 8  # spans without light that are named one by one
+
 
 @dataclass(frozen=True, slots=True)
 class Jump:
@@ -57,7 +59,7 @@ class Findings:
     def along(self, timeline: Timeline) -> Findings:
         """Return these findings with those of a timeline."""
         cuts = tuple(Jump(each.frame, each.size_px, each.sigmas, each.dark) for each in timeline.cuts)
-        return replace(self, repeated=timeline.n_repeated, dark=timeline.dark, shots=timeline.shots, cuts=cuts)
+        return replace(self, repeated=timeline.n_repeated, dark=timeline.unlit, shots=timeline.shots, cuts=cuts)
 
     @property
     def started(self) -> list[Decision]:
@@ -68,13 +70,19 @@ class Findings:
     def of_frames(self) -> list[Decision]:
         """What is known of missing, repeated and dark frames, for the record."""
         found = [Decision("repeated_frames", self.repeated, "copies of the frame before; the motion stands still there")]
-        dark = [
-            Decision("dark_frames", str(span), "no light reaches the sensor; these frames are left out") for span in self.dark
-        ]
+        dark = [Decision("dark_frames", each, "no light reaches the sensor; these frames are left out") for each in self._dark]
         longest = max(self.shots, key=len, default=None)
         apart = f"no motion ties them together; {longest} are located, since they are the most"
         shots = [Decision("shots", listed(map(str, self.shots)), apart)] if self.shots else []
         return (found if self.repeated else []) + shots + dark + [cut.decision for cut in self.cuts]
+
+    @property
+    def _dark(self) -> list[str]:
+        """The spans of frames without light, or how many frames in how many of them, where a lamp flashes."""
+        if len(self.dark) <= _MOST_LISTED:
+            return [str(span) for span in self.dark]
+        n_frames = sum(len(span) for span in self.dark)
+        return [f"{n_frames:,} frames in {len(self.dark):,} spans, the first {self.dark[0]}"]
 
 
 NOTHING = Findings()

@@ -91,13 +91,15 @@ class Prediction:
         """
         self._sample(homography, into)
         if self.light is not None and span is not None:  # of `gain` times the flux
-            gain = gain_image(self.light, span, homography, self.frame_shape)
+            # Frames that are left out have no photons, and the others the gain that is theirs.
+            shown = float(self.light.shown[span.start : span.stop].mean())
+            gain = gain_image(self.light, span, homography, self.frame_shape) / max(shown, 1e-9)
             mean, variance = into
             flux = self.response.flux(mean, _MANY_FRAMES)
             lit = np.asarray(gain * flux, np.float32)
-            mean[:] = self.response.mean_count(lit)
+            mean[:] = shown * self.response.mean_count(lit)
             before, after = (frame_variance(each, self.response, self.response.mean_count) for each in (flux, lit))
-            variance *= after / before
+            variance *= shown * after / before
 
     def _sample(self, homography: Homography, into: NDArray[np.float32]) -> None:
         step = min(NODES_PX)
