@@ -100,14 +100,14 @@ class _Folder:
         levels = read_picture(file, f"is damaged: frame {index} cannot be read; copy it again", cv2.IMREAD_UNCHANGED)
         if levels.shape != self.form[:2] or 8 * levels.itemsize != self.form.bits:
             raise InputError(f"{file} has changed: it had {self.form} when the capture was opened")
-        return levels
+        return _not_negative(levels, f"{file}")
 
     def close(self) -> None:
         """Do nothing: no file stays open."""
 
 
 class _Pages:
-    """A page of a TIFF file for each frame."""
+    """A page of a TIFF file for each frame; or, as ImageJ writes large stacks, a single page and all frames behind it."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -115,24 +115,53 @@ class _Pages:
         self._file = _tiff(path)
         try:
             with reading(path, _DAMAGED):
-                self.n_frames = len(self._file.pages)
                 pages = enumerate(self._file.pages)
                 self.form = _common((f"page {number} of {path}", _form_of_page(path, page)) for number, page in pages)
+                self._stack = _stack_of(path, self._file, self.form) if len(self._file.pages) == 1 else None
+                self.n_frames = len(self._file.pages if self._stack is None else self._stack)
         except BaseException:
             self.close()
             raise
 
     def read(self, index: int) -> Image:
         with reading(self._path, f"is damaged: page {index} cannot be read; copy it again"), self._lock:
-            levels = np.asarray(self._file.pages[index].asarray())
+            levels = np.asarray(self._file.pages[index].asarray() if self._stack is None else self._stack[index])
         if levels.shape != self.form[:2] or 8 * levels.itemsize != self.form.bits:
             raise InputError(
                 f"{self._path} is damaged: page {index} is not of {self.form}, as its header promises; copy it again"
             )
-        return levels
+        return _not_negative(levels, f"page {index} of {self._path}")
 
     def close(self) -> None:
         self._file.close()
+
+
+def _stack_of(path: Path, file: tifffile.TiffFile, form: _Form) -> Image | None:
+    """Return the frames behind the only page of a file, (T, H, W); None if there is the page alone."""
+    stack = file.imagej_metadata or {}
+    n_frames, n_channels = int(stack.get("images", 1)), int(stack.get("channels", 1))
+    if 1 < n_channels < n_frames:
+        raise InputError(f"{path} holds a stack of {n_channels} channels; save each channel, in grey, as a file of its own")
+    if n_frames == 1:
+        return None
+    first = file.pages[0].dataoffsets[0]
+    promised, there = first + n_frames * form.height * form.width * form.bits // 8, path.stat().st_size
+    if there < promised:
+        raise InputError(
+            f"{path} is cut short: it promises {n_frames} frames, {promised:,} bytes, and has {there:,}; copy it again"
+        )
+    levels = np.dtype(file.pages[0].dtype).newbyteorder(file.byteorder)
+    return np.memmap(path, levels, "r", first, (n_frames, form.height, form.width))
+
+
+def _not_negative(levels: Image, name: str) -> Image:
+    """Return levels, which may have a sign; an `InputError` says which are below zero: they are no photons."""
+    if levels.dtype.kind == "i" and (lowest := int(levels.min())) < 0:
+        raise InputError(
+            f"{name} has values below zero, down to {lowest}: a black level was subtracted; save the frames without that, or "
+            f"add {-lowest} or more to all of them"
+        )
+    return levels
 
 
 def _common(forms: Iterable[tuple[str, _Form]]) -> _Form:
@@ -174,6 +203,13 @@ def _form_of_page(file: Path, page: tifffile.TiffPage | tifffile.TiffFrame) -> _
     page = page.aspage()
     if page.samplesperpixel != 1 or page.photometric != tifffile.PHOTOMETRIC.MINISBLACK:
         raise InputError(f"{file} has colours, or white as 0; convert the frames to grey")
+    if page.sampleformat not in (tifffile.SAMPLEFORMAT.UINT, tifffile.SAMPLEFORMAT.INT):
+        raise InputError(f"{file} has numbers with fractions ({page.dtype}); convert the frames to 8 or 16 bits")
+    orientation = page.tags.valueof("Orientation", default=1)
+    if orientation != 1:
+        raise InputError(
+            f"{file} is to be turned or mirrored to be shown (orientation {orientation}); turn it, and save it again"
+        )
     return _grey(file, _Form(page.imagelength, page.imagewidth, page.bitspersample))
 
 

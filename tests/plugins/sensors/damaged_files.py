@@ -194,6 +194,18 @@ def pages(*images: np.ndarray, **tags: int) -> Arrange:
     return arrange
 
 
+def stack(image: np.ndarray, cut: int = 0, **options: Any) -> Arrange:
+    """Write a TIFF file as ImageJ does: one page, and all frames behind it."""
+
+    def arrange(folder: Path) -> dict[str, Any]:
+        path = folder / "a.tif"
+        tifffile.imwrite(path, image, **options)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size - cut])
+        return {"path": path}
+
+    return arrange
+
+
 BITS_KEYS: dict[str, Any] = {"holds": "bits", "frame_axis": "first"}
 SUMS_KEYS: dict[str, Any] = {"holds": "sums", "frames_per_sum": 300, "frame_axis": "first"}
 LAST: dict[str, Any] = {"frame_axis": "last"}
@@ -306,4 +318,9 @@ CASES: dict[str, Arrange] = {
     "image-folder of text": files({"a.png": b"1234"}),
     "image-folder of 48 GiB": files({"1.png": png_of(200_000, 250_000)}),
     "image-folder with pages of two sizes": pages(SMALL, LARGE),
+    "image-folder with half a stack of ImageJ": stack(np.stack([SMALL] * 9), 100, imagej=True, truncate=True),
+    "image-folder with channels": stack(np.stack([[SMALL] * 2] * 9), imagej=True, truncate=True, metadata={"axes": "TCYX"}),
+    "image-folder below zero": stack(np.full((9, 4, 6), -7, np.int16)),
+    "image-folder of floats": stack(np.zeros((9, 4, 6), np.float16)),
+    "image-folder that is to be turned": stack(np.stack([SMALL] * 9), extratags=[("Orientation", "H", 1, 6, True)]),
 }

@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError
 from photonpano.photometry import srgb_to_linear
-from photonpano_sensors.intensity.contributions import FastcamMrawConfig, ResponseConfig
-from photonpano_sensors.intensity.pictures import FastcamMrawSource
+from photonpano_sensors.intensity.contributions import FastcamMrawConfig, ImageFolderConfig, ResponseConfig
+from photonpano_sensors.intensity.pictures import FastcamMrawSource, ImageFolderSource
 from photonpano_sensors.intensity.source import Encoding, LinearLevels, linear_levels
 
 LIMITED = Encoding(8, 16.0, 235.0)
@@ -72,6 +73,15 @@ def test_invalid_curve_file_is_refused(tmp_path: Path, content: str, golden: str
     with pytest.raises(InputError) as raised:
         levels(curve_file=file)
     assert str(raised.value) == golden.replace("FILE", str(file))
+
+
+@pytest.mark.parametrize("byteorder", ["<", ">"])
+def test_stack_of_imagej_has_all_its_frames(tmp_path: Path, byteorder: Any) -> None:
+    frames = np.random.default_rng(0).integers(0, 4000, (7, 24, 40)).astype(np.uint16)
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, frames, byteorder=byteorder, imagej=True, truncate=True)
+    with ImageFolderSource(ImageFolderConfig(path=path)) as source:
+        np.testing.assert_array_equal(source.frames(source.info.span), frames)
 
 
 def test_curve_and_curve_file_together_are_refused() -> None:
