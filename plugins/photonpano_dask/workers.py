@@ -48,7 +48,7 @@ def _client(config: DaskConfig, threads: int, stack: ExitStack) -> Client:
     if config.address is None:
         number = config.workers or threads
         cluster = LocalCluster(n_workers=number, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL)
-        return Client(stack.enter_context(cluster))
+        return Client(stack.enter_context(cluster), direct_to_workers=True)  # not through the scheduler
     try:
         return Client(config.address, timeout=_PATIENCE_S)
     except (OSError, ValueError) as error:
