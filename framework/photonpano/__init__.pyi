@@ -66,7 +66,6 @@ from .evaluation import Evaluation as Evaluation
 from .evaluation import PoseScore as PoseScore
 from .evaluation import RunTrajectory as RunTrajectory
 from .evaluation import evaluate_poses as evaluate_poses
-from .execution import Executor as Executor
 from .execution.context import Progress as Progress
 from .execution.context import Quiet as Quiet
 from .files.paths import Location as Location

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import TypeVar
 
 import photonpano_core as plugin
 from photonpano import (
-    Executor,
     ExecutorContext,
     ExecutorContribution,
     ExporterContribution,
@@ -213,6 +213,4 @@ def _build_merge(_: configs.NoKeys, context: StageContext) -> Renderer:
 
 
 def _build_threads(_: configs.NoKeys, context: ExecutorContext) -> Executor:
-    from photonpano.execution import LocalExecutor
-
-    return LocalExecutor(context.threads)
+    return ThreadPoolExecutor(context.threads)

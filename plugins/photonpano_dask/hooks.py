@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 
-from photonpano import Executor, ExecutorContext, ExecutorContribution, Requirement, hookimpl
+from photonpano import ExecutorContext, ExecutorContribution, Requirement, hookimpl
 from photonpano_dask.configs import DaskConfig
 
 
@@ -21,7 +22,6 @@ def photonpano_executors() -> Iterator[ExecutorContribution]:
 
 
 def _build(config: DaskConfig, context: ExecutorContext) -> Executor:
-    from photonpano.execution import Remote
-    from photonpano_dask.workers import workers_of
+    from photonpano_dask.workers import executor_of
 
-    return Remote(workers_of(config, context), context.capture)
+    return executor_of(config, context)

@@ -2,26 +2,26 @@
 
     python tests/benchmarks/scale.py docs/explanation/scale.md [--frames 10000 40000]
 
-Runs captures of several lengths in one thread, with an executor that packs what each task is given and returns, as for another
-process. It notes the processor time and the bytes of each task, and the processor time of the client beside them. A simulation
-of the scheduler then works on the tasks of longer captures with many workers.
+Runs captures of several lengths in one thread, with an executor that works on copies, as another process would. It notes the
+processor time and the bytes of each task, and the processor time of the client beside them. A simulation of the scheduler then
+works on the tasks of longer captures with many workers.
 """
 
 from __future__ import annotations
 
 import json
+import pickle
 import subprocess
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -31,13 +31,12 @@ from harness import IMAGES, command, packed, passing, table, write_tables
 from scheduling import Costs, Kind, Measured, prediction
 from speed import GROUP_SIZE, PX_A_FRAME, SHAPE, THREADS, simulated
 
-from photonpano import ExecutorContext, FrameSpan, Source, discover, parse_spec, run
-from photonpano.capture import capture_of
-from photonpano.execution import CaptureElsewhere, LocalExecutor
-from photonpano.execution.context import Quiet
-from photonpano.execution.executor import packed as packed_for_worker
+from photonpano import Config, ExecutorContext, ExecutorContribution, FrameSpan, discover, parse_spec, run
+from photonpano.execution.context import Quiet, _each
+from photonpano.execution.threads import in_order
 from photonpano.geometry import FrameTrajectory
 from photonpano.merging import chunks_of
+from photonpano.motion.registration import ExposureTasks, worked
 from photonpano_dask.configs import DaskConfig
 
 DASK = discover().find("executor", "dask").contribution
@@ -47,58 +46,44 @@ EMPTY_TASKS = 2000
 PATH_FRAMES = 400_000
 
 
-class Measuring(LocalExecutor):
-    """Works on each task here, and notes what it takes and what would travel."""
+class NoKeys(Config):
+    """No keys."""
 
-    def __init__(self, capture: Source, stage: Callable[[], str]) -> None:
-        super().__init__(1)
+
+class Measuring(Executor):
+    """Works on each task at once on copies, as another process would, and notes what it takes and what travels."""
+
+    under_way = 1
+
+    def __init__(self, stage: Callable[[], str]) -> None:
         self.kinds: dict[tuple[str, str], Kind] = defaultdict(Kind)
-        self.packing_seconds = 0.0
-        self._capture, self._stage = capture, stage
-        self._stay: dict[int, Any] = {}
+        self.seconds = 0.0
+        self._stage = stage
 
-    def share(self, value: Any) -> Any:
-        """Note a value that travels to each worker once."""
-        kind = self.kinds[self._stage(), f"shared: {name_of(value)}"]
-        kind.tasks += 1
-        kind.to_worker += self._size(value)
-        self._stay[id(value)] = value
-        return value
-
-    def call(self, work: Callable[..., Any], *given: Any) -> Any:
-        """Note a task."""
-        return self._measured(work, given, lambda result: result)
-
-    def keep(self, work: Callable[..., Any], *given: Any) -> Any:
-        """Note a task whose first result stays, and that result by itself: it travels at most to the worker of a pair."""
-        kept, known = self._measured(work, given, lambda both: both[1])
-        self._stay[id(kept)] = kept
-        kind = self.kinds[self._stage(), "kept: features"]
-        kind.tasks += 1
-        kind.to_worker += self._size(kept)
-        return kept, known
-
-    def _measured(self, work: Callable[..., Any], given: tuple[Any, ...], returned: Callable[[Any], Any]) -> Any:
-        kind = self.kinds[self._stage(), name_of(work)]
-        kind.tasks += 1
-        kind.to_worker += sum(self._size(each) for each in (work, *given) if id(each) not in self._stay)
-        begin = time.thread_time()
+    def submit(self, work: Callable[..., Any], *given: Any) -> Future[Any]:
+        """Work on a task, and note it."""
+        begin, done = time.thread_time(), Future[Any]()
         result = work(*given)
-        kind.seconds += time.thread_time() - begin
-        kind.from_worker += self._size(returned(result))
-        return result
+        seconds = time.thread_time() - begin
+        returned = pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
+        done.set_result(pickle.loads(returned))
+        kind = self.kinds[self._stage(), name_of(*pickle.loads(given[0]))]
+        kind.tasks += 1
+        kind.seconds += seconds
+        kind.to_worker += len(given[0])
+        kind.from_worker += len(returned)
+        self.seconds += time.thread_time() - begin
+        return done
 
-    def _size(self, value: Any) -> int:
-        begin = time.thread_time()
-        size = len(packed_for_worker(value, self._capture))
-        self.packing_seconds += time.thread_time() - begin
-        return size
 
-
-def name_of(work: Any) -> str:
-    """Return the name of a task."""
-    work = work.func if isinstance(work, partial) else work
-    return str(getattr(work, "__name__", type(work).__name__)).lstrip("_")
+def name_of(work: Any, given: tuple[Any, ...]) -> str:
+    """Return the name of a task: of the function whose items it works on."""
+    while isinstance(work, partial) or work in (worked, _each):
+        if isinstance(work, partial):
+            work, given = work.func, (*work.args, *given)
+        else:
+            work, given = given[given[0].__class__ is ExposureTasks], ()
+    return str(work.__name__).lstrip("_")
 
 
 class Stages(Quiet):
@@ -116,34 +101,25 @@ class Stages(Quiet):
 
 def measured(cube: Path, n_frames: int) -> Measured:
     """Run a capture with the executor that measures."""
-    stages, executors = Stages(), list[Measuring]()
-
-    @contextmanager
-    def executor_of(_: Any, source: Source) -> Iterator[Measuring]:
-        executors.append(Measuring(capture_of(source).source, lambda: stages.title))
-        yield executors[0]
-
-    spec = packed(cube, None, resample={"with": {"group_size": GROUP_SIZE}}, run={"threads": 1})
+    stages = Stages()
+    executor = Measuring(lambda: stages.title)
+    offer = ExecutorContribution(name="measuring", summary="Notes tasks", config=NoKeys, build=lambda *_: executor)
+    settings = {"threads": 1, "executor": "measuring"}
+    spec = packed(cube, None, resample={"with": {"group_size": GROUP_SIZE}}, run=settings)
     begin = time.process_time()
-    with mock.patch("photonpano.pipeline.run.executor_of", executor_of):
-        run(parse_spec(spec, output=cube.with_suffix(".run")), stages)
-    whole = time.process_time() - begin
-    executor = executors[0]
-    tasks = sum(kind.seconds for kind in executor.kinds.values())
-    return Measured(n_frames, dict(executor.kinds), whole - tasks - executor.packing_seconds)
+    run(parse_spec(spec, output=cube.with_suffix(".run"), catalog=discover().including(offer)), stages)
+    return Measured(n_frames, dict(executor.kinds), time.process_time() - begin - executor.seconds)
 
 
 def measured_costs() -> Costs:
     """Have a cluster of this machine work on empty tasks, and divide a long path into chunks."""
     with cluster() as (address, scheduler):
-        context = ExecutorContext(THREADS, CaptureElsewhere(None, dict), here={}, elsewhere=dict)
-        executor = DASK.build(DaskConfig(address=address), context)
-        with ThreadPoolExecutor(executor.under_way) as pool:
-            list(pool.map(partial(executor.call, len), [[each] for each in range(200)]))
-            before = time.process_time(), sum(scheduler.cpu_times()[:2])
-            list(pool.map(partial(executor.call, len), [[each] for each in range(EMPTY_TASKS)]))
-            client, handed = time.process_time() - before[0], sum(scheduler.cpu_times()[:2]) - before[1]
-        executor.close()
+        executor = DASK.build(DaskConfig(address=address), ExecutorContext(THREADS))
+        list(in_order(len, [[each] for each in range(200)], executor.under_way, executor))
+        before = time.process_time(), sum(scheduler.cpu_times()[:2])
+        list(in_order(len, [[each] for each in range(EMPTY_TASKS)], executor.under_way, executor))
+        client, handed = time.process_time() - before[0], sum(scheduler.cpu_times()[:2]) - before[1]
+        executor.shutdown()
     path = np.tile(np.eye(3), (PATH_FRAMES, 1, 1))
     path[:, 0, 2] = PX_A_FRAME * np.arange(PATH_FRAMES)
     trajectory, begin = FrameTrajectory(path), time.process_time()
@@ -179,9 +155,8 @@ def rows_of_tasks(run: Measured) -> Iterator[Sequence[str]]:
     """Yield the rows of the table of tasks."""
     for (stage, name), kind in run.kinds.items():
         if not stage.startswith("after") and kind.tasks:
-            time_ms = "" if name.startswith(("shared", "kept")) else f"{1e3 * kind.seconds / kind.tasks:.1f} ms"
-            sizes = (f"{size / kind.tasks / 1e3:,.1f} kB" if size else "" for size in (kind.to_worker, kind.from_worker))
-            yield stage, name, f"{kind.tasks:,}", time_ms, *sizes
+            sizes = (f"{size / kind.tasks / 1e3:,.1f} kB" for size in (kind.to_worker, kind.from_worker))
+            yield stage, name, f"{kind.tasks:,}", f"{1e3 * kind.seconds / kind.tasks:.1f} ms", *sizes
 
 
 def rows_of_predictions(run: Measured, costs: Costs, limits: dict[int, dict[str, float]]) -> Iterator[Sequence[str]]:
@@ -219,7 +194,7 @@ def main(page: Path | None, frames: Sequence[int] = (10_000, 40_000)) -> None:
     """Measure two captures, the shorter first, predict, and write the page."""
     costs, limits = measured_costs(), dict[int, dict[str, float]]()
     with passing() as study:
-        cubes = [simulated(study, number) for number in frames]
+        cubes = [simulated(study, number, "smooth") for number in frames]
         # What is imported and loaded once does not count.
         measured(cubes[0], frames[0])
         shorter, longer = (measured(cube, number) for cube, number in zip(cubes, frames, strict=True))

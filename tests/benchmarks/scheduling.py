@@ -13,7 +13,6 @@ STORAGE_BYTES_S = 5e9  # what a shared storage reads for all workers together: a
 LINK_BYTES_S = 1.25e9  # what the client, and each worker, sends and receives: an assumption, ten gigabits per second
 WINDOW = 4  # tasks under way for each worker
 READING = "panorama", "residuals"  # stages beside the levels that read the whole capture
-AT_ONCE = 8  # items of a task, where there are many: as `photonpano.execution.Remote` has it
 
 
 @dataclass
@@ -41,20 +40,15 @@ class Measured:
     client_s: float
 
     def scaled(self, shorter: Measured, n_frames: int) -> Measured:
-        """Predict a longer capture from this one and a shorter one: tasks and time of the client grow along a line."""
+        """Predict a longer capture from this one and a shorter one: tasks, their bytes, and the client grow along a line."""
         grown = (n_frames - self.n_frames) / (self.n_frames - shorter.n_frames)
         kinds = {}
         for key, kind in self.kinds.items():
-            before = shorter.kinds.get(key, Kind())
-            # What is shared once a stage grows with the capture, what is done by the task grows in number.
-            tasks = kind.tasks if key[1].startswith("shared") else round(kind.tasks + grown * (kind.tasks - before.tasks))
-            each = (
-                kind.to_worker + grown * (kind.to_worker - before.to_worker)
-                if key[1].startswith("shared")
-                else kind.to_worker * tasks / kind.tasks
-            )
-            share = tasks / kind.tasks
-            kinds[key] = Kind(tasks, kind.seconds * share, round(each), round(kind.from_worker * share))
+            before = shorter.kinds.get(key, kind)
+            tasks = round(kind.tasks + grown * (kind.tasks - before.tasks))
+            size, size_before = kind.to_worker / kind.tasks, before.to_worker / before.tasks
+            sent, share = tasks * max(size, size + grown * (size - size_before)), tasks / kind.tasks
+            kinds[key] = Kind(tasks, kind.seconds * share, round(sent), round(kind.from_worker * share))
         return Measured(n_frames, kinds, self.client_s + grown * (self.client_s - shorter.client_s))
 
 
@@ -82,8 +76,7 @@ class Stage:
         first: seconds of the first task of a bundle, and how many tasks of the scheduler it is.
         second: the same of the task that follows it, and needs the first task of the bundle before, too.
         chained: whether the second task also needs that of the bundle before, as at the first level.
-        shared: bytes that travel from the client to each worker.
-        returned: bytes that travel to the client.
+        moved: bytes that travel from and to the client.
         read: bytes of the capture.
         begun_s: what each worker takes before its first task.
     """
@@ -91,8 +84,7 @@ class Stage:
     bundles: int
     first: tuple[float, float]
     second: tuple[float, float]
-    shared: int
-    returned: int
+    moved: int
     read: float
     begun_s: float
     chained: bool = False
@@ -103,7 +95,7 @@ class Stage:
         return {
             "work of the workers": self.bundles * (self.first[0] + self.second[0]) / workers,
             "handing tasks on": handed * max(costs.client_s, costs.scheduler_s),
-            "bytes to and from the client": (self.shared * workers + self.returned) / LINK_BYTES_S,
+            "bytes to and from the client": self.moved / LINK_BYTES_S,
             "reading the capture": self.read / STORAGE_BYTES_S,
             "start of each worker": self.begun_s,
             "exposures that wait for the one before": self.bundles * self._link_s(costs) if self.chained else 0.0,
@@ -115,9 +107,9 @@ class Stage:
 
     def seconds(self, costs: Costs, workers: int) -> float:
         """Simulate the stage: each task goes in order to the first worker that is free, with four under way for each worker."""
-        handing_s = max(costs.client_s, costs.scheduler_s, self.returned / self.bundles / LINK_BYTES_S)
+        handing_s = max(costs.client_s, costs.scheduler_s, self.moved / self.bundles / LINK_BYTES_S)
         read_s = self.read / self.bundles / (STORAGE_BYTES_S / workers)
-        begin = self.begun_s + self.shared * workers / LINK_BYTES_S
+        begin = self.begun_s
         free, handed, described, end = [begin] * workers, begin, begin, begin
         done: list[float] = [begin]
         for index in range(self.bundles):
@@ -142,27 +134,18 @@ def stages_of(run: Measured, costs: Costs) -> list[Stage]:
     by_stage: dict[str, dict[str, Kind]] = defaultdict(dict)
     for (stage, name), kind in run.kinds.items():
         by_stage[stage][name] = kind
-    found, shared = list[Stage](), 0
-    for stage, kinds in by_stage.items():
-        shared += sum(kind.to_worker for name, kind in kinds.items() if name.startswith("shared"))
-        tasks = {name: kind for name, kind in kinds.items() if not name.startswith(("shared", "kept"))}
-        if not tasks:
-            continue
-        returned = sum(kind.from_worker for kind in tasks.values())
-        read = run.n_frames * FRAME_BYTES
+    found = list[Stage]()
+    for stage, tasks in by_stage.items():
+        bundles = max(kind.tasks for kind in tasks.values())
+        moved, read = sum(kind.to_worker + kind.from_worker for kind in tasks.values()), run.n_frames * FRAME_BYTES
         if "describe" in tasks:
-            first = stage.startswith("level 1")
-            bundles = -(-tasks["describe"].tasks // AT_ONCE)
-            moved_s = kinds["kept: features"].to_worker / bundles / LINK_BYTES_S
-            registered = sum(kind.seconds for name, kind in tasks.items() if name.startswith("register"))
-            describe, register = (tasks["describe"].seconds / bundles, 2.0), (registered / bundles + moved_s, 1.0)
-            begun_s = 0.0 if first else costs.start_s * run.n_frames
-            found.append(Stage(bundles, describe, register, shared, returned, read, begun_s, chained=first))
+            chained = stage.startswith("level 1")
+            first, second = tasks.pop("describe").seconds, sum(kind.seconds for kind in tasks.values())
+            begun_s = 0.0 if chained else costs.start_s * run.n_frames
+            found.append(Stage(bundles, (first / bundles, 1.0), (second / bundles, 1.0), moved, read, begun_s, chained))
         else:
-            bundles = -(-max(kind.tasks for kind in tasks.values()) // AT_ONCE)
             work = sum(kind.seconds for kind in tasks.values()) / bundles
-            found.append(Stage(bundles, (work, 1.0), (0.0, 0.0), shared, returned, read if stage in READING else 0.0, 0.0))
-        shared = 0
+            found.append(Stage(bundles, (work, 1.0), (0.0, 0.0), moved, read if stage in READING else 0.0, 0.0))
     return found
 
 

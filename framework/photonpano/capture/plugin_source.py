@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -54,7 +54,10 @@ class PluginSource:
         info: frames, size, rate.
         valid: (H, W) mask.
         response: how flux becomes counts.
+        opener: opens the source in another process, where it travels as this; None for a source that travels as it is.
     """
+
+    opener: Callable[[], PluginSource] | None = None
 
     def __init__(self, source: Source, origin: str | None) -> None:
         """Take the source, and who provides it; None for a source that is neither checked nor named.
@@ -75,8 +78,10 @@ class PluginSource:
             self.response: Response = require_response(source.response) if checked else source.response
 
     def __reduce__(self) -> Any:
-        """Travel as what was given; the source of a colour as a colour of the capture, which is opened in each process."""
-        return (PluginSource, (self.given, self._origin)) if self._of is None else (_colour_of, self._of)
+        """Travel as what opens it; the source of a colour as a colour of the capture."""
+        if self._of is not None:
+            return _colour_of, self._of
+        return (PluginSource, (self.given, self._origin)) if self.opener is None else (_opened, (self.opener,))
 
     def offers(self, name: str) -> bool:
         """Return whether the source has an optional method."""
@@ -164,6 +169,12 @@ class PluginSource:
                 require_range(found, what, highest)
                 self._read_before.add(what)
             return found
+
+
+@lru_cache(maxsize=1)
+def _opened(opener: Callable[[], PluginSource]) -> PluginSource:
+    """Open a source, once in a process as long as tasks of one run come; openers of one run are equal."""
+    return opener()
 
 
 def _colour_of(capture: PluginSource, name: str) -> PluginSource:

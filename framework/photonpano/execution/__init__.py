@@ -1,5 +1,1 @@
-"""Executors: where the tasks of a run are worked on, in threads of this process, or elsewhere."""
-
-from photonpano.execution.executor import CaptureElsewhere, Executor, LocalExecutor, Pending, Remote, Workers, differences
-
-__all__ = ["CaptureElsewhere", "Executor", "LocalExecutor", "Pending", "Remote", "Workers", "differences"]
+"""How a computation runs: progress and checkpoints, and threads or another executor that work on its tasks."""

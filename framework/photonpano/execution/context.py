@@ -5,19 +5,23 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 from typing import Any, Protocol, TypeVar
 
-from photonpano.execution import Executor, LocalExecutor
-from photonpano.execution.threads import batched, in_order
+from photonpano.execution.threads import batched, in_order, thread_pool
 from photonpano.notebooks import NotebookBars, in_notebook
 from photonpano.values import Journal
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
+# Items of a task. An exposure takes some ten milliseconds, and a task costs about three in a client and its scheduler.
+_MOST_AT_ONCE = 8
+# Items are worked on at once where there are this many tasks for each one under way, so that no worker waits for the last.
+_TASKS_UNDER_WAY = 4
 
 
 class Progress(Protocol):
@@ -139,17 +143,22 @@ class Context:
     # called with the `LevelResult` of each level of the loop when it is done
     on_level: Callable[[Any], object] = lambda _: None
     checkpoints: Checkpoints = field(default_factory=KeepNothing)  # keep what is found, for the case of an interruption
-    executor: Executor = field(default_factory=LocalExecutor)
+    executor: Executor | None = None  # works on the tasks; None for threads of this process
     time_limit: TimeLimit = field(default_factory=TimeLimit)
 
     def in_order(self, work: Callable[[ItemT], ResultT], items: Iterable[ItemT]) -> Iterator[ResultT]:
         """Yield the results of `work` in the order of the items, in tasks of the executor: see `threads.in_order`."""
-        shared = self.executor.share(work)
-        at_once = self.executor.at_once(len(items)) if isinstance(items, Sequence) else 1
-        if at_once == 1:
-            return in_order(partial(self.executor.call, shared), items, self.threads)
-        results = in_order(partial(self.executor.call, _each, shared), batched(items, at_once), self.threads)
-        return chain.from_iterable(results)
+        at_once = self.at_once(len(items)) if isinstance(items, Sequence) else 1
+        batches = batched(items, at_once)
+        return chain.from_iterable(in_order(partial(_each, work), batches, self.threads, self.executor))
+
+    def at_once(self, number: int) -> int:
+        """Return how many of a number of items are best worked on in one task; all workers have several tasks all the same."""
+        return 1 if self.executor is None else min(_MOST_AT_ONCE, max(1, number // (_TASKS_UNDER_WAY * self.threads)))
+
+    def pool(self) -> AbstractContextManager[Executor]:
+        """Open what works on tasks for a block: the executor, or threads that end with the block."""
+        return thread_pool(self.threads) if self.executor is None else nullcontext(self.executor)
 
 
 def _each(work: Callable[[ItemT], ResultT], items: Iterable[ItemT]) -> list[ResultT]:

@@ -1,18 +1,20 @@
-"""Threads: how many a run uses, results in order, libraries kept to one thread, and time spent in stages."""
+"""Threads and other executors: how many tasks are under way, results in order, libraries kept to one thread, time of stages."""
 
 from __future__ import annotations
 
 import os
-import threading
+import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from itertools import islice
 from typing import Any, Literal, TypeVar
 
 from threadpoolctl import threadpool_limits
+
+from photonpano.errors import PluginError
 
 ItemT = TypeVar("ItemT")
 ResultT = TypeVar("ResultT")
@@ -38,7 +40,7 @@ def thread_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def in_order(
-    work: Callable[[ItemT], ResultT], items: Iterable[ItemT], threads: int, pool: ThreadPoolExecutor | None = None
+    work: Callable[[ItemT], ResultT], items: Iterable[ItemT], threads: int, pool: Executor | None = None
 ) -> Iterator[ResultT]:
     """Yield the results of `work` in the order of the items; `threads` items are worked on ahead, in a pool.
 
@@ -46,9 +48,31 @@ def in_order(
     thread of the caller.
     """
     with nullcontext(pool) if pool else thread_pool(threads) as executor:
-        submitted = (executor.submit(work, item) for item in items)
+        under_way = (submitted(executor, work, item) for item in items)
         # `map` keeps no reference to a result once it is yielded.
-        yield from map(Future.result, lagging(submitted, threads))
+        yield from map(Future.result, lagging(under_way, threads))
+
+
+def submitted(executor: Executor, work: Callable[..., ResultT], *given: Any) -> Future[ResultT]:
+    """Submit a task to an executor.
+
+    Unless threads work on it, it travels as a pickle: a `PluginError` says here what cannot be sent to another process, and the
+    task itself fails where it cannot be opened.
+    """
+    if isinstance(executor, ThreadPoolExecutor):
+        return executor.submit(work, *given)
+    try:
+        task = pickle.dumps((work, given), pickle.HIGHEST_PROTOCOL)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise PluginError(
+            f"a component cannot be sent to other processes: {error}; run it in threads: leave out run.executor"
+        ) from error
+    return executor.submit(_unpacked, task)
+
+
+def _unpacked(task: bytes) -> Any:
+    work, given = pickle.loads(task)
+    return work(*given)
 
 
 def lagging(items: Iterable[ItemT], by: int) -> Iterator[ItemT]:
@@ -69,22 +93,6 @@ def batched(items: Iterable[ItemT], size: int) -> Iterator[tuple[ItemT, ...]]:
         yield batch
 
 
-class Guard:
-    """A lock for a `with` block. With what it guards, it may be pickled: there it is a new one."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-
-    def __enter__(self) -> None:
-        self._lock.acquire()
-
-    def __exit__(self, *error: object) -> None:
-        self._lock.release()
-
-    def __reduce__(self) -> tuple[type[Guard], tuple[()]]:
-        return Guard, ()
-
-
 @contextmanager
 def one_thread_inside() -> Iterator[None]:
     """Keep OpenCV and BLAS from starting threads of their own, which would compete with ours for the cores."""
@@ -100,15 +108,9 @@ def one_thread_inside() -> Iterator[None]:
 
 
 class Stopwatch:
-    """Adds up seconds by stage.
+    """Adds up seconds by stage."""
 
-    Time in a thread of a pool is divided by the number of threads, so that the stages of a level add up to its duration.
-    """
-
-    def __init__(self, threads: int) -> None:
-        self._threads = threads
-        self._lock = threading.Lock()
-        self._caller = threading.get_ident()
+    def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
@@ -120,13 +122,7 @@ class Stopwatch:
         finally:
             self.add({stage: time.perf_counter() - start})
 
-    def add(self, seconds: Mapping[str, float]) -> None:
-        """Add seconds, by stage, that were spent for the calling thread."""
-        share = 1 if threading.get_ident() == self._caller else self._threads
-        with self._lock:
-            for stage, spent in seconds.items():
-                self.seconds[stage] = self.seconds.get(stage, 0.0) + spent / share
-
-    def __reduce__(self) -> tuple[type[Stopwatch], tuple[int]]:
-        """Start anew where it travels to."""
-        return Stopwatch, (self._threads,)
+    def add(self, seconds: Mapping[str, float], under_way: int = 1) -> None:
+        """Add seconds, by stage; those of tasks are divided by how many are `under_way`, so that all add up to the duration."""
+        for stage, spent in seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent / under_way

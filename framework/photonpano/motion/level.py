@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, NewType
+from typing import NewType, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -217,30 +217,18 @@ class PiecewiseTrajectory:
 class Recorder:
     """Records decisions: what a `StageContext` offers to components as `decide`.
 
-    A component that is sent to another process takes its recorder along. There it collects decisions until a task returns them.
+    A component that is sent to another process takes a copy along: tasks return what it has recorded there.
     """
 
     def __init__(self, decisions: list[Decision] | None = None) -> None:
-        """Take the list of a run that receives decisions; None in another process."""
-        self.decisions, self._waiting = decisions, list[Decision]()
+        """Take the list of a run that receives decisions."""
+        self.decisions = list[Decision]() if decisions is None else decisions
 
     def __call__(self, what: str, value: DecisionValue, reason: str) -> None:
         """Record a decision; a `TypeError` if its value is no plain one."""
         if not isinstance(value, bool | int | float | str):
             raise TypeError(f"the value of a decision is a number, a text, true or false; {what} is a {type(value).__name__}")
-        self.add(Decision(what, value, reason))
-
-    def add(self, decision: Decision) -> None:
-        """Record a decision that was taken elsewhere."""
-        (self._waiting if self.decisions is None else self.decisions).append(decision)
-
-    def taken(self) -> tuple[Decision, ...]:
-        """Return the decisions that another process has collected, once; in that of the run, there are none."""
-        waiting, self._waiting = self._waiting, []
-        return tuple(waiting)
-
-    def __reduce__(self) -> tuple[Callable[[], Recorder], tuple[()]]:
-        return Recorder, ()
+        self.decisions.append(Decision(what, value, reason))
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,10 +252,9 @@ class Level:
     recorder: Recorder = field(default_factory=Recorder)  # records what they decide
     handles_movers: bool = False  # whether the merger does: see `MergerContribution`
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Leave out what only the process of the loop needs: the resampler and the interpolator."""
-        components = None, self.merger, self.locators, None
-        return Level, (self.number, self.scale, *components, self.recorder, self.handles_movers)
+    def of_tasks(self) -> Level:
+        """Return the level without what only the loop needs, and need not travel: the resampler and the interpolator."""
+        return replace(self, resampler=cast("Resampler", None), interpolator=cast("Interpolator", None))
 
     def turning(self, camera: Camera | None) -> Level:
         """Return the level for a camera that only turns, which locators use if they can; None if it is not known."""
@@ -305,7 +292,7 @@ class VirtualExposures:
     source: Source
     groups: Sequence[Group]  # the frames of each exposure
     previous: Trajectory | None  # the motion known so far; None at the first level
-    clock: Stopwatch  # adds up the time that merging takes
+    clock: Stopwatch  # adds up the time of the level
     timeline: Timeline | None = None  # where the image jumps; None if it is not known to
     start: Trajectory | None = None  # along which exposures are merged while no motion is known; None if nothing shows it
     known: FrameSpan | None = None  # frames in which the motion known so far was located; None if it is nowhere extrapolated

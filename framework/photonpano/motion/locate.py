@@ -13,7 +13,6 @@ from photonpano.contracts.protocols import Source, camera_of
 from photonpano.contracts.requirements import why_still
 from photonpano.errors import PluginError
 from photonpano.execution.context import Context
-from photonpano.execution.threads import thread_pool
 from photonpano.geometry import corner_displacements, corners, inverse, transform_points, translation
 from photonpano.motion.adjustment import Assessment
 from photonpano.motion.diagnosis import require_tied, solving
@@ -120,11 +119,11 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
     log = context.checkpoints.log(
         f"level-{level.number}", groups, pairs, known, exposures.timeline, camera, decisions=decisions
     )
-    with thread_pool(context.threads) as pool:
-        registrar = Registrar(exposures, log, context, start, excluded)
+    with context.pool() as pool:
+        registrar = Registrar(exposures, log, context, pool, start, excluded)
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
-            edges = tuple(registrar.edges(pairs, pool, context.threads, advance))
+            edges = tuple(registrar.edges(pairs, advance))
         edges = tuple(_alike_across_cuts(exposures, each) for each in edges)
         # Locators must report their failures.
         located = [(edge.locator, edge.motion.homography) for edge in edges if isinstance(edge.motion, Located)]
@@ -142,7 +141,7 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
             kept = context.checkpoints.log(
                 f"level-{level.number}-ties", groups, [each.expected for each in starts], decisions=decisions
             )
-            registered = registrar.closures(starts, pool, kept)
+            registered = registrar.closures(starts, kept)
             edges += tuple(each.checked(edge) for each, edge in zip(by_hand, registered, strict=True))
         if gyroscope is not None:
             edges += gyroscope.edges(groups)
@@ -164,7 +163,7 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
         returning = [
             Pair(*pair, FrameHomography(motion), closure=True) for pair, motion in zip(candidates, between, strict=True)
         ]
-        closures = tuple(registrar.closures(returning, pool, revisits))
+        closures = tuple(registrar.closures(returning, revisits))
     log.finish()
     with exposures.clock("locate"), solving(level.number):
         if closures:

@@ -110,7 +110,7 @@ def estimate_motion(
     for level in levels:
         if results and context.time_limit.leaves_out("further levels"):
             break
-        clock = Stopwatch(context.threads)
+        clock = Stopwatch()
         layered = capture_of(source).background is not None
         model = replace(setting.model.knowing(camera_of_motion(previous)), layered=layered)
         setting = replace(setting, model=model)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
-from functools import partial
-from threading import Lock
-from typing import Any, TypeAlias, TypeVar
+from functools import lru_cache, partial
+from itertools import groupby
+from operator import attrgetter
+from typing import Any, Generic, TypeAlias, TypeVar
+from uuid import uuid4
 
 import cv2
 import numpy as np
@@ -16,7 +19,7 @@ from numpy.typing import NDArray
 from photonpano.contracts.attribution import blaming
 from photonpano.contracts.requirements import require_no_standstill, why_undetermined
 from photonpano.execution.context import Context, Log
-from photonpano.execution.threads import Guard, Stopwatch, batched, in_order, lagging
+from photonpano.execution.threads import Stopwatch, batched, in_order, lagging, submitted
 from photonpano.geometry import corners, inverse, rescaled, rescaling, transform_points, translation, why_implausible
 from photonpano.motion.diagnosis import Contrast, contrast_of
 from photonpano.motion.graph import GraphOptions, GraphSolution
@@ -149,13 +152,12 @@ def _overlaps(moving: FloatArray, fixed: FloatArray, frame_shape: tuple[int, int
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Described:
-    """An exposure as it stays in the process that has merged it."""
+    """An exposure, described."""
 
     contrast: Contrast  # of its image
-    exposure: VirtualExposure | None = None  # the exposure itself, for loop closures
     # what locators made of it so far, by their numbers; none of a blank exposure
     features: dict[int, Any] = field(default_factory=dict)
-    guard: Guard = field(default_factory=Guard)  # held while a locator describes it, so that each does so once
+    exposure: VirtualExposure | None = None  # the exposure itself, within a task of loop closures
 
 
 # Exposures by their numbers.
@@ -175,87 +177,105 @@ class Pair:
     closure: bool = False
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Partners:
+    """Pairs of an exposure with earlier ones."""
+
+    pairs: Sequence[Pair]
+    bridges: Sequence[Pair]  # with its predecessors: tried one after the other if none of its pairs is located
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What a task finds of exposures and their partners."""
+
+    edges: Mapping[int, Sequence[Edge]]  # of each exposure, by its number
+    # where each lies, and the distances of second motions, see `Track`; nothing at levels that are not tracked
+    places: Mapping[int, Place]
+    alternatives_px: Mapping[tuple[int, int], float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Done(Generic[ResultT]):
+    """What a task returns."""
+
+    result: ResultT
+    seconds: Mapping[str, float]  # in each stage
+    decisions: Sequence[Decision]  # of components while it was worked on
+
+
 @dataclass(frozen=True, slots=True)
-class Notes:
-    """What a task returns beside its result."""
-
-    seconds: dict[str, float]  # in each stage
-    decisions: tuple[Decision, ...]  # of components, where it was worked on in another process
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tracked:
-    """Exposures of the first level that were registered with earlier ones."""
-
-    edges: dict[int, list[Edge]]  # of each exposure, by its number
-    places: dict[int, Place]  # where each lies
-    alternatives_px: dict[tuple[int, int], float]  # see `Track`
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ExposureTasks:
-    """The tasks of a level. Each returns notes, too.
-
-    Exposures are given by their numbers, together with mappings in which their descriptions are.
+    """The tasks of a level. Exposures are given by their numbers.
 
     Convention:
         All homographies are in pixels of frames; only a locator sees pixels of exposures.
     """
 
-    exposures: VirtualExposures  # of the level
+    exposures: VirtualExposures = field(compare=False)  # of the level
+    start: StartingMotion | None = field(compare=False)  # what short spans show of the motion, at a first level
+    tracks: bool = field(compare=False)  # whether each exposure starts from where those before it lie
+    process: int = field(default_factory=os.getpid, compare=False)  # that of the loop
+    key: str = field(default_factory=lambda: uuid4().hex)  # the same for all copies
 
-    def describe(self, indices: Sequence[int], keep: bool) -> tuple[dict[int, Described], tuple[list[Contrast], Notes]]:
-        """Merge exposures, and have the first locator describe them; a blank exposure is not described.
-
-        Return what stays in this process, by exposure, with the exposures themselves if they are to `keep`; and the contrasts.
-        """
-        clock, described = Stopwatch(1), dict[int, Described]()
+    def describe(self, clock: Stopwatch, indices: Sequence[int], keep: bool = False) -> dict[int, Described]:
+        """Merge exposures, and have the first locator describe them, if they are not blank; `keep` also the exposures."""
+        found = dict[int, Described]()
         for index in indices:
             exposure = self.exposures.merged(index, clock)
             with clock("locate"):
                 contrast = contrast_of(exposure)
-            described[index] = Described(contrast, exposure if keep else None)
-            if not contrast.blank:
-                described[index].features[0] = self._features_of(exposure, 0, clock)
-        return described, ([each.contrast for each in described.values()], self._notes(clock))
+            features = {} if contrast.blank else {0: self._features_of(exposure, 0, clock)}
+            found[index] = Described(contrast, features, exposure if keep else None)
+        return found
 
-    def register(self, pairs: Sequence[Pair], *described: Descriptions) -> tuple[list[Edge], Notes]:
-        """Pass pairs to one locator after the other, until one locates them."""
-        clock = Stopwatch(1)
-        return self._registered(pairs, _joined(described), clock), self._notes(clock)
+    def register(
+        self, clock: Stopwatch, known: Descriptions, partners: Mapping[int, Partners], places: Mapping[int, Place]
+    ) -> Found:
+        """Register exposures with earlier ones, in order.
 
-    def register_along(
-        self,
-        start: StartingMotion | None,
-        partners: Mapping[int, Sequence[int]],
-        places: Mapping[int, Place],
-        *described: Descriptions,
-    ) -> tuple[Tracked, Notes]:
-        """Register exposures of the first level with earlier ones, in order; the motion to the nearest predicts the others.
-
-        `places` are those of partners that are not among the exposures, and of exposures that were placed before.
+        At a level that is tracked, the motion to the nearest predicts the others. `places` are those of exposures before.
         """
-        clock, known = Stopwatch(1), _joined(described)
-        track = Track(start, self.exposures.groups, self.exposures.frame_shape, places)
-        edges = {moving: self._tracked(track, moving, earlier, known, clock) for moving, earlier in partners.items()}
-        new = {moving: track.places[moving] for moving in partners}
-        return Tracked(edges, new, track.alternatives_px), self._notes(clock)
+        track = Track(self.start, self.exposures.groups, self.exposures.frame_shape, places) if self.tracks else None
+        edges = dict[int, list[Edge]]()
+        for moving, each in partners.items():
+            found = edges[moving] = self._paired(track, moving, each.pairs, known, clock)
+            if found and not any(isinstance(edge.motion, Located) for edge in found):
+                for bridge in each.bridges:
+                    found += self._paired(track, moving, [bridge], known, clock)
+                    if isinstance(found[-1].motion, Located):
+                        break
+        if track is None:
+            return Found(edges, {}, {})
+        return Found(edges, {moving: track.places[moving] for moving in partners}, track.alternatives_px)
 
-    def similarity(self, moving: int, fixed: int, motion: FrameHomography, *described: Descriptions) -> tuple[float, Notes]:
-        """Return the similarity of two exposures that were kept, along their motion."""
-        clock, known = Stopwatch(1), _joined(described)
-        one, other = known[moving].exposure, known[fixed].exposure
-        assert one is not None
-        assert other is not None
+    def closures(self, clock: Stopwatch, pairs: Sequence[Pair]) -> list[Edge]:
+        """Register loop closures; those whose exposures are not similar once aligned are not located."""
+        known = self.describe(clock, sorted({index for pair in pairs for index in (pair.moving, pair.fixed)}), keep=True)
+        return [self._similar(edge, known, clock) for edge in self._registered(pairs, known, clock)]
+
+    def _similar(self, closure: Edge, known: Descriptions, clock: Stopwatch) -> Edge:
+        """Return a loop closure with its similarity, not located if that is too small."""
+        one, other = known[closure.moving].exposure, known[closure.fixed].exposure
+        if isinstance(closure.motion, NotLocated) or one is None or other is None:
+            return closure
         with clock("locate"):
-            similarity = exposure_similarity(one, other, motion)
-        return similarity, self._notes(clock)
+            similarity = exposure_similarity(one, other, FrameHomography(closure.motion.homography))
+        evidence = {**closure.motion.evidence, "closure_similarity": similarity}
+        if similarity < MIN_SIMILARITY:
+            reason = f"the similarity of the exposures of this loop closure is {similarity:.2f}, less than {MIN_SIMILARITY:g}"
+            return Edge(closure.moving, closure.fixed, NotLocated(reason, evidence))
+        return replace(closure, motion=replace(closure.motion, evidence=evidence))
 
-    def _tracked(self, track: Track, moving: int, partners: Sequence[int], known: Descriptions, clock: Stopwatch) -> list[Edge]:
-        """Register an exposure with others, and place it."""
+    def _paired(
+        self, track: Track | None, moving: int, pairs: Sequence[Pair], known: Descriptions, clock: Stopwatch
+    ) -> list[Edge]:
+        """Register an exposure with others; along a track, place it."""
+        if track is None:
+            return self._registered(pairs, known, clock)
         place, foreseen = track.places.get(moving), None
         found: list[Edge] = []
-        for fixed in sorted(partners, reverse=True):
+        for fixed in sorted((pair.fixed for pair in pairs), reverse=True):
             expected = track.expected(place, moving, fixed, partial(self._hypotheses, moving, fixed, known, clock))
             found += self._registered([Pair(moving, fixed, expected, guessed=True)], known, clock)
             if place is None and isinstance(motion := found[-1].motion, Located):
@@ -329,23 +349,31 @@ class ExposureTasks:
     def _features(self, index: int, locator: int, known: Descriptions, clock: Stopwatch) -> Any:
         """Return what a locator makes of an exposure; for a fallback, it is merged again."""
         described = known[index]
-        with described.guard:
-            if locator not in described.features:
-                exposure = self.exposures.merged(index, clock) if described.exposure is None else described.exposure
-                described.features[locator] = self._features_of(exposure, locator, clock)
-            return described.features[locator]
+        if locator not in described.features:
+            exposure = self.exposures.merged(index, clock) if described.exposure is None else described.exposure
+            described.features[locator] = self._features_of(exposure, locator, clock)
+        return described.features[locator]
 
     def _features_of(self, exposure: VirtualExposure, locator: int, clock: Stopwatch) -> Any:
         named = self.exposures.level.locators[locator]
         with clock("locate"):
             return named.component.describe(exposure)
 
-    def _notes(self, clock: Stopwatch) -> Notes:
-        return Notes(clock.seconds, self.exposures.level.recorder.taken())
+
+def worked(tasks: ExposureTasks, work: Callable[..., ResultT], *given: Any) -> Done[ResultT]:
+    """Work on a task of a level: a method of `ExposureTasks`, and what it is given after the clock."""
+    # A merger computes what all exposures of a level share once: in another process, that of the first copy is used.
+    tasks = tasks if tasks.process == os.getpid() else _first_copy(tasks)
+    clock, decisions = Stopwatch(), tasks.exposures.level.recorder.decisions
+    before = len(decisions)
+    result = work(tasks, clock, *given)
+    return Done(result, clock.seconds, decisions[before:])
 
 
-def _joined(described: Iterable[Descriptions]) -> Descriptions:
-    return {index: each for mapping in described for index, each in mapping.items()}
+@lru_cache(maxsize=1)
+def _first_copy(tasks: ExposureTasks) -> ExposureTasks:
+    """Return the copy that came to this process first, as long as tasks of its level come."""
+    return tasks
 
 
 def _of_all(failures: Mapping[str, NotLocated]) -> NotLocated:
@@ -375,40 +403,36 @@ class Registrar:
         exposures: VirtualExposures,
         log: Log,
         context: Context,
+        pool: Executor,
         start: StartingMotion | None = None,
         excluded: Set[tuple[int, int]] = frozenset(),
     ) -> None:
         """Prepare to register; `log` has the first exposures in order, as `Registered`, and receives the others.
 
-        `start` is what short spans show of the motion, at the first level; `excluded` are pairs that are not to be registered.
+        `pool` works on the tasks. `start` is what short spans show of the motion, at the first level; `excluded` are pairs that
+        are not to be registered.
         """
-        self._excluded = excluded
-        self._executor, self._exposures, self._clock, self._log = context.executor, exposures, exposures.clock, log
-        self._at_once = context.executor.at_once(len(exposures.groups))
-        tasks = ExposureTasks(exposures)
-        self._tasks = context.executor.share(tasks)
+        self._exposures, self._log, self._pool, self._excluded = exposures, log, pool, excluded
+        self._threads, self._at_once = context.threads, context.at_once(len(exposures.groups))
         # One call for all exposures: a trajectory takes about as long for one instant as for a thousand.
         # (N, 3, 3) homographies of the exposures by the motion known so far; None at the first level
         self.to_plane = None if exposures.previous is None else exposures.previous.at(instants_of(exposures.groups))
         self._from_plane = None if self.to_plane is None else inverse(self.to_plane)
         # Only locators that keep hypotheses start from a motion at the first level.
-        self._tracks = exposures.previous is None and any(
-            hasattr(locator.component, "hypotheses") for locator in exposures.level.locators
-        )
-        self._start = context.executor.share(start) if self._tracks else None
+        locators = exposures.level.locators
+        tracks = exposures.previous is None and any(hasattr(each.component, "hypotheses") for each in locators)
+        self._tasks = ExposureTasks(replace(exposures, level=exposures.level.of_tasks()), start if tracks else None, tracks)
         self._places: dict[int, Place] = {}
-        self._kept: dict[int, Descriptions] = {}
+        self._known: dict[int, Described] = {}
         self.contrasts: dict[int, Contrast] = {}  # of the exposures described so far, by their numbers
         # by pair, the distance of a second motion that fits as well from where its registration started
         self.alternatives_px: dict[tuple[int, int], float] = {}
-        self._decided, self._lock = set[Decision](), Lock()
+        self._decided = len(exposures.level.recorder.decisions)
 
-    def edges(
-        self, pairs: Sequence[tuple[int, int]], pool: ThreadPoolExecutor, threads: int, advance: Callable[[int], None]
-    ) -> Iterator[Edge]:
+    def edges(self, pairs: Sequence[tuple[int, int]], advance: Callable[[int], None]) -> Iterator[Edge]:
         """Register pairs (moving, fixed), ordered by the moving exposure, the later one, and yield them in order.
 
-        `threads` exposures are worked on ahead, and `advance` is called with 1 after each moving exposure.
+        `advance` is called with 1 after each moving exposure.
         """
         partners: dict[int, list[int]] = {moving: [] for moving in range(len(self._exposures.groups))}
         needed_until = {index: index + BRIDGE for index in partners}
@@ -423,122 +447,71 @@ class Registrar:
             self.alternatives_px |= {(moving, fixed): px for fixed, px in registered.alternatives_px.items()}
             yield from registered.edges
             advance(1)
-        needed = {index: partners[index] for index in partners if max(index, needed_until[index]) >= known}
         if known == len(partners):
             return
+        needed = {index: partners[index] for index in partners if max(index, needed_until[index]) >= known}
         # Pairs of several exposures are under way at once, so that no thread waits for the last pair of one.
-        for moving, job in lagging(self._submitted(needed, known, pool, threads), threads * self._at_once):
-            found = [edge for edge in job.result() if edge.moving == moving]
-            if found and not any(isinstance(edge.motion, Located) for edge in found):
-                found += self._bridge(moving, partners[moving])
-            second = {edge.fixed: self.alternatives_px.get((moving, edge.fixed)) for edge in found}
-            alternatives = {fixed: px for fixed, px in second.items() if px is not None}
-            self._log.add(Registered(tuple(found), self.contrasts[moving], self._places.get(moving), alternatives))
-            yield from found
-            for index in [index for index in self._kept if needed_until[index] <= moving]:
-                del self._kept[index]
-            advance(1)
+        for job in lagging(self._submitted(needed, known), self._threads):
+            done = self._noted(job.result())
+            self.alternatives_px |= done.alternatives_px
+            for moving, found in done.edges.items():
+                second = {edge.fixed: self.alternatives_px.get((moving, edge.fixed)) for edge in found}
+                alternatives = {fixed: px for fixed, px in second.items() if px is not None}
+                self._log.add(Registered(tuple(found), self.contrasts[moving], done.places.get(moving), alternatives))
+                yield from found
+                for index in [index for index in self._known if needed_until[index] <= moving]:
+                    del self._known[index]
+                advance(1)
 
-    def closures(self, pairs: Sequence[Pair], pool: ThreadPoolExecutor, log: Log) -> Iterator[Edge]:
+    def closures(self, pairs: Sequence[Pair], log: Log) -> Iterator[Edge]:
         """Register candidates for loop closures, and tied pairs; pairs that are not similar once aligned are not located.
 
-        Both exposures of a pair are merged and described again, at the same time. The pairs are ordered by the moving exposure.
-        `log` has the first pairs in order, as `Edge`, and receives the others.
+        Both exposures of a pair are merged and described again. The pairs are ordered by the moving exposure. `log` has the
+        first pairs in order, as `Edge`, and receives the others.
         """
-        self._kept.clear()
-        needed_until = {index: position for position, pair in enumerate(pairs) for index in (pair.moving, pair.fixed)}
+        left = pairs[len(log.found) :]
         yield from log.found
-        for position, pair in enumerate(pairs):
-            if position < len(log.found):
-                continue
-            missing = [index for index in (pair.moving, pair.fixed) if index not in self._kept]
-            for index, [(kept, _)] in zip(missing, pool.map(lambda each: self._describe([each], True), missing), strict=True):
-                self._kept[index] = kept
-            closure = self._similar(self._register([pair])[0])
-            log.add(closure)
-            yield closure
-            for index in [index for index in self._kept if needed_until[index] <= position]:
-                del self._kept[index]
+        of_exposures = [list(same) for _, same in groupby(left, attrgetter("moving"))]
+        for done in self._in_order(ExposureTasks.closures, of_exposures):
+            for closure in self._noted(done):
+                log.add(closure)
+                yield closure
 
-    def _submitted(
-        self, partners: Mapping[int, Sequence[int]], known: int, pool: ThreadPoolExecutor, threads: int
-    ) -> Iterator[tuple[int, Future[list[Edge]]]]:
-        """Describe exposures in order; yield each from number `known` on with a job that registers its pairs."""
-        bundles = list(batched(partners, self._at_once))
-        job: Future[list[Edge]] | None = None
-        for bundle, described in zip(bundles, in_order(self._describe, bundles, threads, pool), strict=True):
-            for index, (kept, contrast) in zip(bundle, described, strict=True):
-                self._kept[index], self.contrasts[index] = kept, contrast
-            new = {index: partners[index] for index in bundle if index >= known}
-            if self._tracks:
+    def _submitted(self, partners: Mapping[int, Sequence[int]], known: int) -> Iterator[Future[Done[Found]]]:
+        """Describe exposures in order; yield a job for some exposures after the other from number `known` on."""
+        job: Future[Done[Found]] | None = None
+        for described in self._in_order(ExposureTasks.describe, batched(partners, self._at_once)):
+            self._known |= (new := self._noted(described))
+            self.contrasts |= {index: each.contrast for index, each in new.items()}
+            if job is not None and self._tasks.tracks:
                 # In order: each exposure starts from where those before it lie.
-                job = pool.submit(self._register_along, new, job)
-            else:
-                pairs = [Pair(moving, fixed, self._expected(moving, fixed)) for moving in new for fixed in new[moving]]
-                job = pool.submit(self._register, pairs)
-            yield from ((moving, job) for moving in new)
+                self._places |= job.result().result.places
+            tried = {moving: self._partners(moving, partners[moving]) for moving in new if moving >= known}
+            pairs = [pair for each in tried.values() for pair in (*each.pairs, *each.bridges)]
+            involved = {index for pair in pairs for index in (pair.moving, pair.fixed)}
+            places = {index: self._places[index] for index in involved if index in self._places}
+            descriptions = {index: self._known[index] for index in involved}
+            task = self._tasks, ExposureTasks.register, descriptions, tried, places
+            job = submitted(self._pool, worked, *task)
+            yield job
 
-    def _register_along(self, partners: Mapping[int, Sequence[int]], before: Future[list[Edge]] | None = None) -> list[Edge]:
-        """Register exposures of the first level with earlier ones, once the job of those before them is done."""
-        if before is not None:
-            before.result()
-        involved = {*partners, *(fixed for earlier in partners.values() for fixed in earlier)}
-        places = {index: self._places[index] for index in involved if index in self._places}
-        task = ExposureTasks.register_along, self._tasks, self._start, partners, places
-        tracked = self._noted(self._executor.call(*task, *self._descriptions(involved)))
-        self._places |= tracked.places
-        self.alternatives_px |= tracked.alternatives_px
-        return [edge for edges in tracked.edges.values() for edge in edges]
+    def _in_order(self, work: Callable[..., ResultT], items: Iterable[Any]) -> Iterator[Done[ResultT]]:
+        return in_order(partial(worked, self._tasks, work), items, self._threads, self._pool)
 
-    def _bridge(self, moving: int, tried: Sequence[int]) -> Iterator[Edge]:
-        """Register an exposure with its predecessors, until one is located."""
-        for fixed in range(moving - 1, max(moving - BRIDGE, 0) - 1, -1):
-            if fixed not in tried and (moving, fixed) not in self._excluded:
-                pair = Pair(moving, fixed, self._expected(moving, fixed))
-                [edge] = self._register_along({moving: [fixed]}) if self._tracks else self._register([pair])
-                yield edge
-                if isinstance(edge.motion, Located):
-                    return
+    def _partners(self, moving: int, fixed: Sequence[int]) -> Partners:
+        before = range(moving - 1, max(moving - BRIDGE, 0) - 1, -1)
+        bridges = [each for each in before if each not in fixed and (moving, each) not in self._excluded] if fixed else []
+        return Partners(*([Pair(moving, each, self._expected(moving, each)) for each in some] for some in (fixed, bridges)))
 
-    def _similar(self, closure: Edge) -> Edge:
-        """Return a loop closure with its similarity, not located if that is too small."""
-        if isinstance(closure.motion, NotLocated):
-            return closure
-        pair = closure.moving, closure.fixed
-        task = ExposureTasks.similarity, self._tasks, *pair, closure.motion.homography
-        similarity = self._noted(self._executor.call(*task, *self._descriptions(pair)))
-        evidence = {**closure.motion.evidence, "closure_similarity": similarity}
-        if similarity < MIN_SIMILARITY:
-            reason = f"the similarity of the exposures of this loop closure is {similarity:.2f}, less than {MIN_SIMILARITY:g}"
-            return Edge(closure.moving, closure.fixed, NotLocated(reason, evidence))
-        return replace(closure, motion=replace(closure.motion, evidence=evidence))
+    def _noted(self, done: Done[ResultT]) -> ResultT:
+        """Return the result of a task; add up its time, and record decisions that were taken in another process.
 
-    def _describe(self, indices: Sequence[int], keep: bool = False) -> list[tuple[Descriptions, Contrast]]:
-        """Have exposures described; return what stands for that, and the contrast of each."""
-        described, known = self._executor.keep(ExposureTasks.describe, self._tasks, indices, keep)
-        return [(described, contrast) for contrast in self._noted(known)]
-
-    def _register(self, pairs: Sequence[Pair]) -> list[Edge]:
-        """Have pairs registered from where they are expected."""
-        if not pairs:
-            return []
-        described = self._descriptions(index for pair in pairs for index in (pair.moving, pair.fixed))
-        return self._noted(self._executor.call(ExposureTasks.register, self._tasks, pairs, *described))
-
-    def _descriptions(self, indices: Iterable[int]) -> Iterable[Descriptions]:
-        """Return what stands for the descriptions of exposures; of those that were described together, once."""
-        return {id(kept): kept for kept in (self._kept[index] for index in indices)}.values()
-
-    def _noted(self, done: tuple[ResultT, Notes]) -> ResultT:
-        """Return the result of a task; add up its time, and record its decisions once, since all workers take the same."""
-        result, notes = done
-        self._clock.add(notes.seconds)
-        with self._lock:
-            for decision in notes.decisions:
-                if decision not in self._decided:
-                    self._decided.add(decision)
-                    self._exposures.level.recorder.add(decision)
-        return result
+        All processes take the same, which are recorded once.
+        """
+        self._exposures.clock.add(done.seconds, self._threads)
+        decisions = self._exposures.level.recorder.decisions
+        decisions += [each for each in done.decisions if each not in decisions[self._decided :]]
+        return done.result
 
     def _expected(self, moving: int, fixed: int) -> FrameHomography | None:
         """Return the motion of a pair that is known so far; None at the first level."""

@@ -252,5 +252,8 @@ def built(choice: Choice, context: SourceContext | StageContext | ExecutorContex
     except Exception as error:
         raise PluginError(f"{who} could not be built: {described(error)}") from error
     if lacking:
-        raise PluginError(f"{who} could not be built: build returned {shown(component)}, which has no {listed(lacking, 'nor')}")
+        problem = f"build returned {shown(component)}, which has no {listed(lacking, 'nor')}"
+        if hasattr(component, "share"):  # of executors until 0.2
+            problem += "; return a concurrent.futures.Executor in place of one that has `share` and `keep`"
+        raise PluginError(f"{who} could not be built: {problem}")
     return attributed(component, who, where) if where else component

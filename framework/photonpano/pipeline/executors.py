@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import importlib.metadata
+import platform
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from typing import Any
 from uuid import uuid4
 
 from photonpano.capture import Capture, PluginSource, capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, PhotonpanoError
-from photonpano.execution import CaptureElsewhere, Executor, LocalExecutor, differences
+from photonpano.execution.context import Context
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.pipeline.components import build_source, built
 from photonpano.plugins.contributions import ExecutorContext
@@ -25,25 +26,22 @@ from photonpano.specs.plan import Plan
 
 
 @contextmanager
-def executor_of(plan: Plan, source: Source) -> Iterator[Executor]:
-    """Build the executor of a plan, and close it at the end of the block; `InputError` if workers lack what the run needs."""
+def on_executor(plan: Plan, source: Source, context: Context) -> Iterator[Context]:
+    """Yield a context with the executor of a plan, or with threads; the executor is shut down at the end of the block."""
+    threads = thread_count(plan.run.threads)
     if plan.executor is None:
-        yield LocalExecutor(thread_count(plan.run.threads))
+        yield replace(context, threads=threads)
         return
     read = capture_of(source).source  # as its plugin gives it: it is opened anew in each process
     names = ("photonpano", *library_versions(plan), *(each["plugin"] for each in plugin_records(plan)))
-    here = met_by(dict.fromkeys(names), read)
     # Not the document, which hides the passwords of URLs.
     keys = plan.source.config.model_dump(exclude_unset=True, by_alias=True)
-    opener = CaptureOpener(uuid4().hex, plan.run.seed, plan.source.contribution.name, keys, here)
-    context = ExecutorContext(
-        thread_count(plan.run.threads), CaptureElsewhere(read, opener), here=here, elsewhere=partial(met_elsewhere, opener)
-    )
-    executor: Executor = built(plan.executor, context)
+    read.opener = CaptureOpener(uuid4().hex, plan.run.seed, plan.source.contribution.name, keys, met_by(names, read))
+    executor: Executor = built(plan.executor, ExecutorContext(threads))
     try:
-        yield executor
+        yield replace(context, threads=getattr(executor, "under_way", threads), executor=executor)
     finally:
-        executor.close()
+        executor.shutdown(cancel_futures=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,30 +57,26 @@ class CaptureOpener:
     def __call__(self) -> PluginSource:
         """Open the capture. From then on, the libraries of the process work in one thread: workers are many processes.
 
-        Raises `InputError` in a process that joined the cluster late, and does not have what the run needs.
+        Raises `InputError` in a process that does not have what the run needs.
         """
-        source = self.unchecked()
-        if different := differences(self.needed, met_by(self.needed, source)):
-            raise InputError(f"a worker that joined during the run differs from the process that runs it: {different}")
-        return source
-
-    def unchecked(self) -> PluginSource:
-        """Open the capture, whatever this process has."""
         _WHILE_THE_PROCESS_LIVES.enter_context(one_thread_inside())
         spec = {"version": 1, "source": {"use": self.source, "with": self.keys}, "corrections": [], "run": {"seed": self.seed}}
-        return build_source(parse_spec(spec, output="unused")).source
+        try:
+            source = build_source(parse_spec(spec, output="unused")).source
+        except PhotonpanoError as error:
+            found = met_by(self.needed, None) | {"capture": str(error)}
+        else:
+            found = met_by(self.needed, source)
+        different = [f"{name} {found[name]} (here {here})" for name, here in self.needed.items() if found[name] != here]
+        if different:
+            raise InputError(
+                f"a worker on {platform.node()} differs from the process of the run: {', '.join(different)}; it needs the same "
+                "versions, and must find the same capture at its path, since results must not depend on the worker"
+            )
+        return source
 
 
 _WHILE_THE_PROCESS_LIVES = ExitStack()
-
-
-def met_elsewhere(opener: CaptureOpener) -> dict[str, str]:
-    """Return what another process has of what a run needs; of a capture that it cannot open, why."""
-    try:
-        source = opener.unchecked()
-    except PhotonpanoError as error:
-        return met_by(opener.needed, None) | {"capture": str(error)}
-    return met_by(opener.needed, source)
 
 
 def met_by(needed: Iterable[str], source: PluginSource | None) -> dict[str, str]:

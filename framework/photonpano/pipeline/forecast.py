@@ -55,7 +55,7 @@ def forecast(plan: Plan, source: Source) -> Forecast:
         PhotonpanoError: the trial failed, as the run would.
     """
     threads, n_frames = thread_count(plan.run.threads), source.info.n_frames
-    groups = resample(build_levels(plan, source, [])[0], n_frames, Stopwatch(threads))
+    groups = resample(build_levels(plan, source, [])[0], n_frames, Stopwatch())
     length = float(np.median([len(group.span) for group in groups]))
     _tried(plan, part_of(source, _middle(n_frames, round(_WARM_UP_GROUPS * length))), threads)
     span = _middle(n_frames, round(TRIAL_GROUPS * length))

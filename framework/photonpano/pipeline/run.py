@@ -24,7 +24,7 @@ from photonpano.pipeline.alternatives import beside_alternatives
 from photonpano.pipeline.checkpoints.work_folder import Continuation, Work, finished_run, run_fingerprint, work_folder
 from photonpano.pipeline.components import open_source
 from photonpano.pipeline.estimate import estimate
-from photonpano.pipeline.executors import executor_of
+from photonpano.pipeline.executors import on_executor
 from photonpano.pipeline.follow import followed
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.obstacles import naming_obstacles, order_warning, run_others
@@ -136,8 +136,7 @@ def run(
 def make_panorama(run: BegunRun) -> None:
     """Estimate the motion in levels, refine and judge it, render the panorama, and end the run."""
     plan, folder, journal = run.plan, run.folder, run.journal
-    with executor_of(plan, run.source) as executor:
-        context = replace(run.context, threads=executor.under_way, executor=executor)
+    with on_executor(plan, run.source, run.context) as context:
         with naming_obstacles(run.source):
             state = estimate(plan, run.source, journal, context)
         state, explained = refine(state, build_refiners(plan, state.view.source, journal), journal)

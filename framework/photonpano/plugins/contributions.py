@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Protocol, get_args, get_type_hints
@@ -29,7 +30,6 @@ from photonpano.contracts.protocols import (
     Source,
 )
 from photonpano.errors import CaptureUnreadError
-from photonpano.execution import CaptureElsewhere, Executor
 from photonpano.execution.threads import InOrder
 from photonpano.files.paths import Location, Url, given_path, location, refusal
 from photonpano.text import install_line
@@ -141,11 +141,6 @@ class ExecutorContext:
     """The run for which an executor is built."""
 
     threads: int  # the number of threads of the run
-    capture: CaptureElsewhere  # what stands for the capture in tasks of other processes
-    # what this process has of what the run needs, by name: versions of photonpano, of the plugins of the run and of libraries,
-    # and a hash of the capture
-    here: Mapping[str, str]
-    elsewhere: Callable[[], Mapping[str, str]]  # tells the same of another process, which must have the same; can be pickled
 
 
 @dataclass(frozen=True, slots=True)

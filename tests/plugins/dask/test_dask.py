@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from photonpano import ExecutorContext, InputError, SpecError, parse_spec, run, simulate
-from photonpano.execution import CaptureElsewhere
 from photonpano.execution.context import Quiet
 
 pytest.importorskip("distributed")
@@ -23,7 +22,6 @@ from photonpano_dask import workers
 from photonpano_dask.configs import DaskConfig
 
 FILES = "trajectory.npz", "panorama.tiff"
-CONTEXT = ExecutorContext(2, CaptureElsewhere(None, lambda: None), {"photonpano": "0.1.0", "numpy": "2.4.6"}, dict)
 
 
 def worker_pids() -> list[int]:
@@ -96,7 +94,7 @@ def test_same_bytes_and_decisions_as_on_threads_though_workers_are_killed(spec: 
 def test_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_PATIENCE_S", 0.5)
     with pytest.raises(InputError, match=r"no dask scheduler answers at tcp://127.0.0.1:9 .*start one with `dask scheduler`"):
-        workers.workers_of(DaskConfig(address="tcp://127.0.0.1:9"), CONTEXT)
+        workers.executor_of(DaskConfig(address="tcp://127.0.0.1:9"), ExecutorContext(2))
 
 
 @pytest.mark.parametrize(

@@ -133,7 +133,7 @@ def test_exposures_of_mergers_show_the_background_alone(merger: str) -> None:
     def flux(source: Source) -> np.ndarray:
         spec = {"version": 1, "source": {"use": "simulator"}, "levels": [{"merge": {"use": merger}}]}
         (level,) = build_levels(parse_spec(spec), source, [])
-        return VirtualExposures(level, source, [group], MOTION, Stopwatch(1)).merged(0).flux
+        return VirtualExposures(level, source, [group], MOTION, Stopwatch()).merged(0).flux
 
     ghost, clean, background = map(
         flux,

@@ -1,7 +1,8 @@
 """Values that travel to other processes."""
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import pickle
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import photonpano.pipeline.run as run_module
-from photonpano import FrameSpan, Light, parse_spec, run
-from photonpano.capture import Capture, capture_of, in_light, part_of, seen_through
+from photonpano import Config, ExecutorContribution, FrameSpan, InputError, Light, Plan, PluginError, discover, parse_spec, run
+from photonpano.capture import Capture, PluginSource, capture_of, in_light, part_of, seen_through
 from photonpano.contracts.protocols import Source
 from photonpano.corrections import ColourFilter, HotPixels, Vignette, corrected_source, divided_by
-from photonpano.execution.executor import packed, unpacked
 from photonpano.geometry import Camera
-from photonpano.pipeline.executors import CaptureOpener, met_elsewhere
+from photonpano.pipeline.executors import CaptureOpener, met_by
 from photonpano.testing import MemorySource
 
 SHAPE, N = (24, 32), 60
@@ -32,57 +31,54 @@ WRAPPERS: dict[str, Callable[[Source], Capture]] = {
 }
 
 
-def capture() -> Capture:
-    return capture_of(MemorySource(np.random.default_rng(0).random((N, *SHAPE)) < 0.3), "a source of this test")
+def opened() -> PluginSource:
+    return PluginSource(MemorySource(np.random.default_rng(0).random((N, *SHAPE)) < 0.3), "a source of this test")
+
+
+def copied(value: Any) -> Any:
+    return pickle.loads(pickle.dumps(value))
 
 
 @pytest.mark.parametrize("name", WRAPPERS)
 def test_sources_arrive_as_they_left(name: str) -> None:
-    here, there = capture(), capture()
+    here = capture_of(opened().given, "a source of this test")
+    here.source.opener = opened
     sent = WRAPPERS[name](here)
-    data = packed(sent, capture_of(here).source)
-    arrived: Capture = unpacked(data, capture_of(there).source)
+    arrived: Capture = copied(sent)
+    assert arrived.source is not here.source
     np.testing.assert_array_equal(arrived.counts(SPAN), sent.counts(SPAN))
     np.testing.assert_array_equal(arrived.valid, sent.valid)
     assert arrived.info == sent.info
     counts = sent.counts(SPAN)
     np.testing.assert_array_equal(arrived.corrected(counts, 27), sent.corrected(counts, 27))
-    for colour, source in sent.colours().items():
-        np.testing.assert_array_equal(arrived.colours()[colour].valid, source.valid)
+    for colour, part in sent.colours().items():
+        np.testing.assert_array_equal(arrived.colours()[colour].valid, part.valid)
     assert (sent.light is None) == (arrived.light is None)
     assert (sent.camera is None) == (arrived.camera is None)
 
 
-def test_frames_do_not_travel() -> None:
-    here = capture_of(MemorySource(np.zeros((5000, *SHAPE), bool)), "a source of this test")
-    assert len(packed(part_of(here, FrameSpan(0, 4000)), here.source)) < 2000
-
-
-class Elsewhere:
+class Elsewhere(Executor):
     """An executor that lets every task see copies alone, as another process would."""
 
-    under_way = 2
+    def submit(self, work: Callable[..., Any], *given: Any) -> Future[Any]:
+        done = Future[Any]()
+        work, given = copied((work, given))
+        done.set_result(copied(work(*given)))
+        return done
 
-    def __init__(self) -> None:
-        self.capture: Source | None = None
 
-    def at_once(self, number: int) -> int:
-        return min(3, number)
-
-    def copied(self, value: Any) -> Any:
-        return unpacked(packed(value, self.capture), self.capture)
+class Older:
+    """An executor as they were until 0.2."""
 
     def share(self, value: Any) -> Any:
-        return self.copied(value)
-
-    def call(self, work: Callable[..., Any], *given: Any) -> Any:
-        return self.copied(work(*given))
-
-    def keep(self, work: Callable[..., Any], *given: Any) -> Any:
-        return self.copied(work(*given))
+        return value
 
 
-def test_run_on_copies_has_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+class NoKeys(Config):
+    pass
+
+
+def plan_on(executor: type[Any], output: Path) -> Plan:
     source = {
         "use": "simulator",
         "with": {
@@ -94,38 +90,34 @@ def test_run_on_copies_has_the_same_bytes(tmp_path: Path, monkeypatch: pytest.Mo
         },
     }
     spec = {"version": 1, "source": source, "resample": {"with": {"group_size": 50}}, "levels": 2}
-    run(parse_spec(spec, output=tmp_path / "here"))
-    elsewhere = Elsewhere()
+    offer = ExecutorContribution(name="other", summary="Another", config=NoKeys, build=lambda *_: executor())
+    return parse_spec(spec | {"run": {"executor": "other"}}, output=output, catalog=discover().including(offer))
 
-    @contextmanager
-    def executor_elsewhere(_: Any, source: Source) -> Iterator[Elsewhere]:
-        elsewhere.capture = capture_of(source).source
-        yield elsewhere
 
-    monkeypatch.setattr(run_module, "executor_of", executor_elsewhere)
-    run(parse_spec(spec, output=tmp_path / "there"))
-    assert elsewhere.capture is not None
+def test_run_on_copies_has_the_same_bytes(tmp_path: Path) -> None:
+    for name, executor in (("here", ThreadPoolExecutor), ("there", Elsewhere)):
+        run(plan_on(executor, tmp_path / name))
     for name in ("trajectory.npz", "panorama.tiff"):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
-def opener_of(path: Path, needed: Mapping[str, str]) -> CaptureOpener:
-    return CaptureOpener("run", 0, "packed-npy", {"path": path}, needed)
+def test_executor_of_the_older_contract_is_told_what_to_change(tmp_path: Path) -> None:
+    with pytest.raises(PluginError, match=r"no submit, map nor shutdown; return a concurrent.futures.Executor in place of one"):
+        run(plan_on(Older, tmp_path))
 
 
-@pytest.fixture
-def captures(tmp_path: Path) -> Path:
+def test_process_that_lacks_what_the_run_needs_is_named(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for name in ("one.npy", "other.npy"):
         np.save(tmp_path / name, rng.integers(0, 256, (9, 16, 4), dtype=np.uint8))
-    return tmp_path
 
+    def opener_of(name: str, needed: Mapping[str, str]) -> CaptureOpener:
+        return CaptureOpener("run", 0, "packed-npy", {"path": tmp_path / name}, needed)
 
-def test_processes_are_told_apart_by_versions_and_capture(captures: Path) -> None:
-    needed = dict.fromkeys(("python", "photonpano", "no-such-thing"), "")
-    here, there, nowhere = (met_elsewhere(opener_of(captures / f"{name}.npy", needed)) for name in ("one", "other", "none"))
-    assert here["no-such-thing"] == "missing"
-    assert here["python"] == there["python"]
-    assert here["capture"] != there["capture"]
-    assert here == met_elsewhere(opener_of(captures / "one.npy", needed))
-    assert "there is no file" in nowhere["capture"]
+    needed = met_by(("python", "photonpano"), opener_of("one.npy", {})())
+    opener_of("one.npy", needed)()
+    with pytest.raises(InputError, match=r"a worker on \S+ differs from the process of the run: python \S+ \(here 3.1\); it"):
+        opener_of("one.npy", needed | {"python": "3.1"})()
+    for name, found in (("other.npy", r"capture \w+ \(here"), ("none.npy", "there is no file")):
+        with pytest.raises(InputError, match=found):
+            opener_of(name, needed)()

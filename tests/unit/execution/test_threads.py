@@ -2,10 +2,8 @@
 
 import importlib.util
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -15,7 +13,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from photonpano.compiling import notify_on_first_compile
-from photonpano.execution.threads import Stopwatch, in_order, one_thread_inside
+from photonpano.execution.threads import in_order, one_thread_inside
 
 
 @pytest.fixture
@@ -43,22 +41,6 @@ def test_one_thread_inside_limits_libraries_and_restores_them() -> None:
     with pytest.raises(ValueError, match="half-way"):
         look_inside_and_fail()
     assert threads_of_libraries() == before
-
-
-def test_stopwatch_divides_time_in_a_pool_by_its_threads() -> None:
-    """Two threads that are busy for the same 0.1 s count as 0.1 s."""
-    clock, together = Stopwatch(2), threading.Barrier(2)
-
-    def work() -> None:
-        with clock("merge"):
-            together.wait()
-            time.sleep(0.1)
-            together.wait()
-
-    with ThreadPoolExecutor(2) as pool:
-        for future in [pool.submit(work), pool.submit(work)]:
-            future.result()
-    assert 0.1 <= clock.seconds["merge"] < 0.19
 
 
 def test_in_order_yields_in_order_and_holds_few_results() -> None:

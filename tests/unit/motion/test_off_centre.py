@@ -20,7 +20,7 @@ def exposures(memory_source: type, make_level: Callable) -> Callable[..., Virtua
     def exposures(references: list[float], **known: Trajectory | None) -> VirtualExposures:
         groups = [Group(span, reference) for span, reference in zip(SPANS, references, strict=True)]
         source = memory_source(np.zeros((160, 40, 60)))
-        return VirtualExposures(make_level(), source, groups, known.pop("previous", None), Stopwatch(1), **known)
+        return VirtualExposures(make_level(), source, groups, known.pop("previous", None), Stopwatch(), **known)
 
     return exposures
 

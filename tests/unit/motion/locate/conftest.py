@@ -36,7 +36,7 @@ def run(source: Any) -> Callable[..., LocatedLevel]:
         known: FrameSpan | None = None,
     ) -> LocatedLevel:
         groups = level.resampler.groups(N_FRAMES, level.number)
-        exposures = VirtualExposures(level, source, groups, previous, Stopwatch(threads), known=known)
+        exposures = VirtualExposures(level, source, groups, previous, Stopwatch(), known=known)
         setting = LoopSetting(
             source=source, graph=graph, context=Context(threads), reference=0, timeline=Timeline.regular(N_FRAMES)
         )

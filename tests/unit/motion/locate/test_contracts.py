@@ -147,7 +147,8 @@ def test_fallback_gets_pairs_that_the_locator_does_not_locate_and_no_others(
     by_second = {(edge.moving, edge.fixed) for edge in found.edges if edge.locator == "second"}
     assert by_second == {(4, 3), (4, 2), (5, 4), (5, 3), (6, 5), (6, 4), (7, 5)}
     assert {edge.locator for edge in found.edges} == {"toy", "second"}
-    assert sorted(second.shown) == [2, 3, 4, 5, 6, 7]
+    assert set(second.shown) == {2, 3, 4, 5, 6, 7}
+    assert threads > 1 or len(second.shown) == 6  # threads may describe an exposure at the same time
     assert third.shown == []
 
 

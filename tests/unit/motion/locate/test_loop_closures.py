@@ -75,7 +75,7 @@ def run() -> Callable[..., LocatedLevel]:
     def run(level: Level, closure_overlap: float | None = 0.5, threads: int = 2) -> LocatedLevel:
         groups = level.resampler.groups(10 * N, level.number)
         graph = GraphSettings(skips=(1.0, 2.0), closure_overlap=closure_overlap)
-        exposures = VirtualExposures(level, source, groups, None, Stopwatch(threads))
+        exposures = VirtualExposures(level, source, groups, None, Stopwatch())
         setting = LoopSetting(
             source=source, graph=graph, context=Context(threads), reference=0, timeline=Timeline.regular(10 * N)
         )
@@ -125,7 +125,7 @@ def test_loop_closures_stop_the_drift(run: Callable, level: Callable) -> None:
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_closure_starts_from_the_solution_of_the_other_pairs(run: Callable, level: Callable, scale: float) -> None:
     toy = level(scale=scale)
-    run(toy)
+    run(toy, threads=1)
     initials = toy.locators[0].component.initials
     assert all(initial is None for initial in initials[: -len(PAIRS)])
     # Both exposures of a pair show one place; the drift of neighbours between them is 0.05 px of an exposure each.
