@@ -25,7 +25,6 @@ from photonpano.specs.yaml_reader import Written, from_python
 from photonpano.text import listed
 from photonpano.values import Decision, StreamInfo
 
-MAX_COMPLAINTS = 100  # of one component that are reported
 logger = logging.getLogger(__name__)
 
 _SHOWN = 3  # names of a folder in a message
@@ -76,7 +75,7 @@ def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
     """Run the `check` of a component; one that raises is a complaint itself."""
     try:
         found = choice.contribution.check(choice.config, *stream)
-        return (found,) if isinstance(found, str) else tuple(map(str, islice(found, MAX_COMPLAINTS)))
+        return (found,) if isinstance(found, str) else tuple(map(str, found))
     except Exception as error:
         return (f"the check of the {choice.label} raised {described(error)}",)
 

@@ -19,7 +19,6 @@ from photonpano.text import listed, suggestion
 
 # The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks.
 DEFAULT_FALLBACK = "opencv-sift"
-MAX_LISTED = 16  # components in a list, such as fallbacks
 _AGAIN = "would lose the same pairs again"
 AUTO = "auto"  # the default: the run masks what stands still, and divides by a vignette
 
@@ -122,9 +121,7 @@ class ComponentResolver:
         items = written.items()
         if written.data is None and default in self.catalog.names(kind.name):
             items = [Written(default, written.place.below(0))]
-        if len(items) > MAX_LISTED:
-            self.spec.wrong(written, f"expected at most {MAX_LISTED} {kind.name}s, got {given(items)}")
-        return [each.spelled_out() for each in items[:MAX_LISTED]]
+        return [each.spelled_out() for each in items]
 
     def fallbacks(self, section: Written, written: Written, first: Choice | None) -> tuple[Choice, ...]:
         """Resolve the locators to which the pairs that the first one lost are offered.
