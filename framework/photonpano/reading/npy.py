@@ -13,7 +13,7 @@ from functools import lru_cache
 from gzip import GzipFile
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -416,9 +416,6 @@ _CARRIES = 0.25
 _BLOCK = 8  # side of the blocks of frames, rows and columns that are correlated with their neighbours
 _TIMES_LONGER = 2  # the axis of the frames is more than twice as long as both of the image
 
-Eight: TypeAlias = Literal["pixels of a column", "pixels of a row", "frames"]
-_PACKED_AXES: tuple[Eight, ...] = get_args(Eight)  # the axis of an array whose last is that of the frames
-
 _MIN_LEAD = 4.0  # standard errors by which the correlation along the axis of the frames exceeds the others
 
 
@@ -506,54 +503,36 @@ def _are_numbers(samples: Sequence[NDArray[np.uint8]], peak: NDArray[np.uint8]) 
     return _score(_units_of((excess * pairs)[None])[0]) > _MIN_SCORE
 
 
-def frames_are_last(samples: Sequence[NDArray[Any]], shape: Sequence[int]) -> bool:
+def frames_are_last(samples: Sequence[NDArray[Any]], shape: Sequence[int], packed_axis: int | None = None) -> bool:
     """Return whether the last axis of an array is that of the frames, and the first two are those of the image.
 
     Eight frames later a pixel is more like itself than the pixel eight rows or columns further, unless the image moves by more
     than a pixel a frame. So the axis along which blocks of values correlate most is that of the frames, if it is the longest.
 
     Args:
-        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, columns), a pixel to a value.
-        shape: that of the array.
+        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, columns).
+        shape: that of the array: (rows, columns, frames).
+        packed_axis: the axis of which a byte would hold eight values; None for a pixel to a value.
     """
-    return _last_is_longest(*shape) and _last_is_alike(samples, (_BLOCK, _BLOCK, _BLOCK))
-
-
-def packed_frames_are_last(samples: Sequence[NDArray[np.uint8]], shape: Sequence[int], a_byte_holds: Eight) -> bool:
-    """Return whether the last axis of an array of bytes is that of the frames: see `frames_are_last`.
-
-    Args:
-        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, bytes of a row).
-        shape: that of the array: (rows, bytes of a row, frames), (bytes of a column, columns, frames), or (rows, columns, bytes
-            of eight frames).
-        a_byte_holds: what the eight bits of a byte would be.
-    """
-    axis = _PACKED_AXES.index(a_byte_holds)
     lengths, block = list(shape), [_BLOCK] * 3
-    lengths[axis], block[axis] = 8 * shape[axis], 1
-    if not _last_is_longest(*lengths):
+    values = list(samples)
+    if packed_axis is not None:
+        lengths[packed_axis], block[packed_axis] = 8 * shape[packed_axis], 1
+        values = [np.bitwise_count(each) for each in samples]
+    if lengths[2] <= _TIMES_LONGER * max(lengths[:2]):
         return False
-    lit = [np.bitwise_count(each) for each in samples]
-    if a_byte_holds == "frames":
-        return _last_is_alike(lit, block)
+    blocks = [_blocks(each, block) for each in values]
+    (first, _), (second, _), (last, number) = (_correlation(blocks, axis) for axis in range(3))
+    is_alike = bool(first and second and last) and last - max(first, second) > _MIN_LEAD * math.sqrt(2 / number)
+    if packed_axis is None or packed_axis == 2:
+        return is_alike
     # Bytes of eight pixels are less alike along the axis where they are packed, as they are 8 px apart there.
-    pixels = [_blocks(each, (1, 1, _BLOCK)) for each in lit]
-    if _correlation(pixels, axis) < _correlation(pixels, 1 - axis) and _last_is_alike(lit, block):
+    pixels = [_blocks(each, (1, 1, _BLOCK)) for each in values]
+    if is_alike and _correlation(pixels, packed_axis) < _correlation(pixels, 1 - packed_axis):
         return True
     # The frames may move too fast for that. Then the axis where bytes are packed is still an axis of the image.
-    other = other_order(samples if axis == 1 else [each.swapaxes(0, 1) for each in samples])
+    other = other_order(samples if packed_axis == 1 else [each.swapaxes(0, 1) for each in samples])
     return other is not None and other.order.packed_along == "height"
-
-
-def _last_is_longest(first: int, second: int, last: int) -> bool:
-    return last > _TIMES_LONGER * max(first, second)
-
-
-def _last_is_alike(samples: Sequence[NDArray[Any]], block: Sequence[int]) -> bool:
-    """Return whether neighbouring blocks of values correlate most along the last axis."""
-    blocks = [_blocks(each, block) for each in samples]
-    (first, _), (second, _), (last, number) = (_correlation(blocks, axis) for axis in range(3))
-    return bool(first and second and last) and last - max(first, second) > _MIN_LEAD * math.sqrt(2 / number)
 
 
 def _blocks(frames: NDArray[Any], block: Sequence[int]) -> NDArray[np.float64]:
