@@ -297,26 +297,19 @@ def other_order(samples: Sequence[NDArray[np.uint8]], expected: PixelOrder = ORD
     None where that fits, or where the frames are too dark or too plain. Noise, uniform light and static columns have no order;
     stripes and other regular patterns agree with the expected one.
     """
-    found = [_other(_Likeness(products), ORDERS.index(expected)) for products in _products_of(samples)]
+    found = [_other(products, ORDERS.index(expected)) for products in _products_of(samples)]
     scored = [each for each in found if each is not None]
     return max(scored, key=lambda each: each[0])[1] if scored else None
 
 
-class _Likeness:
-    """Products of neighbouring pixels in units of the image, over the variance there."""
-
-    def __init__(self, products: NDArray[np.float32]) -> None:
-        *sums, variance = _units_of(products)
-        seen = variance > 0
-        units = np.array(sums)[:, seen] / (variance[seen] + _FLOOR * np.sum(variance) / max(1, seen.sum()))
-        self.smooth, self.across, self.within = units[:4], units[4:8], units[8]
-
-
-def _other(likeness: _Likeness, expected: int) -> tuple[float, OtherOrder] | None:
+def _other(products: NDArray[np.float32], expected: int) -> tuple[float, OtherOrder] | None:
     """Return the order that fits if the expected one does not, and the score of their difference."""
-    smooth, across, within = likeness.smooth, likeness.across, likeness.within
-    if not len(within):
+    *sums, variance = _units_of(products)
+    seen = variance > 0
+    if not seen.any():
         return None
+    likeness = np.array(sums)[:, seen] / (variance[seen] + _FLOOR * variance[seen].mean())
+    smooth, across, within = likeness[:4], likeness[4:8], likeness[8]
     best = int(np.argmax(smooth.mean(axis=1)))
     lead = _score(smooth[best] - smooth[expected])
     if best == expected or min(lead, _score(smooth[best])) < _MIN_SCORE:
@@ -335,10 +328,9 @@ def _products_of(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float3
     found: dict[int, NDArray[np.float32]] = {}
     for frames in samples:
         n_sums = len(frames) // _LENGTHS[0]
-        # The counts of the four pairs of pixels of a byte lie in the four bytes of a word.
-        words = _PAIRS[frames[: n_sums * _LENGTHS[0]]].reshape(n_sums, _LENGTHS[0], *frames.shape[1:])
-        summed: NDArray[np.uint32] = words.sum(axis=1, dtype=np.uint32)
-        sums = summed[..., None].view(np.uint8).astype(np.float32)
+        bits = np.unpackbits(frames[: n_sums * _LENGTHS[0]], axis=2)
+        pixels = bits.reshape(n_sums, _LENGTHS[0], -1, 2).sum(axis=1, dtype=np.uint8).sum(axis=2, dtype=np.float32)
+        sums = pixels.reshape(n_sums, *frames.shape[1:], 4)  # four pairs of pixels in a byte
         for length in _LENGTHS:
             step = length // _LENGTHS[0]
             if step > len(sums):
@@ -348,9 +340,6 @@ def _products_of(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float3
                 products = _products(image)
                 found[length] = found[length] + products if length in found else products
     return list(found.values())
-
-
-_PAIRS = np.unpackbits(np.arange(256, dtype=np.uint8)).reshape(256, 4, 2).sum(axis=2, dtype=np.uint8).view(np.uint32)[:, 0]
 
 
 def _products(image: NDArray[np.float32]) -> NDArray[np.float32]:
