@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, Literal, Self, TypeAlias
+from typing import Any, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,6 @@ from photonpano.photometry import BinarySumResponse, packed_along_width, reverse
 from photonpano.reading import (
     BinarySource,
     BlockSource,
-    Content,
     FrameFile,
     FrameLayout,
     NpyHeader,
@@ -49,7 +48,6 @@ from photonpano.reading import (
     objections,
     of_channel,
     other_order,
-    packed_frames_are_last,
     require_frames,
     require_whole,
     sampled_frames,
@@ -268,55 +266,49 @@ def _whole_header(config: _AnyConfig) -> NpyHeader:
     path, header = config.path, _header(config)
     if not is_gzip(path):
         require_whole(path, header)
-    if isinstance(config, NpyConfig) and config.frame_axis is None and _frames_are_last(path, header):
-        raise InputError(
-            f"{path} has its frames along the last axis of {header.shape}, where values are most alike; write "
-            "frame_axis: last, or frame_axis: first if it is right"
-        )
+    if isinstance(config, NpyConfig) and config.frame_axis is None and len(header.shape) == 3:
+        samples = sampled_frames(path, header)
+        if samples and frames_are_last(samples, header.shape):
+            raise InputError(
+                f"{path} has its frames along the last axis of {header.shape}, where values are most alike; write "
+                "frame_axis: last, or frame_axis: first if it is right"
+            )
     return header
 
 
 def _header(config: _AnyConfig) -> NpyHeader:
     """Return the header of the capture, which may be incomplete; raise if it does not agree with the config."""
-    path = config.path
-    header = any_npy_header(path)
+    path, header = config.path, any_npy_header(config.path)
+    axes = "frames, height, bytes of a row"
     if isinstance(config, PackedNpyConfig):
-        _require_packed(config, header)
-        return header
-    if header.dtype.kind not in "bui":
+        if header.dtype != np.uint8:
+            seen = _seen(path, header)
+            remedy = "pack frames of zeros and ones with numpy.packbits(cube, axis=-1)" if seen is None else seen.remedy(path)
+            raise InputError(f"{path} holds {header.dtype} values, not bytes of eight pixels; {remedy}")
+    else:
+        axes = "height, width, frames" if config.frame_axis == "last" else "frames, height, width"
+        if header.dtype.kind not in "bui":
+            raise InputError(
+                f"{path} holds {header.dtype} values; {config.holds} are bool or whole numbers: convert them with "
+                f"cube.astype({_TYPES[config.holds]})"
+            )
+    in_colour = has_channels(path, header)
+    if len(header.shape) != 3 and not in_colour:
         raise InputError(
-            f"{path} holds {header.dtype} values; {config.holds} are bool or whole numbers: convert them with "
-            f"cube.astype({_TYPES[config.holds]})"
+            f"{path} has the shape {header.shape}; a capture has 3 dimensions, {axes}, and in colour a fourth, of 3 channels"
         )
-    if has_channels(path, header):
-        if config.holds == "sums" or config.frame_axis == "last":
-            key, remedy = "frame_axis: last", "numpy.moveaxis(numpy.load(path), 2, 0) to another file, and leave it out"
-            if config.holds == "sums":
-                key, remedy = "holds: sums", "one of them, such as numpy.load(path)[..., 1], to another file"
-            raise InputError(f"{path} has three channels, in the shape {header.shape}, and {key} reads one only; save {remedy}")
-    elif len(header.shape) != 3:
+    require_frames(path, header, axes)
+    if isinstance(config, PackedNpyConfig):
+        if not in_colour and config.channel is not None:
+            raise InputError(f"{path} has the shape {header.shape} and no channels; leave out channel: {config.channel}")
+        _frame_shape(config, header)
+    elif in_colour and (config.holds == "sums" or config.frame_axis == "last"):
+        key = "holds: sums" if config.holds == "sums" else "frame_axis: last"
         raise InputError(
-            f"{path} has the shape {header.shape}; a capture has 3 dimensions, frames, height and width, and one in colour a "
-            "fourth, of 3 channels"
+            f"{path} has three channels, in the shape {header.shape}, and {key} reads one only; save one of them, such as "
+            "numpy.load(path)[..., 1], to another file"
         )
-    require_frames(path, header, "height, width, frames" if config.frame_axis == "last" else "frames, height, width")
     return header
-
-
-def _require_packed(config: PackedNpyConfig, header: NpyHeader) -> None:
-    path, channel = config.path, config.channel
-    if header.dtype != np.uint8:
-        raise InputError(f"{path} holds {header.dtype} values, not bytes of eight pixels; {_remedy(path, header)}")
-    colour = has_channels(path, header)
-    if len(header.shape) != 3 and not colour:
-        raise InputError(
-            f"{path} has the shape {header.shape}; a packed capture has 3 dimensions, frames, height and bytes of a row, and "
-            "one of colour a fourth, of 3 channels"
-        )
-    require_frames(path, header, "frames, height, bytes of a row")
-    if not colour and channel is not None:
-        raise InputError(f"{path} has the shape {header.shape} and no channels; leave out channel: {channel}")
-    _frame_shape(config, header)
 
 
 def _layout(config: PackedNpyConfig, header: NpyHeader, channel: int | None) -> FrameLayout:
@@ -337,104 +329,93 @@ def _layout(config: PackedNpyConfig, header: NpyHeader, channel: int | None) -> 
 
 def _frame_shape(config: PackedNpyConfig, header: NpyHeader) -> tuple[int, int]:
     """Return the height and width of a frame; raise if they do not agree with the array."""
-    n_rows, n_columns = header.shape[1:3]
-    if config.packed_along == "height":
-        height = 8 * n_rows if config.height is None else config.height
-        width = n_columns if config.width is None else config.width
-        if -(-height // 8) != n_rows:
-            raise InputError(
-                f"{config.path} has columns of {n_rows} bytes, which hold a height of {8 * n_rows - 7} to {8 * n_rows}, not "
-                f"{height}; correct the height"
-            )
-        if width != n_columns:
-            raise InputError(f"{config.path} has {n_columns} columns, not {width}; correct the width, or leave it out")
-        return height, width
-    if config.height not in (None, n_rows):
-        raise InputError(f"{config.path} has {n_rows} rows, not {config.height}; correct the height, or leave it out")
-    width = 8 * n_columns if config.width is None else config.width
-    if -(-width // 8) != n_columns:
-        remedy = "correct the width"
-        if width == n_columns:
-            remedy = f"it seems not to be packed: write {_section(config.path, 'bits')}"
-        raise InputError(
-            f"{config.path} has rows of {n_columns} bytes, which hold a width of {8 * n_columns - 7} to {8 * n_columns}, not "
-            f"{width}; {remedy}"
-        )
-    return n_rows, width
+    packed_along, found = config.packed_along or "width", {"height": header.shape[1], "width": header.shape[2]}
+    for key, stored in found.items():
+        written: int | None = getattr(config, key)
+        if key != packed_along and written not in (None, stored):
+            raise InputError(f"{config.path} has a {key} of {stored}, not {written}; correct the {key}, or leave it out")
+        if key == packed_along:
+            found[key] = 8 * stored if written is None else written
+            if -(-found[key] // 8) != stored:
+                remedy = f"correct the {key}"
+                if written == stored:
+                    remedy = f"it seems not to be packed: write {_section(config.path, {'holds': 'bits'})}"
+                raise InputError(
+                    f"{config.path} has {stored} bytes along the {key}, which hold {8 * stored - 7} to {8 * stored} px, not "
+                    f"{written}; {remedy}"
+                )
+    return found["height"], found["width"]
 
 
-def _remedy(path: Location, header: NpyHeader) -> str:
-    """Return the remedy for an array that is not uint8."""
-    content = _contents(path, header)
-    if content is None:
-        return "pack frames of zeros and ones with numpy.packbits(cube, axis=-1)"
-    return f"write {_section(path, content.holds, content.highest)}"
+class _Seen(NamedTuple):
+    """How the values of an array seem to be stored."""
+
+    use: str  # the source that reads it, empty if none does
+    keys: dict[str, Any]  # of this source, beside the path
+    because: str = ""  # what shows it
+    save: str = ""  # what to save to another file if no source reads it
+
+    def remedy(self, path: Location) -> str:
+        """Return what to write in a spec, or to save."""
+        if self.use == "npy":
+            larger = ", with the number of binary frames in a sum if it is larger" if self.keys["holds"] == "sums" else ""
+            return f"write {_section(path, self.keys)}{larger}"
+        keys = " and ".join(f"{key}: {value}" for key, value in self.keys.items())
+        remedy = f"save {self.save} to another file, or write" if self.save else f"write {keys}, or"
+        return f"{remedy} bit_order: big if it is right"
 
 
-def _section(path: Location, holds: str, highest: int = 1) -> str:
-    """Return the section of a spec that reads values; `highest` is the largest one seen."""
-    written = str(path) if _PLAIN.fullmatch(str(path)) else json.dumps(str(path), ensure_ascii=False)
-    if holds == "bits":
-        return f"source: {{use: npy, with: {{path: {written}, holds: bits}}}}"
-    keys = f"holds: sums, frames_per_sum: {highest}"
-    return f"source: {{use: npy, with: {{path: {written}, {keys}}}}}, with the number of binary frames in a sum if it is larger"
+_EIGHT = {1: "pixels of a row", 0: "pixels of a column", 2: "frames"}  # what a byte may hold if the frames are the last axis
 
 
-def _contents(path: Location, header: NpyHeader) -> Content | None:
-    """Return the content of an array of bool or whole numbers; None if it is something else, or bytes of eight pixels each."""
+def _seen(path: Location, header: NpyHeader, channel: int | None = None) -> _Seen | None:
+    """Return how an array of bool or whole numbers seems to be stored, by the likeness of neighbouring values."""
     if header.dtype.kind not in "bui" or min(header.shape, default=0) < 1 or header.fortran_order:
         return None
-    if len(header.shape) != 3 and not has_channels(path, header):
+    in_colour = has_channels(path, header)
+    if len(header.shape) != 3 and not in_colour:
         return None
-    samples = _samples(path, header)
-    return unpacked_content(samples) if samples else None
+    samples = [of_channel(each, channel) if in_colour else each for each in sampled_frames(path, header)]
+    if not samples:
+        return None
+    shape = header.shape[:3]
+    if content := unpacked_content(samples):
+        keys: dict[str, Any] = {"holds": content.holds}
+        because = f"all of {content.n_values:,} values sampled are 0 or {content.highest}"
+        if content.holds == "sums":
+            keys["frames_per_sum"] = content.highest
+            because = f"neighbouring values are alike as numbers, up to {content.highest} in {content.n_values:,} sampled"
+        if not in_colour and frames_are_last(samples, shape):
+            return _Seen("npy", keys | {"frame_axis": "last"}, f"{because}, and most alike along the last axis of {shape}")
+        return _Seen("npy", keys, because)
+    if header.dtype != np.uint8:
+        return None
+    for axis, eight in _EIGHT.items():
+        if frames_are_last(samples, shape, axis):
+            frames_first = f"numpy.moveaxis(numpy.unpackbits(numpy.load(path), axis={axis}), -1, 0)"
+            alike = f"has its frames along the last axis of {shape}, where values are most alike"
+            return _Seen("", {}, f"{alike}, and a byte holds eight {eight}", f"numpy.packbits({frames_first}, axis=-1)")
+    if other := other_order(samples):
+        keys = {key: value for key, value in other.order._asdict().items() if value != getattr(PixelOrder(), key)}
+        return _Seen("packed-npy", keys, str(other))
+    return _Seen("packed-npy", {})
 
 
-def _frames_are_last(path: Location, header: NpyHeader) -> bool:
-    samples = _samples(path, header)
-    return bool(samples) and len(header.shape) == 3 and frames_are_last(samples, header.shape)
+def _section(path: Location, keys: dict[str, Any]) -> str:
+    """Return the section of a spec that reads values that are not packed."""
+    written = str(path) if _PLAIN.fullmatch(str(path)) else json.dumps(str(path), ensure_ascii=False)
+    return f"source: {{use: npy, with: {{path: {written}, {', '.join(f'{key}: {value}' for key, value in keys.items())}}}}}"
 
 
 def _require_order(config: PackedNpyConfig) -> None:
     """Refuse frames that are not packed, or in another order than by default, with the line of a spec that reads them."""
     header = _whole_header(config)
-    path, samples = config.path, _samples(config.path, header, config.channel)
-    if not samples or config.bit_order is not None or config.packed_along is not None:
+    if config.bit_order is not None or config.packed_along is not None:
         return
-    if content := unpacked_content(samples):
-        seen = f"all of {content.n_values:,} bytes sampled are 0 or {content.highest}"
-        if content.holds == "sums":
-            seen = f"neighbouring bytes are alike as numbers, up to {content.highest} in {content.n_values:,} sampled"
-        raise InputError(f"{path} is not packed: {seen}; write {_section(path, content.holds, content.highest)}")
-    frames_first = "numpy.moveaxis(numpy.load(path), -1, 0)"
-    if packed_frames_are_last(samples, header.shape[:3], "pixels of a row"):
-        raise _frames_last(path, header, "pixels of a row", f"save {frames_first} to another file")
-    if packed_frames_are_last(samples, header.shape[:3], "pixels of a column"):
-        remedy = f"save {frames_first} to another file and read that with packed_along: height"
-        raise _frames_last(path, header, "pixels of a column", remedy)
-    if other := other_order(samples):
-        keys = " and ".join(f"{key}: {value}" for key, value in _keys_of(other.order).items())
-        raise InputError(f"{path} is packed in another order: {other}; write {keys}, or bit_order: big if it is right")
-    if packed_frames_are_last(samples, header.shape[:3], "frames"):
-        frames_first = "numpy.moveaxis(numpy.unpackbits(numpy.load(path), axis=-1), -1, 0)"
-        raise _frames_last(path, header, "frames", f"save numpy.packbits({frames_first}, axis=-1) to another file")
-
-
-def _frames_last(path: Location, header: NpyHeader, a_byte_holds: str, remedy: str) -> InputError:
-    return InputError(
-        f"{path} has its frames along the last axis of {header.shape[:3]}, where values are most alike, and a byte holds eight "
-        f"{a_byte_holds}; {remedy}, or write bit_order: big if it is right"
-    )
-
-
-def _samples(path: Location, header: NpyHeader, channel: int | None = None) -> list[NDArray[Any]]:
-    samples = sampled_frames(path, header)
-    return [of_channel(each, channel) for each in samples] if len(header.shape) == 4 else samples
-
-
-def _keys_of(order: PixelOrder) -> dict[str, str]:
-    """Return the keys of an order that differ from the defaults."""
-    return {key: value for key, value in order._asdict().items() if value != getattr(PixelOrder(), key)}
+    seen = _seen(config.path, header, config.channel)
+    if seen is not None and (seen.use != "packed-npy" or seen.keys):
+        wrong = {"npy": "is not packed: ", "packed-npy": "is packed in another order: "}.get(seen.use, "")
+        raise InputError(f"{config.path} {wrong}{seen.because}; {seen.remedy(config.path)}")
 
 
 def _require_values(config: NpyConfig) -> None:
@@ -452,45 +433,23 @@ def _is_alone(path: Location) -> bool:
     return isinstance(path, Url) or (path.is_file() and not (path.parent / "transforms.json").exists())
 
 
-def _recognise_packed(path: Location) -> Recognised | None:
-    if not _is_alone(path):
-        return None
-    try:
-        header = _header(PackedNpyConfig(path=path))
-    except InputError:
-        return None
-    keys: dict[str, Any] = {"path": as_written(path)}
-    because = f"uint8 of shape {header.shape} in a .npy file{_IN_COLOUR if len(header.shape) == 4 else ''}"
-    samples = _samples(path, header)
-    if not samples:
-        return Recognised(keys, because)
-    shape = header.shape[:3]
-    if unpacked_content(samples) or packed_frames_are_last(samples, shape, "pixels of a row"):
-        return None
-    if packed_frames_are_last(samples, shape, "pixels of a column"):
-        return None
-    if other := other_order(samples):
-        return Recognised(keys | _keys_of(other.order), f"{because}, where {other}")
-    return None if packed_frames_are_last(samples, shape, "frames") else Recognised(keys, because)
-
-
-def _recognise_bits(path: Location) -> Recognised | None:
-    """Take .npy files of bits. The number of frames in a sum stands in no file."""
+def _recognise(use: str, path: Location) -> Recognised | None:
+    """Take .npy files that the source reads as their values seem to be stored; but no sums, whose number stands in no file."""
     if not _is_alone(path):
         return None
     try:
         header = any_npy_header(path)
-        content = _contents(path, header)
+        seen = _seen(path, header)
+        if seen is None and use == "packed-npy":  # too short to tell, or cut short
+            _header(PackedNpyConfig(path=path))
+            seen = _Seen(use, {})
     except InputError:
         return None
-    if content is None or content.holds != "bits":
+    if seen is None or seen.use != use or seen.keys.get("holds") == "sums":
         return None
-    keys = {"path": as_written(path), "holds": "bits"}
     colour = _IN_COLOUR if len(header.shape) == 4 else ""
-    because = f"{header.dtype} of shape {header.shape} in a .npy file{colour}, with the values 0 and {content.highest} only"
-    if not _frames_are_last(path, header):
-        return Recognised(keys, because)
-    return Recognised(keys | {"frame_axis": "last"}, f"{because}, and values are most alike along the last axis")
+    because = f"{header.dtype} of shape {header.shape} in a .npy file{colour}{', where ' if seen.because else ''}{seen.because}"
+    return Recognised({"path": as_written(path), **seen.keys}, because)
 
 
 _contribution = partial(
@@ -505,14 +464,14 @@ PACKED_NPY = _contribution(
     summary="Binary frames in a .npy file, eight pixels to a byte, as from numpy.packbits",
     config=PackedNpyConfig,
     check=lambda config: objections(_require_order, config),
-    recognise=_recognise_packed,
+    recognise=partial(_recognise, "packed-npy"),
 )
 NPY = _contribution(
     name="npy",
     summary="Frames in a .npy file, a pixel to a value: zeros and ones, or sums of binary frames",
     config=NpyConfig,
     check=lambda config: objections(_require_values, config),
-    recognise=_recognise_bits,
+    recognise=partial(_recognise, "npy"),
 )
 
 

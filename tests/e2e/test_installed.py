@@ -119,7 +119,7 @@ def test_names_of_missing_plugin_are_errors_with_suggestions(small_capture: Path
     merger, locator, last = checked.output.splitlines()
     known = "local-flow, photon-mle and splat"
     assert merger.endswith(f"scan.yaml:9:8: merge.use: there is no merger 'short-exposure'; known: {known}")
-    assert "scan.yaml:12:8: locate.use: there is no locator 'profile-shift'; known: chain-of-backends, direct, " in locator
+    assert "scan.yaml:12:8: locate.use: there is no locator 'profile-shift'; known: direct, " in locator
     assert last == "error: the spec has 2 problems"
 
 

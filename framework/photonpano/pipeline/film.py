@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Literal
 
 import cv2
@@ -12,14 +11,15 @@ import numpy as np
 
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source, camera_of
+from photonpano.execution.context import Context
 from photonpano.execution.threads import in_order
 from photonpano.geometry import Camera, Canvas, outline_of
-from photonpano.merging.colour import composed, in_colours
-from photonpano.merging.panorama import MergeRenderer
+from photonpano.merging.colour import composed
+from photonpano.merging.panorama import render
 from photonpano.motion.frame_motion import FrameMotion, smooth_view
 from photonpano.photometry import WhiteBalance, balanced, grey_world, linear_to_srgb
 from photonpano.record.picture_files import Picture
-from photonpano.values import FloatArray, FluxImage, FrameSpan, Panorama
+from photonpano.values import FloatArray, FluxImage, FrameSpan
 
 # The white balance "grey-world" is averaged over this many pictures of the video, so that it does not flicker.
 _BALANCED_ON = 16
@@ -93,12 +93,7 @@ def merged(
     source: Source, motion: FrameMotion, span: FrameSpan, canvas: Canvas, tolerance_px: float, threads: int
 ) -> FluxImage:
     """Merge frames on a canvas along a motion; of a filter array, the colours: (H, W) or (H, W, 3)."""
-    renderer = MergeRenderer(partial(in_order, threads=threads))
-
-    def of_colour(each: Source) -> Panorama:
-        return renderer.render(each, motion.trajectory, span, canvas, tolerance_px, lambda _: None)
-
-    return composed(in_colours(source, of_colour), source).flux
+    return composed(render(source, motion.trajectory, span, canvas, tolerance_px, Context(threads)), source).flux
 
 
 def outline_on(canvas: Canvas, motion: FrameMotion, camera: Camera | None, instant: float) -> FluxImage:

@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
-from itertools import islice
 from typing import Any
 
 import pluggy
@@ -25,7 +24,6 @@ PREFIX = f"{PROJECT}_"
 HOOKS = tuple(name for name in vars(hookspecs) if name.startswith(PREFIX))
 # The hooks that offer nothing: a run calls them, so that a plugin can watch it.
 OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for kind in KINDS.values()})
-MAX_OFFERED = 1000  # maximum number of components of a hook
 logger = logging.getLogger(__name__)
 
 DISABLE = "PHOTONPANO_DISABLE_PLUGINS"  # an environment variable: names of distributions or entry points, separated by commas
@@ -82,20 +80,14 @@ def _registered(plugin: object) -> pluggy.PluginManager:
 def _offered(manager: pluggy.PluginManager, kind: Kind) -> list[Contribution]:
     try:
         results: list[Any] = getattr(manager.hook, kind.hook)()
-        offered = [item for result in results for item in _items(result)]
+        offered = [item for each in results for item in ([each] if isinstance(each, Contribution) else each)]
     except Exception as error:
         raise PluginError(f"{kind.hook} raised {described(error)}") from error
-    if len(offered) > MAX_OFFERED:
-        raise PluginError(f"{kind.hook} offers more than {MAX_OFFERED} components; does it end?")
     for item in offered:
         if not isinstance(item, kind.contribution):
             raise PluginError(f"{kind.hook} offers {_short(item)}, expected a {kind.contribution.__name__}")
         require_same_contract(item)
     return offered
-
-
-def _items(result: Any) -> list[Any]:
-    return [result] if isinstance(result, Contribution) else list(islice(result, MAX_OFFERED + 1))
 
 
 def _short(item: object) -> str:

@@ -30,7 +30,6 @@ from .npy import gzipped_npy_header as gzipped_npy_header
 from .npy import has_channels as has_channels
 from .npy import npy_header as npy_header
 from .npy import other_order as other_order
-from .npy import packed_frames_are_last as packed_frames_are_last
 from .npy import require_frames as require_frames
 from .npy import require_whole as require_whole
 from .npy import sampled_frames as sampled_frames

@@ -13,7 +13,7 @@ from functools import lru_cache
 from gzip import GzipFile
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -297,26 +297,19 @@ def other_order(samples: Sequence[NDArray[np.uint8]], expected: PixelOrder = ORD
     None where that fits, or where the frames are too dark or too plain. Noise, uniform light and static columns have no order;
     stripes and other regular patterns agree with the expected one.
     """
-    found = [_other(_Likeness(products), ORDERS.index(expected)) for products in _products_of(samples)]
+    found = [_other(products, ORDERS.index(expected)) for products in _products_of(samples)]
     scored = [each for each in found if each is not None]
     return max(scored, key=lambda each: each[0])[1] if scored else None
 
 
-class _Likeness:
-    """Products of neighbouring pixels in units of the image, over the variance there."""
-
-    def __init__(self, products: NDArray[np.float32]) -> None:
-        *sums, variance = _units_of(products)
-        seen = variance > 0
-        units = np.array(sums)[:, seen] / (variance[seen] + _FLOOR * np.sum(variance) / max(1, seen.sum()))
-        self.smooth, self.across, self.within = units[:4], units[4:8], units[8]
-
-
-def _other(likeness: _Likeness, expected: int) -> tuple[float, OtherOrder] | None:
+def _other(products: NDArray[np.float32], expected: int) -> tuple[float, OtherOrder] | None:
     """Return the order that fits if the expected one does not, and the score of their difference."""
-    smooth, across, within = likeness.smooth, likeness.across, likeness.within
-    if not len(within):
+    *sums, variance = _units_of(products)
+    seen = variance > 0
+    if not seen.any():
         return None
+    likeness = np.array(sums)[:, seen] / (variance[seen] + _FLOOR * variance[seen].mean())
+    smooth, across, within = likeness[:4], likeness[4:8], likeness[8]
     best = int(np.argmax(smooth.mean(axis=1)))
     lead = _score(smooth[best] - smooth[expected])
     if best == expected or min(lead, _score(smooth[best])) < _MIN_SCORE:
@@ -335,10 +328,9 @@ def _products_of(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float3
     found: dict[int, NDArray[np.float32]] = {}
     for frames in samples:
         n_sums = len(frames) // _LENGTHS[0]
-        # The counts of the four pairs of pixels of a byte lie in the four bytes of a word.
-        words = _PAIRS[frames[: n_sums * _LENGTHS[0]]].reshape(n_sums, _LENGTHS[0], *frames.shape[1:])
-        summed: NDArray[np.uint32] = words.sum(axis=1, dtype=np.uint32)
-        sums = summed[..., None].view(np.uint8).astype(np.float32)
+        bits = np.unpackbits(frames[: n_sums * _LENGTHS[0]], axis=2)
+        pixels = bits.reshape(n_sums, _LENGTHS[0], -1, 2).sum(axis=1, dtype=np.uint8).sum(axis=2, dtype=np.float32)
+        sums = pixels.reshape(n_sums, *frames.shape[1:], 4)  # four pairs of pixels in a byte
         for length in _LENGTHS:
             step = length // _LENGTHS[0]
             if step > len(sums):
@@ -348,9 +340,6 @@ def _products_of(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float3
                 products = _products(image)
                 found[length] = found[length] + products if length in found else products
     return list(found.values())
-
-
-_PAIRS = np.unpackbits(np.arange(256, dtype=np.uint8)).reshape(256, 4, 2).sum(axis=2, dtype=np.uint8).view(np.uint32)[:, 0]
 
 
 def _products(image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -415,9 +404,6 @@ _WEIGHTS = np.unpackbits(np.arange(256, dtype=np.uint8)).reshape(256, 8) @ 4.0 *
 _CARRIES = 0.25
 _BLOCK = 8  # side of the blocks of frames, rows and columns that are correlated with their neighbours
 _TIMES_LONGER = 2  # the axis of the frames is more than twice as long as both of the image
-
-Eight: TypeAlias = Literal["pixels of a column", "pixels of a row", "frames"]
-_PACKED_AXES: tuple[Eight, ...] = get_args(Eight)  # the axis of an array whose last is that of the frames
 
 _MIN_LEAD = 4.0  # standard errors by which the correlation along the axis of the frames exceeds the others
 
@@ -506,54 +492,36 @@ def _are_numbers(samples: Sequence[NDArray[np.uint8]], peak: NDArray[np.uint8]) 
     return _score(_units_of((excess * pairs)[None])[0]) > _MIN_SCORE
 
 
-def frames_are_last(samples: Sequence[NDArray[Any]], shape: Sequence[int]) -> bool:
+def frames_are_last(samples: Sequence[NDArray[Any]], shape: Sequence[int], packed_axis: int | None = None) -> bool:
     """Return whether the last axis of an array is that of the frames, and the first two are those of the image.
 
     Eight frames later a pixel is more like itself than the pixel eight rows or columns further, unless the image moves by more
     than a pixel a frame. So the axis along which blocks of values correlate most is that of the frames, if it is the longest.
 
     Args:
-        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, columns), a pixel to a value.
-        shape: that of the array.
+        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, columns).
+        shape: that of the array: (rows, columns, frames).
+        packed_axis: the axis of which a byte would hold eight values; None for a pixel to a value.
     """
-    return _last_is_longest(*shape) and _last_is_alike(samples, (_BLOCK, _BLOCK, _BLOCK))
-
-
-def packed_frames_are_last(samples: Sequence[NDArray[np.uint8]], shape: Sequence[int], a_byte_holds: Eight) -> bool:
-    """Return whether the last axis of an array of bytes is that of the frames: see `frames_are_last`.
-
-    Args:
-        samples: runs of consecutive frames as they would lie along the first axis, each (n, rows, bytes of a row).
-        shape: that of the array: (rows, bytes of a row, frames), (bytes of a column, columns, frames), or (rows, columns, bytes
-            of eight frames).
-        a_byte_holds: what the eight bits of a byte would be.
-    """
-    axis = _PACKED_AXES.index(a_byte_holds)
     lengths, block = list(shape), [_BLOCK] * 3
-    lengths[axis], block[axis] = 8 * shape[axis], 1
-    if not _last_is_longest(*lengths):
+    values = list(samples)
+    if packed_axis is not None:
+        lengths[packed_axis], block[packed_axis] = 8 * shape[packed_axis], 1
+        values = [np.bitwise_count(each) for each in samples]
+    if lengths[2] <= _TIMES_LONGER * max(lengths[:2]):
         return False
-    lit = [np.bitwise_count(each) for each in samples]
-    if a_byte_holds == "frames":
-        return _last_is_alike(lit, block)
+    blocks = [_blocks(each, block) for each in values]
+    (first, _), (second, _), (last, number) = (_correlation(blocks, axis) for axis in range(3))
+    is_alike = bool(first and second and last) and last - max(first, second) > _MIN_LEAD * math.sqrt(2 / number)
+    if packed_axis is None or packed_axis == 2:
+        return is_alike
     # Bytes of eight pixels are less alike along the axis where they are packed, as they are 8 px apart there.
-    pixels = [_blocks(each, (1, 1, _BLOCK)) for each in lit]
-    if _correlation(pixels, axis) < _correlation(pixels, 1 - axis) and _last_is_alike(lit, block):
+    pixels = [_blocks(each, (1, 1, _BLOCK)) for each in values]
+    if is_alike and _correlation(pixels, packed_axis) < _correlation(pixels, 1 - packed_axis):
         return True
     # The frames may move too fast for that. Then the axis where bytes are packed is still an axis of the image.
-    other = other_order(samples if axis == 1 else [each.swapaxes(0, 1) for each in samples])
+    other = other_order(samples if packed_axis == 1 else [each.swapaxes(0, 1) for each in samples])
     return other is not None and other.order.packed_along == "height"
-
-
-def _last_is_longest(first: int, second: int, last: int) -> bool:
-    return last > _TIMES_LONGER * max(first, second)
-
-
-def _last_is_alike(samples: Sequence[NDArray[Any]], block: Sequence[int]) -> bool:
-    """Return whether neighbouring blocks of values correlate most along the last axis."""
-    blocks = [_blocks(each, block) for each in samples]
-    (first, _), (second, _), (last, number) = (_correlation(blocks, axis) for axis in range(3))
-    return bool(first and second and last) and last - max(first, second) > _MIN_LEAD * math.sqrt(2 / number)
 
 
 def _blocks(frames: NDArray[Any], block: Sequence[int]) -> NDArray[np.float64]:

@@ -8,29 +8,26 @@ from dataclasses import replace
 from functools import partial
 from heapq import nsmallest
 from itertools import islice
-from typing import Any
+from typing import Any, NoReturn
 
 from pydantic import ConfigDict, Field
 
 from photonpano.corrections import Correction, FlatField
-from photonpano.errors import InputError, Problem, described
+from photonpano.errors import InputError, PluginError, Problem, described
 from photonpano.files.paths import Location, Url
 from photonpano.plugins.contributions import Config, MergerContribution, Recognised, SourceContribution, SpecLocation, hookimpl
 from photonpano.plugins.registry import Catalog, Entry
 from photonpano.reading import objections, require_there
-from photonpano.specs.components import LocatorAlias, SourceAlias
 from photonpano.specs.plan import Choice, LevelPlan, Plan, Spec, validate
 from photonpano.specs.settings import CameraSettings, MotionSettings
 from photonpano.specs.yaml_reader import Written, from_python
 from photonpano.text import listed
 from photonpano.values import Decision, StreamInfo
 
-MAX_COMPLAINTS = 100  # of one component that are reported
 logger = logging.getLogger(__name__)
 
 _SHOWN = 3  # names of a folder in a message
 _SEARCHED = 1000  # maximum number of files of a folder whose endings are compared with those of sources
-_MOST_BACKENDS = 16  # locators of a chain
 
 
 def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
@@ -76,7 +73,7 @@ def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
     """Run the `check` of a component; one that raises is a complaint itself."""
     try:
         found = choice.contribution.check(choice.config, *stream)
-        return (found,) if isinstance(found, str) else tuple(map(str, islice(found, MAX_COMPLAINTS)))
+        return (found,) if isinstance(found, str) else tuple(map(str, found))
     except Exception as error:
         return (f"the check of the {choice.label} raised {described(error)}",)
 
@@ -159,33 +156,15 @@ class AutoConfig(Config):
     )
 
 
-class ChainConfig(Config):
-    """Several locators, in the order in which they are tried."""
-
-    backends: tuple[str | dict[str, Any], ...] = Field(
-        ("direct", "opencv-sift"),
-        min_length=1,
-        max_length=_MOST_BACKENDS,
-        description="the locators, in the order in which they are tried: each is a name, or a mapping of use and with",
-    )
+def _unbuilt(*_: object) -> NoReturn:
+    raise PluginError("this name stands for other components, which a spec that uses it is resolved to; build those")
 
 
 @hookimpl
-def photonpano_sources() -> Iterator[SourceAlias]:
+def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer the name for the source that recognises a capture."""
-    yield SourceAlias(
-        name="auto", summary="The source that recognises the file or folder", config=AutoConfig, expand=recognised_source
-    )
-
-
-@hookimpl
-def photonpano_locators() -> Iterator[LocatorAlias]:
-    """Offer the name for a locator with fallbacks."""
-    yield LocatorAlias(
-        name="chain-of-backends",
-        summary="Several locators in order, each for the pairs that those before it lost",
-        config=ChainConfig,
-        expand=first_with_fallbacks,
+    yield SourceContribution(
+        name="auto", summary="The source that recognises the file or folder", config=AutoConfig, build=_unbuilt
     )
 
 
@@ -262,7 +241,7 @@ def _near_misses(spec: Spec, keys: Written, path: Location) -> list[tuple[str, s
     endings = {path.suffix.lower(), *(each.suffix.lower() for each in files)}
     for entry in spec.catalog.rows:
         contribution = entry.contribution
-        if not isinstance(contribution, SourceContribution) or isinstance(contribution, SourceAlias):
+        if not isinstance(contribution, SourceContribution) or entry.name == "auto":
             continue
         if contribution.suffixes and not endings & {*contribution.suffixes}:
             continue
@@ -301,22 +280,3 @@ def _contents(path: Location) -> str:
     if len(names) > _SHOWN:
         return f"a folder of {', '.join(names[:_SHOWN])} and more"
     return f"a folder of {listed(names)}" if names else "an empty folder"
-
-
-def first_with_fallbacks(section: Written, spec: Spec) -> Written | None:
-    """Rewrite a section that uses `chain-of-backends` into one that uses the first, and has the others as its fallbacks."""
-    keys, use = section.at("with"), section.at("use")
-    if section.at("fallback").data:
-        spec.wrong_key(section.at("fallback"), "a chain cannot have a fallback; add the locator to its backends")
-    validate(ChainConfig, keys, spec)
-    backends: Any = keys.at("backends").data
-    if backends is None:
-        backends = [Written(name, use.place) for name in ChainConfig.model_fields["backends"].default]
-    if not isinstance(backends, list) or not backends or not all(isinstance(item.data, str | dict) for item in backends):
-        return None
-    items: list[Written] = [each.spelled_out() for each in backends[:_MOST_BACKENDS]]
-    first, *others = items
-    if "fallback" in first.data:
-        message = "a locator of a chain cannot have a fallback; list all of them, in the order in which they are tried"
-        spec.wrong_key(first.at("fallback"), message)
-    return first.having({"fallback": Written(others, first.place)})

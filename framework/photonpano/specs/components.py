@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from photonpano.corrections import CORRECTIONS, Correction
 from photonpano.errors import PluginError, described
-from photonpano.plugins.contributions import KINDS, ExporterContribution, Kind, LocatorContribution, SourceContribution
+from photonpano.plugins.contributions import KINDS, ExporterContribution, Kind
 from photonpano.plugins.registry import Entry
 from photonpano.reading import missing_file
+from photonpano.specs.builtin import recognised_source
 from photonpano.specs.plan import Choice, Spec, validate
 from photonpano.specs.settings import CHOICE
 from photonpano.specs.yaml_reader import Written, given
@@ -19,34 +20,11 @@ from photonpano.text import listed, suggestion
 
 # The locator to which lost pairs are offered, if it is installed and the spec names neither a locator nor fallbacks.
 DEFAULT_FALLBACK = "opencv-sift"
-MAX_LISTED = 16  # components in a list, such as fallbacks
 _AGAIN = "would lose the same pairs again"
 AUTO = "auto"  # the default: the run masks what stands still, and divides by a vignette
 
 
-def _unbuilt(*_: object) -> NoReturn:
-    raise PluginError("this name stands for other components, which a spec that uses it is resolved to; build those")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Alias:
-    """A name that stands for other components, so that nothing is built of it.
-
-    `expand` rewrites a section into one that uses these; None if there are problems, which it adds to the spec.
-    """
-
-    expand: Callable[[Written, Spec], Written | None]
-    build: Callable[[Any, Any], Any] = _unbuilt
-
-
-@dataclass(frozen=True, kw_only=True)
-class SourceAlias(Alias, SourceContribution):
-    """Stands for a source."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LocatorAlias(Alias, LocatorContribution):
-    """Stands for a locator and its fallbacks; its config lists locators under `backends`."""
+CHAIN = "chain-of-backends"  # another spelling of a locator with fallbacks
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,18 +79,33 @@ class ComponentResolver:
             section = Written(base.section.data | own | {"with": together}, content.place)
         elif "use" not in content.data and kind.default:
             section = content.having({"use": Written(kind.default, content.place.below("use"))})
-        below = self.catalog.keys_of(kind.name, section.at("use").data)
+        use = section.at("use").data
+        below = ("backends",) if is_locator and use == CHAIN else self.catalog.keys_of(kind.name, use)
         spec.check_keys(content, (*CHOICE, "fallback") if is_locator else CHOICE, below)
-        if alias := self.alias(kind, section.at("use").data):
-            expanded = alias.expand(section, spec)
-            if expanded is None:
-                return None
-            section = expanded
         if not is_locator:
-            return section
+            is_auto = kind is KINDS["source"] and section.at("use").data == AUTO
+            return recognised_source(section, spec) if is_auto else section
+        if section.at("use").data == CHAIN:
+            return self.chain(section)
         fallback = section.at("fallback")
         items = self.items(kind, fallback, None if "use" in content.data else DEFAULT_FALLBACK)
         return section.having({"fallback": Written(items, fallback.place)})
+
+    def chain(self, section: Written) -> Written | None:
+        """Rewrite a section that uses `chain-of-backends`: its first locator is used, and the others are the fallbacks."""
+        spec = self.spec
+        keys = spec.mapping(section.at("with"))
+        if keys is None:
+            return None
+        spec.check_keys(keys, ("backends",))
+        if section.at("fallback").data:
+            spec.wrong_key(section.at("fallback"), "a chain cannot have a fallback; add the locator to its backends")
+        backends = keys.at("backends")
+        names = [Written(name, section.at("use").place) for name in (KINDS["locator"].default, DEFAULT_FALLBACK)]
+        first, *others = [each.spelled_out() for each in backends.items() or names]
+        if backends.data == []:
+            spec.wrong(backends, "expected a list of locators, in the order in which they are tried, got an empty list")
+        return first.having({"fallback": Written(others, first.place)}) if self.is_item(KINDS["locator"], first) else None
 
     def items(self, kind: Kind, written: Written, default: str | None = None) -> list[Written]:
         """Return the sections of a list of components; one alone is a list of it, and a name a section that uses it.
@@ -122,9 +115,7 @@ class ComponentResolver:
         items = written.items()
         if written.data is None and default in self.catalog.names(kind.name):
             items = [Written(default, written.place.below(0))]
-        if len(items) > MAX_LISTED:
-            self.spec.wrong(written, f"expected at most {MAX_LISTED} {kind.name}s, got {given(items)}")
-        return [each.spelled_out() for each in items[:MAX_LISTED]]
+        return [each.spelled_out() for each in items]
 
     def fallbacks(self, section: Written, written: Written, first: Choice | None) -> tuple[Choice, ...]:
         """Resolve the locators to which the pairs that the first one lost are offered.
@@ -162,19 +153,23 @@ class ComponentResolver:
 
     def item(self, kind: Kind, section: Written) -> Choice | None:
         """Resolve one component of a list, or one that has no default."""
+        return self.component(kind, section) if self.is_item(kind, section) else None
+
+    def is_item(self, kind: Kind, section: Written) -> bool:
+        """Return whether a section is a mapping, and report what it must not have in a list."""
         spec = self.spec
         if not isinstance(section.data, dict):
             article = "an" if kind.name[0] in "aeiou" else "a"
             expected = f"the name of {article} {kind.name}, or a mapping such as {{use: NAME}}"
             spec.wrong(section, f"expected {expected}, got {given(section.data)}")
-            return None
+            return False
         known = [*CHOICE]
         if kind is KINDS["locator"] and "fallback" in section.data:
             known.append("fallback")
-            message = "a fallback cannot have a fallback; list all of them, in the order in which they are tried"
+            message = "a locator of a list cannot have a fallback; list all of them, in the order in which they are tried"
             spec.wrong_key(section.at("fallback"), message)
         spec.check_keys(section, known, below=self.catalog.keys_of(kind.name, section.at("use").data))
-        return self.component(kind, section)
+        return True
 
     def component(self, kind: Kind, section: Written) -> Choice | None:
         """Look up the component that a section names, and validate its keys."""
@@ -195,29 +190,24 @@ class ComponentResolver:
         """Look up the component that a section names; None if it names none, or one that there is not."""
         use = section.at("use")
         if "use" not in section.data:
-            known = (name for name in self.catalog.names(kind.name) if kind.name == "source" or not self.alias(kind, name))
-            self.spec.wrong_key(use, f"required: the name of the {kind.name}; known: {listed(known) or 'none'}")
+            known = listed(self.catalog.names(kind.name)) or "none"
+            self.spec.wrong_key(use, f"required: the name of the {kind.name}; known: {known}")
             return None
         if not isinstance(use.data, str):
             self.spec.wrong(use, f"expected the name of the {kind.name}, got {given(use.data)}")
+            return None
+        if kind is KINDS["locator"] and use.data == CHAIN:  # one that stands where it may has been rewritten
+            message = f"{CHAIN!r} cannot be part of a chain or a fallback; list the locators themselves"
+            self.spec.wrong_key(section, message)
             return None
         try:
             entry = self.catalog.find(kind.name, use.data)
         except PluginError as error:
             self.spec.wrong(use, str(error))
             return None
-        if isinstance(entry.contribution, Alias):  # one that stands where it may has been spelled out
-            message = f"{use.data!r} cannot be part of a chain or a fallback; list the {kind.name}s themselves"
-            self.spec.wrong_key(section, message)
-            return None
         if entry.unavailable:
             self.spec.wrong(use, entry.unavailable)
         return entry
-
-    def alias(self, kind: Kind, name: object) -> Alias | None:
-        """Return the alias with this name, None if there is none."""
-        offered = (entry.contribution for entry in self.catalog.entries(kind.name, name))
-        return next((each for each in offered if isinstance(each, Alias)), None)
 
 
 def resolved_corrections(written: Written, spec: Spec) -> tuple[Correction, ...] | None:

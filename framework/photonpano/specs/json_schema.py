@@ -12,7 +12,7 @@ from photonpano.corrections import CORRECTIONS
 from photonpano.plugins.contributions import KINDS, Kind
 from photonpano.plugins.description import TolerantJsonSchema
 from photonpano.plugins.registry import Catalog, Entry
-from photonpano.specs.components import AUTO, DEFAULT_FALLBACK, LocatorAlias
+from photonpano.specs.components import AUTO, CHAIN, DEFAULT_FALLBACK
 from photonpano.specs.settings import (
     LEVELS,
     MAX_LEVELS,
@@ -57,14 +57,15 @@ def json_schema(catalog: Catalog) -> Schema:
         )
         if kind.of_level:
             overrides[kind.section] = _component(kind, own, schemas, None)
-    one = _item(KINDS["locator"], entries, schemas)
-    definitions["fallback"] = _one_or_list(one)
-    for entry in entries:
-        if isinstance(entry.contribution, LocatorAlias):
-            definitions[_definition(schemas[entry.contribution.config])]["properties"]["backends"]["items"] = one
+    definitions["fallback"] = _one_or_list(_item(KINDS["locator"], entries, schemas))
+    backends = {"$ref": "#/$defs/fallback", "description": "the locators, in the order in which they are tried"}
+    chain = {"type": SECTION, "additionalProperties": False, "properties": {"backends": backends}}
     for section, default in ((sections["locate"], DEFAULT_FALLBACK), (overrides["locate"], "those of `locate`")):
         described = f"{FALLBACK}; by default {default}, but none where `use` is given"
-        section["properties"] = section["properties"] | {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
+        section["properties"] |= {"fallback": {"$ref": "#/$defs/fallback", "description": described}}
+        section["properties"]["use"]["enum"].append(CHAIN)
+        chosen = {"properties": {"use": {"const": CHAIN}}, "required": ["use"]}
+        section["allOf"] = [*section.get("allOf", ()), {"if": chosen, "then": {"properties": {"with": chain}}}]
     definitions[LevelSettings.__name__]["properties"] |= overrides
     sections["source"]["required"] = ["use"]
     definitions[RunSettings.__name__]["properties"]["executor"] = sections.pop("run.executor")
@@ -129,7 +130,7 @@ def _component(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], 
 
 def _item(kind: Kind, entries: list[Entry], schemas: dict[type[BaseModel], Schema]) -> Schema:
     """Return the schema of one component of a list: a name, or a mapping."""
-    own = [entry for entry in entries if entry.kind == kind.name and not isinstance(entry.contribution, LocatorAlias)]
+    own = [entry for entry in entries if entry.kind == kind.name]
     component = _component(kind, own, schemas, None) | {"type": "object", "required": ["use"]}
     return {"anyOf": [component["properties"]["use"], component]}
 

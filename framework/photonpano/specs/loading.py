@@ -13,9 +13,10 @@ from photonpano.plugins.registry import Catalog, discover
 from photonpano.specs.builtin import ask_sources
 from photonpano.specs.plan import Plan, Spec
 from photonpano.specs.resolution import resolve
-from photonpano.specs.yaml_reader import MAX_LENGTH, Place, Written, from_python, given, joined, read_yaml
+from photonpano.specs.yaml_reader import Place, Written, from_python, given, joined, read_yaml
 
 SPEC_SUFFIXES = {".yaml", ".yml"}
+MAX_LENGTH = 2**18  # bytes of a spec: a capture that is given by mistake is longer
 
 
 def load_spec(
@@ -136,7 +137,7 @@ def read_spec(path: Path) -> str:
             data = file.read(MAX_LENGTH + 1)
         if len(data) <= MAX_LENGTH:
             return data.decode("utf-8-sig")
-        problem = Problem("", f"not a spec: longer than {MAX_LENGTH} bytes", path)  # a capture that is given by mistake is
+        problem = Problem("", f"not a spec: longer than {MAX_LENGTH} bytes", path)
     except FileNotFoundError:
         problem = Problem("", "there is no such file", path)
     except IsADirectoryError:

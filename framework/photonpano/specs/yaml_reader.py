@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, StringMark, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 from ruamel.yaml.reader import ReaderError
@@ -19,10 +18,8 @@ from photonpano.errors import Problem
 from photonpano.files.paths import Url
 
 TAG = "tag:yaml.org,2002:"
+KNOWN = ("map", "seq", "null", "bool", "int", "float", "str", "timestamp", "value")  # dates are text
 WHOLE = re.compile(r"[-+]?\d+[eE]\+?\d{1,2}")
-MAX_LENGTH = 2**18  # characters of a spec, or bytes of its file: a text of a megabyte takes 4 s to read
-MAX_VALUES = 5000  # of a spec; aliases of aliases multiply
-MAX_DEPTH = 100  # of values in values
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,14 +139,6 @@ def given(data: object) -> str:
 
 def from_python(data: object, place: Place, problems: list[Problem]) -> Written:
     """Read plain Python data, all of it on the line of its place; anything else is a problem, and nothing in its place."""
-    try:
-        return _from_python(data, place, problems)
-    except RecursionError:
-        problems.append(place.problem("not a spec: nested too deeply"))
-        return Written(None, place)
-
-
-def _from_python(data: object, place: Place, problems: list[Problem]) -> Written:
     match data:
         case str() if any("\ud800" <= each <= "\udfff" for each in data):
             message = f"{data!a} is no text of UTF-8, which results cannot record; if it names a file, rename it"
@@ -160,16 +149,16 @@ def _from_python(data: object, place: Place, problems: list[Problem]) -> Written
         case Real():
             return Written(float(data), place)
         case Path():
-            return _from_python(str(data), place, problems)
+            return from_python(str(data), place, problems)
         case Url():
             return Written(data.address, place)
         case list() | tuple():
-            return Written([_from_python(item, _inside(place, index), problems) for index, item in enumerate(data)], place)
+            return Written([from_python(item, _inside(place, index), problems) for index, item in enumerate(data)], place)
         case Mapping():
             content = {}
             for key, item in data.items():
                 if isinstance(key, str):
-                    content[key] = _from_python(item, _inside(place, key), problems)
+                    content[key] = from_python(item, _inside(place, key), problems)
                 else:
                     problems.append(place.problem(f"a key is text, got {key!r}"))
             return Written(content, place)
@@ -183,28 +172,6 @@ def _inside(place: Place, key: str | int) -> Place:
     return replace(place, where=joined(place.where, key))
 
 
-class _TooLongError(Exception):
-    """More than `MAX_VALUES` values."""
-
-
-class _Composer(Composer):
-    """Stop early in files that are no specs: a megabyte may hold 500,000 values, which take a minute."""
-
-    n_values = 0
-    depth = 0
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        self.n_values += 1
-        self.depth += 1
-        if self.n_values > 2 * MAX_VALUES:  # keys count here
-            raise _TooLongError
-        if self.depth > MAX_DEPTH:
-            raise RecursionError
-        node = super().compose_node(parent, index)
-        self.depth -= 1
-        return node
-
-
 def read_yaml(text: str, place: Place, problems: list[Problem]) -> Written:
     """Read one YAML 1.2 document; aliases and merge keys are followed.
 
@@ -212,12 +179,8 @@ def read_yaml(text: str, place: Place, problems: list[Problem]) -> Written:
     returned for a text that is not YAML, or without a document.
     """
     yaml = YAML(typ="safe", pure=True)
-    yaml.Composer = _Composer
     yaml.composer.warn_double_anchors = False
-    reader = _Reader(place, problems)
-    if len(text) > MAX_LENGTH:
-        problems.append(place.problem(f"not a spec: longer than {MAX_LENGTH} characters"))
-        return Written(None, place)
+    reader = _Reader(yaml, place, problems)
     try:
         node = yaml.compose(text)
         if node is not None:
@@ -231,10 +194,9 @@ def read_yaml(text: str, place: Place, problems: list[Problem]) -> Written:
         problems.append(place.problem(f"not valid YAML: {error.reason}, got the character {error.character:#04x}"))
     except YAMLError as error:
         problems.append(place.problem(f"not valid YAML: {error}"))
-    except _TooLongError:
-        problems.append(place.problem(f"not a spec: with its aliases expanded it has more than {MAX_VALUES} values"))
     except RecursionError:
-        problems.append(place.problem("not a spec: nested too deeply"))
+        message = "not a spec: nested too deeply; does an alias stand in the value that it repeats?"
+        problems.append(place.problem(message))
     return Written(None, place)
 
 
@@ -253,11 +215,8 @@ def _syntax_problem(error: MarkedYAMLError, reader: _Reader) -> Problem:
 class _Reader:
     """Reads the nodes of one document; what cannot be read becomes a problem, and nothing in its place."""
 
-    def __init__(self, root: Place, problems: list[Problem]) -> None:
-        self.root = root
-        self.problems = problems
-        self.count = 0
-        self.open: set[int] = set()
+    def __init__(self, yaml: YAML, root: Place, problems: list[Problem]) -> None:
+        self.yaml, self.root, self.problems = yaml, root, problems
 
     def marked(self, mark: StringMark, where: str) -> Place:
         """Return the place of a mark; an override has no lines."""
@@ -270,23 +229,15 @@ class _Reader:
 
     def value(self, node: Node, place: Place) -> Written:
         """Read a node, whose place is that of its key, or where it begins if it has none."""
-        self.count += 1
-        if self.count > MAX_VALUES:
-            raise _TooLongError
+        tag = str(node.tag).removeprefix(TAG)
+        if tag not in KNOWN:
+            return self.unreadable(place, f"tags such as {str(node.tag).replace(TAG, '!!')} are not allowed")
         if isinstance(node, ScalarNode):
-            return self.scalar(node, place)
-        if not self.is_known(node, "map", "seq"):
-            return self.unreadable(place, _tag_message(node))
-        if id(node) in self.open:
-            return self.unreadable(place, "an alias inside the value that it repeats")
-        self.open.add(id(node))
-        try:
-            if isinstance(node, MappingNode):
-                return self.mapping(node, place)
-            items = enumerate(node.value)
-            return Written([self.value(item, self.place(item, joined(place.where, index))) for index, item in items], place)
-        finally:
-            self.open.discard(id(node))
+            return self.scalar(node, tag, place)
+        if isinstance(node, MappingNode):
+            return self.mapping(node, place)
+        items = enumerate(node.value)
+        return Written([self.value(item, self.place(item, joined(place.where, index))) for index, item in items], place)
 
     def mapping(self, node: MappingNode, place: Place) -> Written:
         """Read a mapping; the first of duplicate keys stays, and the mapping's own keys win over those that are merged in."""
@@ -334,38 +285,15 @@ class _Reader:
         self.problems.append(replace(place, line=line, column=column).problem(message))
         return Written(None, replace(place, is_readable=False))
 
-    def is_known(self, node: Node, *names: str) -> bool:
-        return node.tag in {f"{TAG}{name}" for name in names}
-
-    def scalar(self, node: ScalarNode, place: Place) -> Written:
-        """Read a scalar; dates are text."""
-        if not self.is_known(node, "null", "bool", "int", "float", "str", "timestamp", "value"):
-            return self.unreadable(place, _tag_message(node))
+    def scalar(self, node: ScalarNode, tag: str, place: Place) -> Written:
+        """Read a scalar; a whole number such as 1e3 is an integer."""
         text = str(node.value)
-        tag = str(node.tag).removeprefix(TAG)
+        if tag not in ("null", "bool", "int", "float"):
+            return Written(text, place)
         try:
-            return Written(_parsed(text, tag), place)
-        except ValueError:
-            expected = {"int": "an integer", "float": "a number"}.get(tag, "text")
+            value = self.yaml.constructor.construct_object(node)
+        except (KeyError, ValueError):
+            expected = {"bool": "true or false", "int": "an integer"}.get(tag, "a number")
             return self.unreadable(place, f"expected {expected}, got {given(text)}")
-
-
-def _tag_message(node: Node) -> str:
-    return f"tags such as {str(node.tag).replace(TAG, '!!')} are not allowed"
-
-
-def _parsed(text: str, tag: str) -> str | int | float | bool | None:
-    match tag:
-        case "null":
-            return None
-        case "bool":
-            return text.lower() in ("true", "yes", "on")
-        case "int":
-            digits = text.replace("_", "")
-            return int(digits, 0 if digits.lstrip("+-")[:2] in ("0x", "0o", "0b") else 10)
-        case "float" if WHOLE.fullmatch(text) and abs(float(text)) < 2**53:
-            return int(float(text))  # 1e3 frames are as good as 1000
-        case "float":
-            return float(text.replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan"))
-    text.encode()  # refuses half of a surrogate pair, which JSON and file systems cannot hold
-    return text
+        is_whole = tag == "float" and WHOLE.fullmatch(text) and abs(value) < 2**53
+        return Written(int(value) if is_whole else value, place)

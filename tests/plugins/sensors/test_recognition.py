@@ -118,7 +118,7 @@ def test_unpacked_bits_are_recognised_by_their_values(tmp_path: Path, dtype: Any
     assert set(found) == {"npy"}
     assert found["npy"].keys == {"path": str(path), "holds": "bits"}
     name = np.dtype(dtype).name
-    assert found["npy"].because == f"{name} of shape (6, 10, 16) in a .npy file, with the values 0 and 1 only"
+    assert found["npy"].because == f"{name} of shape (6, 10, 16) in a .npy file, where all of 960 values sampled are 0 or 1"
     with opened("npy", found["npy"].keys) as source:
         np.testing.assert_array_equal(source.frames(source.info.span), FRAMES)
     (tmp_path / "cube.npy.gz").write_bytes(gzip.compress(path.read_bytes()))
