@@ -26,12 +26,12 @@ import cv2
 import numpy as np
 from harness import Study, chosen, command, in_child, packed, record_of, simulator, table, write_tables
 
-from photonpano import CameraGuess, PhotonpanoError, evaluate_poses, parse_spec, simulate
+from photonpano import PhotonpanoError, parse_spec, simulate
 from photonpano.capture.writing import truth_path
-from photonpano.evaluation import PoseScore, pose_errors
-from photonpano.evaluation.poses import load_run_poses, load_true_poses
 from photonpano_colmap.hooks import ColmapAveragesConfig
 from photonpano_colmap.reconstruction import reconstruct
+from photonpano_poses import CameraGuess, PoseScore, evaluate_poses, pose_errors
+from photonpano_poses.scores import load_run_poses, load_true_poses
 
 N_FRAMES, SHAPE, FOCAL_PX, SHARP_EVERY = 10_000, (254, 496), 450.0, 200
 TREMOR = {"rms_px": 2.0, "rms_mm": 0.5, "roll_rms_deg": 0.05}

@@ -7,22 +7,22 @@ trajectory error (ATE) after the best similarity (Umeyama 1991), and the relativ
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import InputError
+from photonpano import BoolArray, FloatArray, InputError
 from photonpano.evaluation.scores import of_focal_length
 from photonpano.geometry import Camera, nearest_rotations, positions_of, rotation_vectors
 from photonpano.notebooks import facts
 from photonpano.reading import read_arrays
 from photonpano.record.contents import require_one_run
-from photonpano.values import BoolArray, FloatArray
 
 POSES = "poses.npz"
+_FEW = 0.1  # if fewer positions lie within 3 expected errors, the truth is probably of another capture
 _ORTHONORMAL = 1e-3  # maximum deviation of R R^T from the identity in a pose
 
 
@@ -164,6 +164,21 @@ class PoseScore:
         if self.focal_error is not None:
             rows.append(("focal length", of_focal_length(self.focal_error)))
         return rows
+
+    def data(self) -> dict[str, Any]:
+        """Return the scores with their names, for programs."""
+        named = {each.name: each.name for each in fields(self)} | {"honest_shares": "within_std_shares"}
+        return {named[name]: getattr(self, name) for name in named if name not in ("errors_m", "errors_deg")}
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the summary of a batch shows."""
+        return {"true_position_error": self.ate_share}
+
+    def doubt(self) -> str:
+        """Return why the truth may be that of another capture."""
+        if self.honest_shares is None or self.honest_shares[2] >= _FEW:
+            return ""
+        return f"{100 * self.honest_shares[2]:.0f} % of the positions are within 3 std_position"
 
     def _repr_html_(self) -> str:
         return facts(self.rows())

@@ -1,25 +1,98 @@
-"""The poses of a run with `pose`: estimate them, write their files, describe them for `run.json`, and judge them."""
+"""A run with `pose`: estimate the poses, write their files, describe them for `run.json`, judge them, and end the run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
 
-from photonpano.contracts.protocols import Source
-from photonpano.errors import OutputError
-from photonpano.execution.context import Progress
+from photonpano import FloatArray, FluxImage, OutputError, Plan, Progress, Source, StreamInfo, Verdict
+from photonpano.contracts.attribution import blaming
 from photonpano.geometry import Camera, positions_of
 from photonpano.photometry import tone_mapped
-from photonpano.pipeline.components import build_pose_estimator
+from photonpano.pipeline.components import build_finder
 from photonpano.pipeline.estimate import require_centre
+from photonpano.pipeline.obstacles import naming_obstacles
+from photonpano.pipeline.run import BegunRun
 from photonpano.record.picture_files import png_of
-from photonpano.record.poses import Poses, colmap, in_standard_world, nerfstudio, ply, tum
-from photonpano.record.schema import PosesRecord
-from photonpano.specs.plan import Plan
-from photonpano.values import CameraGuess, FloatArray, FluxImage, Journal, PoseEstimate, StreamInfo, Verdict
+from photonpano.record.run_json import verdict_record
+from photonpano.record.schema import CameraRecord, RunRecord
+from photonpano.text import counted
+from photonpano.values import Journal
 from photonpano.values.verdict import Found, Test, judged
+from photonpano_poses.contract import require_poses
+from photonpano_poses.files import Poses, colmap, in_standard_world, nerfstudio, ply, tum
+from photonpano_poses.page import render_pose_report
+from photonpano_poses.scores import PoseScore, evaluate_poses
+from photonpano_poses.values import CameraGuess, PoseEstimate
+
+
+class LostFramesRecord(TypedDict):
+    """Frames whose pose was not found, as a half-open span [start, stop), and why."""
+
+    frames: Sequence[int]
+    reason: str
+
+
+class PosesRecord(TypedDict):
+    """The poses of a camera that travels.
+
+    `located` counts frames. `std_position` and `std_rotation_deg` are the expected errors of the located frames, root mean
+    square; the length of the path is 1. They are None where the estimator knows none. `points` and `exposures` count those of
+    `sparse`; `levels` is what the pose estimator records, and `doubts` are the reasons of the verdict as sentences.
+    """
+
+    camera: CameraRecord
+    located: int
+    std_position: float | None
+    std_rotation_deg: float | None
+    points: int
+    exposures: int
+    lost: Sequence[LostFramesRecord]
+    levels: Sequence[Mapping[str, float | int | str | None]]
+    doubts: Sequence[str]
+
+
+class PoseRunRecord(RunRecord):
+    """The content of the `run.json` of a run with `pose`."""
+
+    poses: PosesRecord
+
+
+class PoseRuns:
+    """Does runs with `pose`, and describes them: a `RunKind`."""
+
+    def run(self, run: BegunRun) -> None:
+        """Estimate the poses, write their files, and end the run."""
+        plan, source, start = run.plan, run.source, time.perf_counter()
+        with naming_obstacles(source):
+            found = estimate_poses(plan, source, run.journal, run.progress)
+        run.observers.stage_finished(None, "pose", time.perf_counter() - start, counts_of(found))
+        files = write_pose_files(run.folder.staging, found, source.info, plan.output.exposures)
+        verdict = judge_poses(found)
+        record: PoseRunRecord = {
+            **run.started_record(),
+            "poses": poses_record(found, verdict),
+            "verdict": verdict_record(verdict),
+            "warnings": [*poses_warnings(found), *files],
+        }
+        run.end(record, lambda record: render_pose_report(record, found), verdict)
+
+    def rows(self, record: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Return how many frames have a pose."""
+        return [("located", f"{record['poses']['located']:,} of {counted(record['source']['n_frames'], 'frame')}")]
+
+    def figures(self, record: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the expected error of the positions."""
+        return {"expected_position_error": record["poses"]["std_position"]}
+
+    def evaluate(self, run_folder: Path, truth: Path) -> PoseScore:
+        """Score the poses of a run: see `evaluate_poses`."""
+        return evaluate_poses(run_folder, truth)
+
 
 _WHITE_QUANTILE = 0.995  # quantile of the flux of an exposure that is white in its picture
 _SHOWN_LOST = 3  # spans of lost frames that a warning names
@@ -35,8 +108,10 @@ def camera_guess(plan: Plan) -> CameraGuess:
 def estimate_poses(plan: Plan, source: Source, journal: Journal, progress: Progress) -> PoseEstimate:
     """Return the poses, checked, in a world in which the path has the length 1; `journal` receives decisions."""
     require_centre(plan, source)
-    estimator = build_pose_estimator(plan, source, journal)
-    return in_standard_world(estimator.estimate(source, camera_guess(plan), progress))
+    estimator = build_finder(plan, source, journal)
+    found = estimator.estimate(source, camera_guess(plan), progress)
+    with blaming(estimator):
+        return in_standard_world(require_poses(found, source))
 
 
 def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:
