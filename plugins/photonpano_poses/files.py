@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray, InputError, LocationError
 from photonpano.geometry import Camera, positions_of
 from photonpano.photometry import srgb_to_linear, tone_mapped
-from photonpano_poses.values import PoseEstimate, ScenePoints
+from photonpano_poses.contract import PoseEstimate, ScenePoints
 
 PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "openmvg", "tum"]
 

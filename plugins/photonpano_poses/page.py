@@ -27,7 +27,7 @@ from photonpano.report.drawing import (
     svg_of,
 )
 from photonpano.report.page import head_of
-from photonpano_poses.values import PoseEstimate
+from photonpano_poses.contract import PoseEstimate
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes

@@ -15,10 +15,9 @@ from photonpano.geometry import Camera, camera_matrix, rotation_matrices, transf
 from photonpano.testing import MemorySource
 from photonpano.testing.captures import ReadOnlySource
 from photonpano.testing.conformance import Answer, AnswerConformance
-from photonpano_poses.contract import PoseEstimatorContribution, require_poses
+from photonpano_poses.contract import CameraGuess, PoseEstimatorContribution, require_poses
 from photonpano_poses.files import in_standard_world
 from photonpano_poses.scores import pose_errors
-from photonpano_poses.values import CameraGuess
 
 POSES_SHAPE = (128, 160)
 FOCAL_PX = 150.0

@@ -98,7 +98,7 @@ def _sharp(cube: Path, truth: Path, k1: float) -> PoseScore:
     config, guess = ColmapAveragesConfig(), CameraGuess(FOCAL_PX, distortion=(k1, 0, 0, 0))
     found = reconstruct([(picture, everywhere) for picture in pictures], guess, config, 0)
     piece = found.pieces[0]
-    true = load_true_poses(truth).camera_from_world[::SHARP_EVERY]
+    true = load_true_poses(truth)[0][::SHARP_EVERY]
     poses, located = np.full(true.shape, np.nan), np.zeros(len(true), np.bool_)
     poses[piece.images], located[piece.images] = piece.poses, True
     return pose_errors(poses, true, located, 1)

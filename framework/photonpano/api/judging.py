@@ -12,7 +12,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from photonpano.api.command import command, json_lines, require_trust, verdict_lines, warn
+from photonpano.api.command import command, json_lines, require_trust, verdict_lines
 from photonpano.api.run_folders import opened_run
 from photonpano.capture import capture_of
 from photonpano.capture.writing import truth_path
@@ -106,12 +106,8 @@ def check_run(
 
 def _score(run_folder: Path, truth: Path, **how: Any) -> Score:
     """Score a panorama, or what another kind of run has found."""
-    if (kind := kind_of_run(run_folder)) is None:
-        return evaluate(run_folder, truth, **how)
-    score = kind.runs.evaluate(run_folder, truth)
-    if doubt := score.doubt():
-        warn(f"{doubt}: is {truth} of this capture?")
-    return score
+    kind = kind_of_run(run_folder)
+    return evaluate(run_folder, truth, **how) if kind is None else kind.runs.evaluate(run_folder, truth)
 
 
 def _lines_of_score(score: Score, *, as_json: bool = False) -> Iterable[str]:

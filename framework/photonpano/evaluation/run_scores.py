@@ -106,10 +106,6 @@ class Evaluation:
         """Return what the summary of a batch shows."""
         return {"true_error_px": self.trajectory.mean_px, "psnr_db": None if self.panorama is None else self.panorama.psnr_db}
 
-    def doubt(self) -> str:
-        """Return nothing: a truth of another capture has another size."""
-        return ""
-
     def _repr_html_(self) -> str:
         return facts(self.rows())
 

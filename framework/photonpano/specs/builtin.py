@@ -15,15 +15,7 @@ from pydantic import ConfigDict, Field
 from photonpano.corrections import Correction, FlatField
 from photonpano.errors import InputError, Problem, described
 from photonpano.files.paths import Location, Url
-from photonpano.plugins.contributions import (
-    Config,
-    MergerContribution,
-    Recognised,
-    RunKindContribution,
-    SourceContribution,
-    SpecLocation,
-    hookimpl,
-)
+from photonpano.plugins.contributions import Config, MergerContribution, Recognised, SourceContribution, SpecLocation, hookimpl
 from photonpano.plugins.registry import Catalog, Entry
 from photonpano.reading import objections, require_there
 from photonpano.specs.components import LocatorAlias, SourceAlias
@@ -92,11 +84,12 @@ def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
 _TURNING = ("rotation", "auto")  # the models that may find that a camera turns
 
 
-def check_settings(found: dict[str, Any], kind: RunKindContribution | None, spec: Spec) -> None:
+def check_settings(found: dict[str, Any], spec: Spec) -> None:
     """Check the settings of each section, None where they have problems, against each other; problems go to the spec."""
+    kind = spec.kind
     motion, camera, output, render, run = (found[name] for name in ("motion", "camera", "output", "render", "run"))
     if motion is not None and camera is not None:
-        _check_camera(motion, camera, kind, spec)
+        _check_camera(motion, camera, spec)
     if output is not None and output.exposures and kind is None:
         sections = listed((f"`{section}`" for section in spec.catalog.run_kinds), "or") or "of a plugin"
         message = f"true needs a section {sections}: of a panorama, keep: exposures writes them; remove it"
@@ -117,7 +110,7 @@ def check_settings(found: dict[str, Any], kind: RunKindContribution | None, spec
         spec.wrong(spec.root.at("render", "projection"), message)
 
 
-def _check_camera(motion: MotionSettings, camera: CameraSettings, kind: RunKindContribution | None, spec: Spec) -> None:
+def _check_camera(motion: MotionSettings, camera: CameraSettings, spec: Spec) -> None:
     """Refuse what planar models and other kinds of runs cannot find of the camera, and a start that rotations do not have."""
     if motion.model == "rotation" and motion.start != "none":
         message = f"{motion.start} is a start of planar models, not of motion.model: rotation"
@@ -127,26 +120,26 @@ def _check_camera(motion: MotionSettings, camera: CameraSettings, kind: RunKindC
         spec.wrong(spec.root.at("motion", "prior"), message)
     elif motion.prior is not None and not motion.prior.imu.is_file():
         spec.wrong(spec.root.at("motion", "prior", "imu"), f"there is no file {motion.prior.imu}; check the path")
-    if motion.model in _TURNING and kind is None:
+    if motion.model in _TURNING and spec.kind is None:
         return
     unfindable = "find needs motion.model: rotation or auto, which measure the camera; give a number here"
     without_focal = "distortion is in units of the focal length: give camera.focal_px"
-    if kind is not None:
+    if spec.kind is not None:
         instead = "calibrate the lens, or measure it in a run with motion.model: rotation"
-        unfindable = f"find does not apply with `{kind.section}`: {instead}"
+        unfindable = f"find does not apply with `{spec.kind.section}`: {instead}"
     else:
         without_focal += ", or take motion.model: rotation or auto"
     distortion, written = camera.distortion.model_dump(), spec.root.at("camera", "distortion")
     for key, number in distortion.items():
         if number == "find":
             spec.wrong(written.at(key), unfindable)
-    if camera.focal_px == "find" and any(number != 0 and not (kind and number == "find") for number in distortion.values()):
+    if camera.focal_px == "find" and any(
+        number != 0 and not (spec.kind and number == "find") for number in distortion.values()
+    ):
         spec.wrong_key(written, without_focal)
 
 
-def check_flat_field(
-    corrections: Iterable[Correction], levels: Iterable[LevelPlan], kind: RunKindContribution | None, spec: Spec
-) -> None:
+def check_flat_field(corrections: Iterable[Correction], levels: Iterable[LevelPlan], spec: Spec) -> None:
     """Refuse a flat field where nothing can be divided by it."""
     index = next((place for place, each in enumerate(corrections) if isinstance(each, FlatField)), None)
     if index is None:
@@ -154,8 +147,8 @@ def check_flat_field(
     mergers = [level.merge.contribution for level in levels]
     refusing = [each.name for each in mergers if isinstance(each, MergerContribution) and not each.accepts_corrected_sums]
     written = spec.root.at("corrections", index)
-    if kind is not None:
-        spec.wrong(written, f"flat-field does not apply with `{kind.section}`: it is measured along a panorama; remove it")
+    if spec.kind is not None:
+        spec.wrong(written, f"flat-field does not apply with `{spec.kind.section}`: it is measured along a panorama; remove it")
     elif refusing:
         message = f"flat-field divides sums of frames, and {refusing[0]!r} merges single frames; choose another merger"
         spec.wrong(written, message)

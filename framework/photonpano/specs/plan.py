@@ -55,6 +55,12 @@ class Spec:
     remark: str = ""  # added to the message of every problem
 
     @property
+    def kind(self) -> RunKindContribution | None:
+        """The kind of run that the spec asks for; None for a panorama."""
+        kinds = self.catalog.run_kinds.items()
+        return next((kind for section, kind in kinds if section in self.root.data), None)
+
+    @property
     def sections(self) -> tuple[str, ...]:
         """All sections, those of kinds of runs included."""
         return (*SECTIONS, *self.catalog.run_kinds)

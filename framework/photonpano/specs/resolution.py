@@ -41,14 +41,14 @@ class _Resolver:
     """Resolves one spec; every method adds the problems that it finds to the spec, and goes on."""
 
     def __init__(self, root: Written, spec: Spec) -> None:
-        self.kind = next((kind for section, kind in spec.catalog.run_kinds.items() if section in root.data), None)
-        self.root = spec.root = root if self.kind is None else _without_panorama(root, spec, self.kind)
+        self.root = spec.root = root if spec.kind is None else _without_panorama(root, spec, spec.kind)
         self.spec = spec
         self.components = ComponentResolver(spec)
 
     def plan(self) -> Plan | None:
         """Resolve every section; None if there are problems."""
-        spec, root, components, run_kind = self.spec, self.root, self.components, self.kind
+        spec, root, components = self.spec, self.root, self.components
+        run_kind = spec.kind
         spec.check_keys(root, spec.sections)
         version = root.at("version")
         if "version" not in root.data:
@@ -80,8 +80,8 @@ class _Resolver:
             name: validate(model, written.at(name).without(*NOT_SETTINGS.get(name, ())), spec)
             for name, model in SETTINGS.items()
         }
-        check_settings(settings, run_kind, spec)
-        check_flat_field(corrections or (), plans, run_kind, spec)
+        check_settings(settings, spec)
+        check_flat_field(corrections or (), plans, spec)
         if source.choice is None or renderer is None or (run_kind is not None and finder is None) or spec.problems:
             return None
         spelled_out = stages | {"source": source}

@@ -19,9 +19,6 @@ class Score(Protocol):
     def figures(self) -> Mapping[str, Any]:
         """Return what the summary of a batch shows, by the attributes of `photonpano.BatchRow`."""
 
-    def doubt(self) -> str:
-        """Return a clause that says why the truth may be that of another capture; empty where nothing does."""
-
 
 class RunKind(Protocol):
     """Does runs of one kind, and describes them."""
