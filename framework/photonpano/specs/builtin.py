@@ -86,20 +86,13 @@ _TURNING = ("rotation", "auto")  # the models that may find that a camera turns
 
 def check_settings(found: dict[str, Any], spec: Spec) -> None:
     """Check the settings of each section, None where they have problems, against each other; problems go to the spec."""
-    kind = spec.kind
-    motion, camera, output, render, run = (found[name] for name in ("motion", "camera", "output", "render", "run"))
+    motion, camera, output, render = (found[name] for name in ("motion", "camera", "output", "render"))
     if motion is not None and camera is not None:
         _check_camera(motion, camera, spec)
-    if output is not None and output.exposures and kind is None:
+    if output is not None and output.exposures and spec.kind is None:
         sections = listed((f"`{section}`" for section in spec.catalog.run_kinds), "or") or "of a plugin"
         message = f"true needs a section {sections}: of a panorama, keep: exposures writes them; remove it"
         spec.wrong(spec.root.at("output", "exposures"), message)
-    if output is not None and output.keep is not None and kind is not None:
-        message = "exposures are those of the levels of a panorama; remove it, or write exposures: true"
-        spec.wrong(spec.root.at("output", "keep"), message)
-    if run is not None and run.time_limit is not None and kind is not None:
-        finder = kind.component.kind.replace("-", " ")
-        spec.wrong(spec.root.at("run", "time_limit"), f"a {finder} cannot end early; remove it")
     if (
         motion is not None
         and render is not None
@@ -133,9 +126,8 @@ def _check_camera(motion: MotionSettings, camera: CameraSettings, spec: Spec) ->
     for key, number in distortion.items():
         if number == "find":
             spec.wrong(written.at(key), unfindable)
-    if camera.focal_px == "find" and any(
-        number != 0 and not (spec.kind and number == "find") for number in distortion.values()
-    ):
+    known = (number for number in distortion.values() if spec.kind is None or number != "find")
+    if camera.focal_px == "find" and any(known):
         spec.wrong_key(written, without_focal)
 
 

@@ -163,12 +163,15 @@ def _without_panorama(root: Written, spec: Spec, kind: RunKindContribution) -> W
         if key in root.data:
             message = f"{without}, which finds {kind.name} instead of a panorama; remove it, or remove `{kind.section}`"
             spec.wrong_key(root.at(key), message)
-    formats, executor = root.at("output", "formats"), root.at("run", "executor")
-    if formats.data is not None:
-        message = f"{without}: there is no panorama to write; {kind.name} are written in all their formats"
-        spec.wrong_key(formats, message)
-    if executor.data is not None:
-        spec.wrong_key(executor, f"{without}: {kind.name} are found in threads of one process")
+    keys = {
+        ("output", "formats"): f"there is no panorama to write; {kind.name} are written in all their formats",
+        ("output", "keep"): "exposures are those of the levels of a panorama; remove it, or write exposures: true",
+        ("run", "executor"): f"{kind.name} are found in threads of one process",
+        ("run", "time_limit"): f"a {kind.component.kind.replace('-', ' ')} cannot end early; remove it",
+    }
+    for path, why in keys.items():
+        if root.at(*path).data is not None:
+            spec.wrong_key(root.at(*path), f"{without}: {why}")
     own = root.without(*PANORAMA_ONLY)
     return own.having({"output": own.at("output").without("formats")}) if "output" in own.data else own
 
