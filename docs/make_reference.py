@@ -8,6 +8,7 @@ out of date.
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import re
 from collections.abc import Iterable, Sequence
@@ -17,7 +18,6 @@ from typing import Any
 import typer
 from pydantic import BaseModel
 
-import photonpano
 from photonpano import discover
 from photonpano.api.cli.app import app, commands
 from photonpano.api.cli.verbosity import PARAMETERS
@@ -84,7 +84,7 @@ def components() -> str:
     rows = [
         [f"`{KINDS[entry.kind].section}`", f"[`{entry.name}`](spec/{entry.kind}s.md#{entry.name})", entry.contribution.summary]
         for entry in discover().rows
-        if entry.origin.plugin == "photonpano"
+        if entry.origin.plugin == "photonpano" and KINDS[entry.kind].section
     ]
     return table(["Section", "`use`", "What it is"], rows)
 
@@ -118,10 +118,10 @@ def command(names: Sequence[str]) -> str:
 
 
 def functions(names: Sequence[str]) -> str:
-    """Return a table of functions of `photonpano`."""
+    """Return a table of functions of `photonpano`, or of the package that a name begins with."""
     rows = []
     for name in names:
-        function = getattr(photonpano, name)
+        function = public(name)
         signature = inspect.signature(function)
         parameters = [each.replace(annotation=inspect.Parameter.empty) for each in signature.parameters.values()]
         call = inspect.Signature(parameters)
@@ -130,9 +130,15 @@ def functions(names: Sequence[str]) -> str:
     return table(["Call", "Returns", "What it does"], rows)
 
 
+def public(name: str) -> Any:
+    """Return what has a name in `photonpano`, or in the package that it begins with."""
+    package, _, last = name.rpartition(".")
+    return getattr(importlib.import_module(package or "photonpano"), last)
+
+
 def attributes(name: str) -> str:
     """Return the attributes of a class of `photonpano`, from its docstring."""
-    section = (inspect.getdoc(getattr(photonpano, name)) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
+    section = (inspect.getdoc(public(name)) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
     rows = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
     return table(["Attribute", "Meaning"], [[f"`{attribute}`", " ".join(text.split()).rstrip(".")] for attribute, text in rows])
 

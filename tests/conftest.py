@@ -338,7 +338,7 @@ def plugins_found_once() -> Iterator[None]:
 def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write an empty report in runs of this process: drawing it takes longer than a small run."""
     monkeypatch.setattr("photonpano.pipeline.run.render_report", lambda *_: "<html></html>")
-    monkeypatch.setattr("photonpano.pipeline.run.render_pose_report", lambda *_: "<html></html>")
+    monkeypatch.setattr("photonpano_poses.run.render_pose_report", lambda *_: "<html></html>")
     monkeypatch.setattr("photonpano.pipeline.run.render_failure", lambda *_: "<html></html>")
 
 

@@ -14,9 +14,10 @@ from harness import RATE_HZ, Compared, Study, packed, simulator
 from paper.figures.light import fine_images, fine_pictures
 from paper.figures.others import draw_found, true_centres
 
-from photonpano import FrameSpan, evaluate_poses, load_panorama, open_source, parse_spec
+from photonpano import FrameSpan, load_panorama, open_source, parse_spec
 from photonpano.capture.writing import truth_path
 from photonpano.photometry import BinaryResponse, Tone, picture_of
+from photonpano_poses import evaluate_poses
 from photonpano_simulator.config import NightScene
 from photonpano_simulator.scenes import scene_flux
 from photonpano_simulator.travel import depth, sharp_view, truth_of

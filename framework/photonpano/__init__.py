@@ -5,6 +5,8 @@ These names are public, and so are those of `photonpano.geometry`, `photonpano.p
 A name is imported when it is first used, so that the help of the command line needs no numpy.
 """
 
+from importlib.metadata import entry_points
+
 import lazy_loader
 
 __version__ = "0.2.0"
@@ -18,4 +20,9 @@ def __getattr__(name: str) -> object:
             f"photonpano.{name} was removed after 0.2: a component reads `corrects_sums`, `weight`, `light` and `camera` "
             "of the `photonpano.Capture` that it gets"
         )
-    return _public(name)
+    try:
+        return _public(name)
+    except AttributeError:
+        for command in entry_points(group="photonpano.commands", name=name):  # of a plugin
+            return getattr(command.load(), name)
+        raise

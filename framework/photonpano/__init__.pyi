@@ -4,8 +4,6 @@ from .api.copies import DarkMeasurement as DarkMeasurement
 from .api.copies import WrittenCapture as WrittenCapture
 from .api.copies import convert as convert
 from .api.copies import dark as dark
-from .api.export import ExportedPoses as ExportedPoses
-from .api.export import export as export
 from .api.judging import Comparison as Comparison
 from .api.judging import RunCheck as RunCheck
 from .api.judging import check_run as check_run
@@ -48,7 +46,6 @@ from .contracts.protocols import Merger as Merger
 from .contracts.protocols import PackedSource as PackedSource
 from .contracts.protocols import PanoramaView as PanoramaView
 from .contracts.protocols import Piped as Piped
-from .contracts.protocols import PoseEstimator as PoseEstimator
 from .contracts.protocols import Refiner as Refiner
 from .contracts.protocols import Renderer as Renderer
 from .contracts.protocols import Resampler as Resampler
@@ -63,9 +60,7 @@ from .errors import PhotonpanoError as PhotonpanoError
 from .errors import PluginError as PluginError
 from .errors import SpecError as SpecError
 from .evaluation import Evaluation as Evaluation
-from .evaluation import PoseScore as PoseScore
 from .evaluation import RunTrajectory as RunTrajectory
-from .evaluation import evaluate_poses as evaluate_poses
 from .execution.context import Progress as Progress
 from .execution.context import Quiet as Quiet
 from .files.paths import Location as Location
@@ -81,12 +76,12 @@ from .plugins.contributions import ExporterContribution as ExporterContribution
 from .plugins.contributions import InterpolatorContribution as InterpolatorContribution
 from .plugins.contributions import LocatorContribution as LocatorContribution
 from .plugins.contributions import MergerContribution as MergerContribution
-from .plugins.contributions import PoseEstimatorContribution as PoseEstimatorContribution
 from .plugins.contributions import Recognised as Recognised
 from .plugins.contributions import RefinerContribution as RefinerContribution
 from .plugins.contributions import RendererContribution as RendererContribution
 from .plugins.contributions import Requirement as Requirement
 from .plugins.contributions import ResamplerContribution as ResamplerContribution
+from .plugins.contributions import RunKindContribution as RunKindContribution
 from .plugins.contributions import SourceContext as SourceContext
 from .plugins.contributions import SourceContribution as SourceContribution
 from .plugins.contributions import SpecLocation as SpecLocation
@@ -102,7 +97,6 @@ from .specs import load_spec as load_spec
 from .specs import parse_spec as parse_spec
 from .values import Bayer as Bayer
 from .values import BoolArray as BoolArray
-from .values import CameraGuess as CameraGuess
 from .values import CaptureSummary as CaptureSummary
 from .values import Counts as Counts
 from .values import FloatArray as FloatArray
@@ -113,17 +107,13 @@ from .values import Group as Group
 from .values import Homography as Homography
 from .values import Light as Light
 from .values import Located as Located
-from .values import LostFrames as LostFrames
 from .values import NotLocated as NotLocated
 from .values import Panorama as Panorama
 from .values import PanoramaRows as PanoramaRows
 from .values import Patches as Patches
-from .values import PosedView as PosedView
-from .values import PoseEstimate as PoseEstimate
 from .values import Reason as Reason
 from .values import Refined as Refined
 from .values import Response as Response
-from .values import ScenePoints as ScenePoints
 from .values import SpanResiduals as SpanResiduals
 from .values import StreamInfo as StreamInfo
 from .values import Verdict as Verdict

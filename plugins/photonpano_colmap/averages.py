@@ -10,19 +10,14 @@ import numpy as np
 
 from photonpano import (
     BoolArray,
-    CameraGuess,
     CaptureSummary,
     FloatArray,
     FluxImage,
     FrameSpan,
     Group,
     LocationError,
-    LostFrames,
-    PosedView,
-    PoseEstimate,
     Progress,
     Reason,
-    ScenePoints,
     Source,
     StageContext,
     VirtualExposure,
@@ -33,6 +28,7 @@ from photonpano.locating import blur_against_noise, stabilised_8_bit
 from photonpano_colmap.exposures import PoseSpline, left_out, lit_counts
 from photonpano_colmap.hooks import MIN_AVERAGES, ColmapAveragesConfig, counted, starts_of, too_few_averages
 from photonpano_colmap.reconstruction import Piece, PoseNoise, Reconstruction, pose_noise, reconstruct
+from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
 
 _PHOTONS = 60.0  # photons per pixel of an average; with fewer, keypoints are noise
 _BLUR_PX = 6.0  # motion blur of an average that keypoints tolerate; the shorter average of both limits is taken

@@ -9,8 +9,9 @@ import numpy as np
 from pydantic import Field
 
 import photonpano_colmap as plugin
-from photonpano import Config, LocatorContribution, PoseEstimatorContribution, Requirement, StreamInfo, hookimpl
+from photonpano import Config, LocatorContribution, Requirement, StreamInfo, hookimpl
 from photonpano.locating import KeypointConfig
+from photonpano_poses import PoseEstimatorContribution
 
 FIRST_CENTRE = 0.5  # position of the centre of the first pixel in COLMAP; ours is 0
 SEEDS = 2**31  # seeds of the library are below this

@@ -26,10 +26,11 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from photonpano import CameraGuess, FloatArray, Homography, Located, NotLocated, OutputError, Reason, VirtualExposure
+from photonpano import FloatArray, Homography, Located, NotLocated, OutputError, Reason, VirtualExposure
 from photonpano.geometry import normalised, positions_of
 from photonpano.locating import Matches, PointLocator, blur_against_noise, motion_from_points, stabilised_8_bit, too_few_matches
 from photonpano_colmap.hooks import FIRST_CENTRE, SEEDS, ColmapAveragesConfig, PycolmapTwoViewConfig
+from photonpano_poses import CameraGuess
 
 MAX_TRIALS = 10_000  # of RANSAC, which finds a homography with 20 % inliers in half as many
 _SIFT = pycolmap.FeatureExtractorType.SIFT

@@ -15,22 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import (
-    BoolArray,
-    CameraGuess,
-    FloatArray,
-    FrameSpan,
-    Group,
-    LocationError,
-    LostFrames,
-    PosedView,
-    PoseEstimate,
-    Progress,
-    Reason,
-    ScenePoints,
-    Source,
-    StageContext,
-)
+from photonpano import BoolArray, FloatArray, FrameSpan, Group, LocationError, Progress, Reason, Source, StageContext
 from photonpano.geometry import Camera, camera_matrix, corners, positions_of
 from photonpano_colmap.averages import FOCAL_BIAS, AveragesEstimator, flux_of_points, relative_std, tilt, with_focal_judged
 from photonpano_colmap.exposures import (
@@ -47,6 +32,7 @@ from photonpano_colmap.exposures import (
 )
 from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Adjusted, Found, Observations, adjust, find_patches, patches_of, stabilised
+from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
 _CONTRADICTION, _CONTRADICTION_PX = 10.0, 0.5

@@ -26,12 +26,12 @@ import cv2
 import numpy as np
 from harness import Study, chosen, command, in_child, packed, record_of, simulator, table, write_tables
 
-from photonpano import CameraGuess, PhotonpanoError, evaluate_poses, parse_spec, simulate
+from photonpano import PhotonpanoError, parse_spec, simulate
 from photonpano.capture.writing import truth_path
-from photonpano.evaluation import PoseScore, pose_errors
-from photonpano.evaluation.poses import load_run_poses, load_true_poses
 from photonpano_colmap.hooks import ColmapAveragesConfig
 from photonpano_colmap.reconstruction import reconstruct
+from photonpano_poses import CameraGuess, PoseScore, evaluate_poses, pose_errors
+from photonpano_poses.scores import load_run_poses, load_true_poses
 
 N_FRAMES, SHAPE, FOCAL_PX, SHARP_EVERY = 10_000, (254, 496), 450.0, 200
 TREMOR = {"rms_px": 2.0, "rms_mm": 0.5, "roll_rms_deg": 0.05}
@@ -98,7 +98,7 @@ def _sharp(cube: Path, truth: Path, k1: float) -> PoseScore:
     config, guess = ColmapAveragesConfig(), CameraGuess(FOCAL_PX, distortion=(k1, 0, 0, 0))
     found = reconstruct([(picture, everywhere) for picture in pictures], guess, config, 0)
     piece = found.pieces[0]
-    true = load_true_poses(truth).camera_from_world[::SHARP_EVERY]
+    true = load_true_poses(truth)[0][::SHARP_EVERY]
     poses, located = np.full(true.shape, np.nan), np.zeros(len(true), np.bool_)
     poses[piece.images], located[piece.images] = piece.poses, True
     return pose_errors(poses, true, located, 1)

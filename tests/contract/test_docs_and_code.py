@@ -16,9 +16,9 @@ import photonpano
 from photonpano import discover
 from photonpano.api.cli.app import commands
 from photonpano.corrections import CORRECTIONS
-from photonpano.pipeline import pose_run
 from photonpano.plugins import hookspecs
 from photonpano.residuals import causes, verdict
+from photonpano_poses import run as pose_run
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
@@ -91,7 +91,7 @@ def generated(*names: str) -> list[str]:
     return [f"<!-- generated: {name} -->" for name in names]
 
 
-OWN = [entry for entry in discover().rows if entry.origin.plugin == "photonpano"]
+OWN = [entry for entry in discover().rows if entry.origin.plugin == "photonpano" and entry.kind != "run-kind"]
 FUNCTIONS = [name for name in photonpano.__all__ if inspect.isfunction(getattr(photonpano, name))]
 HOOKS = [name for name in vars(hookspecs) if name.startswith("photonpano_")]
 # Pages, and what must stand in them.

@@ -5,16 +5,18 @@ from __future__ import annotations
 import inspect
 import re
 import types
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, run
+from photonpano import Config, FrameSpan, Group, SpecError, run
 from photonpano.plugins import hookspecs, registry
 from photonpano.plugins.registry import OBSERVATION_HOOKS, contributions_of, discover, observation_of
 from photonpano.specs import parse_spec
+from photonpano.specs.settings import PANORAMA_ONLY
 from photonpano.testing import ExporterConformance, RefinerConformance, RendererConformance, ResamplerConformance
 from photonpano.testing.conformance import Conformance
 
@@ -34,7 +36,7 @@ KINDS = {
     "photonpano_refiners": ("refiner", "jump"),
     "photonpano_renderers": ("renderer", "nearest-pixel"),
     "photonpano_exporters": ("exporter", "pgm"),
-    "photonpano_pose_estimators": ("pose-estimator", "never-posed"),
+    "photonpano_run_kinds": ("run-kind", "brightnesses"),
     "photonpano_executors": ("executor", "one-by-one"),
 }
 
@@ -52,6 +54,13 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.fixture(autouse=True)
+def forget_meters() -> Iterator[None]:
+    """Forget the kind of component that the example of a kind of run defines."""
+    yield
+    registry.KINDS.pop("meter", None)
+
+
 def example_of(hook: str) -> types.ModuleType:
     """Make a plugin of the example in the section of a hook."""
     (code,) = re.findall(r"^```python\n(.*?)^```$", dict(SECTIONS)[hook], re.MULTILINE | re.DOTALL)
@@ -62,12 +71,13 @@ def example_of(hook: str) -> types.ModuleType:
 
 def test_every_hook_is_tested_here() -> None:
     assert set(HOOKS) == {*KINDS, *OBSERVED}
-    assert {hook: kind for hook, (kind, _) in KINDS.items()} == {kind.hook: kind.name for kind in registry.KINDS.values()}
+    own = {kind.hook: kind.name for kind in registry.KINDS.values() if kind.hook in HOOKS}
+    assert {hook: kind for hook, (kind, _) in KINDS.items()} == own
     assert set(OBSERVED) == set(OBSERVATION_HOOKS)
 
 
 def test_page_has_one_section_for_every_hook() -> None:
-    assert [name for name, _ in SECTIONS] == list(HOOKS)
+    assert [name for name, _ in SECTIONS if name != "photonpano_pose_estimators"] == list(HOOKS)
 
 
 @pytest.mark.parametrize("hook", HOOKS)
@@ -84,6 +94,11 @@ def test_component_hook_has_no_arguments_and_complete_example(hook: str) -> None
     assert (contribution.kind, contribution.name) == KINDS[hook]
 
 
+def test_hook_of_pose_estimators_has_complete_example() -> None:
+    (contribution,) = contributions_of(example_of("photonpano_pose_estimators"))
+    assert (contribution.kind, contribution.name) == ("pose-estimator", "never-posed")
+
+
 @pytest.mark.parametrize("hook", OBSERVED)
 def test_observation_hook_has_documented_arguments_and_complete_example(hook: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = list(inspect.signature(HOOKS[hook]).parameters)
@@ -93,6 +108,28 @@ def test_observation_hook_has_documented_arguments_and_complete_example(hook: st
     assert set(ARGUMENTS[hook]) | {"directory"} == set(arguments)
     getattr(observation, hook)(directory=Path("runs/scan"), **ARGUMENTS[hook])
     assert capsys.readouterr().err == OBSERVED[hook]
+
+
+def test_run_kind_example_runs_beside_others(tiny_spec: dict[str, Any], tmp_path: Path) -> None:
+    def measured(source: Any) -> np.ndarray:
+        return np.array([source.counts(FrameSpan(frame, frame + 1)).mean() for frame in range(source.info.n_frames)])
+
+    example = example_of("photonpano_run_kinds")
+    meter = example.MeterContribution(
+        name="mean", summary="Mean", config=Config, build=lambda *_: types.SimpleNamespace(measure=measured)
+    )
+    catalog = discover().including(example, meter)
+    found = run(parse_spec({**shared(tiny_spec), "meter": "mean"}, output=tmp_path / "run", catalog=catalog))
+    assert found.record["brightnesses"]["mean"] == pytest.approx(np.load(tmp_path / "run" / "brightnesses.npy").mean())
+    assert found.rows == [("mean", f"{found.record['brightnesses']['mean']:.3f} of the pixels are lit")]
+    assert found.record["spec"]["meter"] == {"use": "mean", "with": {}}
+    with pytest.raises(SpecError, match="does not apply with `meter`, which finds brightnesses instead of a panorama"):
+        parse_spec({**tiny_spec, "meter": "mean"}, output=tmp_path / "other", catalog=catalog)
+
+
+def shared(spec: dict[str, Any]) -> dict[str, Any]:
+    """Return the sections of a spec that hold for every kind of run."""
+    return {name: section for name, section in spec.items() if name not in PANORAMA_ONLY}
 
 
 @pytest.mark.parametrize("section", ["merge", "interpolate"])

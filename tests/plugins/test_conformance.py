@@ -16,12 +16,12 @@ from photonpano.testing import (
     InterpolatorConformance,
     LocatorConformance,
     MergerConformance,
-    PoseEstimatorConformance,
     RefinerConformance,
     RendererConformance,
     ResamplerConformance,
 )
 from photonpano.testing.conformance import Conformance
+from photonpano_poses.testing import PoseEstimatorConformance
 
 (AUTO,) = builtin.photonpano_sources()
 (CHAIN,) = builtin.photonpano_locators()
@@ -112,6 +112,13 @@ class TestChainOfBackends(Conformance):
 
     kind = "locator"
     contribution = CHAIN
+
+
+class TestPoses(Conformance):
+    """A kind of run is no component of a spec: what holds for every contribution holds."""
+
+    kind = "run-kind"
+    contribution = CATALOG.find("run-kind", "poses").contribution
 
 
 class TestAuto(Conformance):

@@ -28,11 +28,11 @@ from paper.figures.study import (
     told,
 )
 
-from photonpano import FrameSpan, Panorama, PhotonpanoError, evaluate_poses, load_panorama, open_source, parse_spec
+from photonpano import FrameSpan, Panorama, PhotonpanoError, load_panorama, open_source, parse_spec
 from photonpano.capture.writing import truth_path
-from photonpano.evaluation import align_positions
 from photonpano.geometry import FrameTrajectory, positions_of
 from photonpano.merging.panorama import plan_canvas
+from photonpano_poses import align_positions, evaluate_poses
 
 APERTURES = {"f/8": 1 / 8, "f/5.6": 1 / 4, "f/4": 1 / 2, "f/2.8": 1.0}  # and their light, relative to the spec
 SHOWN = ("f/5.6", "f/2.8")  # the paper's apertures

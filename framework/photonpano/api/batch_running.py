@@ -27,7 +27,7 @@ import cv2
 from photonpano.api.batch_jobs import Job, is_of_capture
 from photonpano.capture.writing import truth_path
 from photonpano.errors import InputError, OutputError, PhotonpanoError, SpecError, described
-from photonpano.evaluation import evaluate, evaluate_poses
+from photonpano.evaluation import evaluate
 from photonpano.execution.context import Quiet
 from photonpano.files.folders import atomic_path
 from photonpano.files.paths import Url
@@ -94,7 +94,7 @@ def _attempted(job: Job) -> BatchRow:
 
 def _finished(row: BatchRow, result: RunResult) -> BatchRow:
     """Describe what a run has found."""
-    record, poses, motion = result.record, result.record["poses"], result.record["motion"]
+    record, motion = result.record, result.record["motion"]
     doubts = [str(each) for each in (result.verdict.reasons if result.verdict else ())]
     return replace(
         row,
@@ -104,7 +104,7 @@ def _finished(row: BatchRow, result: RunResult) -> BatchRow:
         reason="\n".join(doubts),
         reduced_chi2=result.verdict.reduced_chi2 if result.verdict else None,
         expected_error_px=motion["std_px"] if motion else None,
-        expected_position_error=poses["std_position"] if poses else None,
+        **(result.kind.runs.figures(record) if result.kind else {}),
         n_frames=record["source"]["n_frames"],
         seconds=record["seconds"],
         peak_memory_bytes=record["peak_memory_bytes"],
@@ -118,11 +118,8 @@ def _scored(row: BatchRow, result: RunResult) -> BatchRow:
     if isinstance(row.capture, Url) or not (truth := truth_path(row.capture)).exists():
         return row
     try:
-        if result.record["poses"]:
-            return replace(row, true_position_error=evaluate_poses(result.directory, truth).ate_share)
-        score = evaluate(result.directory, truth)
-        psnr_db = None if score.panorama is None else score.panorama.psnr_db
-        return replace(row, true_error_px=score.trajectory.mean_px, psnr_db=psnr_db)
+        score = (result.kind.runs.evaluate if result.kind else evaluate)(result.directory, truth)
+        return replace(row, **score.figures())
     except InputError as error:
         return replace(row, reason="\n".join(filter(None, (row.reason, f"no score: {error}"))))
 

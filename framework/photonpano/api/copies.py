@@ -75,7 +75,8 @@ def lines_of_capture(written: WrittenCapture) -> Iterator[str]:
     yield columns([[str(file), decimal(_size(file)), text] for file, text in files if file])
     yield f"\nIn a spec in this folder:\n\nsource: {flow(dict(written.source))}"
     held = ZipFile(written.truth).namelist() if written.truth else ()
-    for array, kind in (("homographies", "run"), ("camera_from_world", "run with `pose`")):
+    others = [(kind.truth, f"run with `{kind.section}`") for kind in discover().run_kinds.values()]
+    for array, kind in (("homographies", "run"), *others):
         if f"{array}.npy" in held:
             yield f"\nTo score a {kind} of it: photonpano evaluate RUN --truth {quote(str(written.truth))}"
 

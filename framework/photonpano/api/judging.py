@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +12,18 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from photonpano.api.command import command, json_lines, require_trust, verdict_lines, warn
+from photonpano.api.command import command, json_lines, require_trust, verdict_lines
 from photonpano.api.run_folders import opened_run
 from photonpano.capture import capture_of
 from photonpano.capture.writing import truth_path
-from photonpano.contracts.protocols import Trajectory
+from photonpano.contracts.protocols import Score, Trajectory
 from photonpano.errors import InputError, OutputError
 from photonpano.evaluation import (
     Evaluation,
-    ImageScore,
-    PoseScore,
-    RotationScore,
-    evaluate_poses,
-    has_poses,
     load_run_trajectory,
 )
 from photonpano.evaluation import evaluate as evaluate_folder
-from photonpano.evaluation.inputs import RunTrajectory
+from photonpano.evaluation.inputs import RunTrajectory, kind_of_run
 from photonpano.evaluation.run_scores import motion_difference, on_canvas, reduced
 from photonpano.execution.context import Context, Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
@@ -48,7 +43,6 @@ from photonpano.residuals.verdict import NARROW, REPEATS, judge
 from photonpano.text import columns
 from photonpano.values import Panorama, Reason, Verdict
 
-_FEW = 0.1  # if fewer positions lie within 3 expected errors, the truth is probably of another capture
 _PICTURE_PIXELS = 1600  # longer side of a panorama on the page
 _FILES = ("trajectory.npz", "panorama.png")
 
@@ -110,24 +104,14 @@ def check_run(
     return RunCheck(replace(judged, reduced_chi2=verdict.reduced_chi2))
 
 
-def _score(run_folder: Path, truth: Path, **how: Any) -> Evaluation | PoseScore:
-    """Score a panorama or poses, whichever the run has found."""
-    if not has_poses(run_folder):
-        return evaluate(run_folder, truth, **how)
-    score = evaluate_poses(run_folder, truth)
-    if score.honest_shares is not None and score.honest_shares[2] < _FEW:
-        warn(f"{100 * score.honest_shares[2]:.0f} % of the positions are within 3 std_position: is {truth} of this capture?")
-    return score
+def _score(run_folder: Path, truth: Path, **how: Any) -> Score:
+    """Score a panorama, or what another kind of run has found."""
+    kind = kind_of_run(run_folder)
+    return evaluate(run_folder, truth, **how) if kind is None else kind.runs.evaluate(run_folder, truth)
 
 
-def _lines_of_score(score: Evaluation | PoseScore, *, as_json: bool = False) -> Iterator[str]:
-    if not as_json:
-        yield columns(score.rows())
-    elif isinstance(score, Evaluation):
-        yield from json_lines(_data(score))
-    else:
-        named = {each.name: each.name for each in fields(score)} | {"honest_shares": "within_std_shares"}
-        yield from json_lines({named[name]: getattr(score, name) for name in named if name not in ("errors_m", "errors_deg")})
+def _lines_of_score(score: Score, *, as_json: bool = False) -> Iterable[str]:
+    return json_lines(score.data()) if as_json else [columns(score.rows())]
 
 
 @command(
@@ -152,7 +136,7 @@ def evaluate(
     rotations are angles, after the best common rotation. PSNR and SSIM compare the panorama with the true scene, where it was
     seen. The oracle is the panorama along the true motion.
 
-    Of a run with `pose`, positions are in m after the best similarity (ATE), and relative errors (RPE) over some frames.
+    Of another kind of run, the plugin that offers it says what is scored.
 
     Args:
         run_folder: written by `run`.
@@ -177,23 +161,6 @@ def evaluate(
             return composed(images, source)
 
         return evaluate_folder(run_folder, truth, along_truth)
-
-
-def _data(evaluation: Evaluation) -> dict[str, Any]:
-    motion = evaluation.trajectory
-    return {
-        "corner_error_px": {name: getattr(motion, f"{name}_px") for name in ("mean", "median", "p95", "max")},
-        "located_share": motion.located_share,
-        "within_three_std_share": evaluation.honest_share,
-        "rotation": _given(evaluation.rotation, "mean_deg", "max_deg", "focal_error", "focal_std"),
-        "panorama": _given(evaluation.panorama, "psnr_db", "ssim", "compared_share"),
-        "oracle": _given(evaluation.oracle, "psnr_db", "ssim", "compared_share"),
-        "below_oracle_db": evaluation.below_oracle_db,
-    }
-
-
-def _given(score: ImageScore | RotationScore | None, *names: str) -> dict[str, float | None] | None:
-    return None if score is None else {name: getattr(score, name) for name in names}
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,23 +11,29 @@ import typer
 from photonpano.api.command import command, component_names, json_lines
 from photonpano.plugins.contributions import KINDS, install_command
 from photonpano.plugins.description import config_rows, snippet
-from photonpano.plugins.registry import Catalog, Entry, Origin
+from photonpano.plugins.registry import Catalog, Entry, Origin, discover
 from photonpano.text import columns
 
 
+def _kinds() -> list[str]:
+    """Return all kinds of components; plugins that are found may define some."""
+    discover()
+    return list(KINDS)
+
+
 def _kind(text: str) -> str:
-    if text in KINDS:
+    if text in (kinds := _kinds()):
         return text
-    raise typer.BadParameter(f"{text!r} is not one of {', '.join(map(repr, KINDS))}.")
+    raise typer.BadParameter(f"{text!r} is not one of {', '.join(map(repr, kinds))}.")
 
 
 def kind_option(help_text: str) -> Any:
     """Return the option `--kind`."""
 
     def complete(incomplete: str) -> list[str]:
-        return [name for name in KINDS if name.startswith(incomplete)]
+        return [name for name in _kinds() if name.startswith(incomplete)]
 
-    return typer.Option(metavar="KIND", parser=_kind, autocompletion=complete, help=f"{help_text}: {', '.join(KINDS)}.")
+    return typer.Option(metavar="KIND", parser=_kind, autocompletion=complete, help=f"{help_text}: {', '.join(_kinds())}.")
 
 
 def _lines_of_list(catalog: Catalog, *, kind: str | None = None, broken: bool = False, as_json: bool = False) -> Iterator[str]:

@@ -39,12 +39,9 @@ def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
             yield f"refined   {refinement['change_px']:.2g} px on average by {refinement['use']}: {refinement['rounds'][0]}"
     if line := _range(record.get("panorama")):
         yield f"range     {line}"
-    poses = record.get("poses")
-    if poses:
-        yield f"located   {poses['located']:,} of {counted(record['source']['n_frames'], 'frame')}"
-        yield f"poses     {directory / 'poses.npz'}"
-    else:
-        yield f"panorama  {directory / 'panorama.png'}"
+    yield from (f"{name:<9} {text}" for name, text in result.rows)
+    name, file = ("panorama", "panorama.png") if result.kind is None else (result.kind.name, result.kind.file)
+    yield f"{name:<9} {directory / file}"
     if "report.html" in record["files"]:
         yield f"report    {directory / 'report.html'}"
     for other in result.others:
@@ -81,7 +78,7 @@ def _run(
     deviation, coverage.tiff, trajectory.npz, run.json (settings, versions, results) and report.html. The verdict says whether
     motion and panorama explain the photons.
     Of several shots, each one but the longest gets a run folder of its own, DIR.panorama-2 and so on.
-    A spec with `pose` finds the poses of a camera instead: poses.npz, and files of other programs.
+    A spec with the section of another kind of run, which a plugin offers, finds that instead.
 
     Args:
         spec: a YAML file.

@@ -37,7 +37,11 @@ def _check(spec: Path, changes: Sequence[str] = ()) -> Iterator[str]:
     """
     plan = load_spec(spec, changes)
     with open_source(plan, look=False) as source:
-        what = f"poses by {plan.pose.contribution.name}" if plan.pose else counted(len(plan.levels), "level")
+        what = (
+            f"{plan.kind.name} by {plan.finder.contribution.name}"
+            if plan.kind and plan.finder
+            else counted(len(plan.levels), "level")
+        )
         up_to = "up to " if plan.until_converged else ""
         yield f"{spec}: ok, {up_to}{what} on {plan.source.contribution.name}: {source.info}"
         if (found := plan.recognised) is not None:
@@ -50,7 +54,7 @@ def forecast(plan: Plan) -> Forecast:
     """Predict time and memory of a run, from a trial on the middle of the capture.
 
     Raises:
-        InputError: the spec finds poses.
+        InputError: the spec finds something else than a panorama.
         PhotonpanoError: the trial failed, as the run may.
     """
     from photonpano.pipeline.forecast import forecast as forecast_from
@@ -94,8 +98,8 @@ def explain(plan: Plan, *, with_forecast: bool = False, catalog: Catalog | None 
 
 
 def _require_levels(plan: Plan) -> None:
-    if plan.pose is not None:
-        raise InputError("a forecast is of panoramas, and the spec finds poses: leave out --forecast")
+    if plan.kind is not None:
+        raise InputError(f"a forecast is of panoramas, and the spec finds {plan.kind.name}: leave out --forecast")
 
 
 def _levels(plan: Plan, source: Source) -> Iterator[str]:

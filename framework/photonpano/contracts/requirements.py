@@ -28,9 +28,6 @@ from photonpano.values import (
     Located,
     NotLocated,
     Panorama,
-    PosedView,
-    PoseEstimate,
-    Reason,
     Refined,
     Response,
     StreamInfo,
@@ -45,7 +42,6 @@ _ROUNDING = 1e-9  # elements of the identity may differ by less
 STILL_SHARE = 0.1
 KNOT_PX, KNOT_STDS = 1.0, 10.0  # a trajectory may miss its knots by this much, or by this many of their expected errors
 _LARGEST = 1e9  # no camera moves by so much, and larger numbers of a homography overflow in later steps
-_ORTHONORMAL = 1e-6  # largest element of R R^T - I of a rotation
 _FLUX = np.array([[0.0, 0.01, 0.3], [0.3, 0.01, np.nan]], np.float32)  # with which a response is tried
 UNDETERMINED = 10.0  # expected corner error of a pair, in sides of a frame, from which on it constrains nothing
 _SAFE = 0.01  # margin of the bound on errors that the smallest pivot gives
@@ -67,7 +63,7 @@ def shown(value: object) -> str:
 
 def require_info(info: Any) -> StreamInfo:
     """Return the `info` of a source."""
-    _require_instance(info, StreamInfo)
+    require_instance(info, StreamInfo)
     for name in ("n_frames", "height", "width", "bit_depth"):
         size: Any = getattr(info, name)
         if not (isinstance(size, int | np.integer) and size >= 1):
@@ -85,7 +81,7 @@ def require_info(info: Any) -> StreamInfo:
 
 def require_mask(valid: Any, frame_shape: tuple[int, int]) -> BoolArray:
     """Return the mask `valid` of a source."""
-    _require_array("valid", valid, frame_shape, "bool", "b")
+    require_array("valid", valid, frame_shape, "bool", "b")
     mask: BoolArray = valid
     return mask
 
@@ -97,7 +93,7 @@ def require_response(response: Any) -> Response:
         flux = response.flux(counts, 10_000.0)
         stabilised = response.stabilised(_FLUX, np.full(_FLUX.shape, 100, np.float32))
     for name, image in (("mean_count", counts), ("flux", flux), ("stabilised", stabilised)):
-        _require_array(f"the result of response.{name}()", image, _FLUX.shape, "float32", "f")
+        require_array(f"the result of response.{name}()", image, _FLUX.shape, "float32", "f")
         if (np.isnan(image) != np.isnan(_FLUX)).any():
             raise BrokenContract(f"response.{name}() keeps NaN, and gives no other; {_FLUX.tolist()} became {image.tolist()}")
     if not np.allclose(flux, _FLUX, rtol=0.1, atol=0.01, equal_nan=True):
@@ -125,7 +121,7 @@ def require_range(found: NDArray[Any], method: str, highest: int) -> None:
 
 def require_sharp_view(found: Any, shape: tuple[int, int]) -> NDArray[Any]:
     """Return the frame without noise that a simulator returned."""
-    _require_array("the result of sharp_view()", found, shape, "float32", "f")
+    require_array("the result of sharp_view()", found, shape, "float32", "f")
     if bad := found.size - int(np.count_nonzero(np.isfinite(found))):
         raise BrokenContract(f"sharp_view() returns finite numbers; {bad} of {found.size} pixels are NaN or infinite")
     image: NDArray[Any] = found
@@ -134,7 +130,7 @@ def require_sharp_view(found: Any, shape: tuple[int, int]) -> NDArray[Any]:
 
 def require_truth(found: Any) -> Mapping[str, NDArray[np.generic]]:
     """Return the ground truth of a simulator."""
-    _require_instance(found, Mapping)
+    require_instance(found, Mapping)
     truth: Mapping[str, NDArray[np.generic]] = found
     return truth
 
@@ -146,7 +142,7 @@ def require_groups(found: Any, n_frames: int, *_: Any) -> tuple[Group, ...]:
     """Return the groups of a resampler."""
     groups: tuple[Group, ...] = tuple(found)
     for group in groups:
-        _require_instance(group, Group)
+        require_instance(group, Group)
     instants = [group.reference for group in groups]
     if not groups or any(later <= earlier for earlier, later in pairwise(instants)):
         raise BrokenContract(f"expected at least one group, in order, each instant once; got the instants {instants!s:.200}")
@@ -158,7 +154,7 @@ def require_groups(found: Any, n_frames: int, *_: Any) -> tuple[Group, ...]:
 
 def require_exposure(found: Any, source: Source, group: Group, _: Any, scale: float) -> VirtualExposure:
     """Return the exposure of a merger."""
-    _require_instance(found, VirtualExposure)
+    require_instance(found, VirtualExposure)
     if found.scale != scale:
         raise BrokenContract(f"expected an exposure of scale {scale:g}, got {found.scale:g}")
     if found.group != group:
@@ -175,7 +171,7 @@ def require_exposure(found: Any, source: Source, group: Group, _: Any, scale: fl
 
 def require_motion(found: Any, *_: Any) -> Located | NotLocated:
     """Return what a locator returned for a pair."""
-    _require_instance(found, Located, NotLocated)
+    require_instance(found, Located, NotLocated)
     if not isinstance(found.evidence, Mapping):
         raise BrokenContract(f"evidence is a mapping of numbers by name, got {shown(found.evidence)}")
     for name, value in found.evidence.items():
@@ -196,8 +192,8 @@ def require_motion(found: Any, *_: Any) -> Located | NotLocated:
             f"residual_px is a finite number of at least 0, None if it is not known; got {located.residual_px!r}"
         )
     if located.patches is not None:
-        _require_finite("patches.shifts", located.patches.shifts, (PATCHES**2, 2))
-        _require_finite("patches.information", located.patches.information, (PATCHES**2, 2, 2))
+        require_finite("patches.shifts", located.patches.shifts, (PATCHES**2, 2))
+        require_finite("patches.information", located.patches.information, (PATCHES**2, 2, 2))
     return located
 
 
@@ -242,7 +238,7 @@ def why_still(homographies: Sequence[Homography], frame_shape: tuple[int, int], 
 def require_homographies(found: Any, frame_indices: ArrayLike) -> FloatArray:
     """Return what a trajectory returned for N instants, as float64: (N, 3, 3)."""
     frames, found = np.atleast_1d(np.asarray(frame_indices, np.float64)), np.asarray(found)
-    _require_array("the result of at()", found, (len(frames), 3, 3), "float64", "fiu")
+    require_array("the result of at()", found, (len(frames), 3, 3), "float64", "fiu")
     bad = ~np.isfinite(found).all(axis=(1, 2)) | (found[:, 2, 2] == 0)
     if bad.any():
         first = int(np.argmax(bad))
@@ -291,10 +287,10 @@ def require_refined(found: Any, _source: Any, _trajectory: Any, std_px: FloatArr
     """Return the motion of a refiner, whose expected errors were (T,) `std_px`; None if it found nothing."""
     if found is None:
         return None
-    _require_instance(found, Refined)
+    require_instance(found, Refined)
     n_frames = len(std_px)
-    _require_array("homographies", found.homographies, (n_frames, 3, 3), "float64", "fiu")
-    _require_array("std_px", found.std_px, (n_frames,), "float64", "fiu")
+    require_array("homographies", found.homographies, (n_frames, 3, 3), "float64", "fiu")
+    require_array("std_px", found.std_px, (n_frames,), "float64", "fiu")
     if not isinstance(found.summary, str):
         raise BrokenContract(f"the summary is a text, got {shown(found.summary)}")
     bad = ~np.isfinite(found.homographies).all(axis=(1, 2)) | ~(found.std_px >= 0)
@@ -320,7 +316,7 @@ def require_refined(found: Any, _source: Any, _trajectory: Any, std_px: FloatArr
 
 def require_panorama(found: Any, _source: Any, _trajectory: Any, _span: FrameSpan, canvas: Canvas, *_: Any) -> Panorama:
     """Return what a renderer returned for a canvas, in float32."""
-    _require_instance(found, Panorama)
+    require_instance(found, Panorama)
     _require_images(found, canvas.shape)
     if not np.array_equal(np.asarray(found.canvas), canvas.transform):
         raise BrokenContract("the canvas of the panorama is the transform of the given canvas, got another one")
@@ -337,78 +333,11 @@ def require_files(written: Collection[str], path: Path) -> None:
         raise BrokenContract(f"expected a file or folder {path.name} with content, got none")
 
 
-def require_poses(found: Any, source: Source, *_: Any) -> PoseEstimate:
-    """Return the estimate of a pose estimator."""
-    _require_instance(found, PoseEstimate)
-    n_frames, located = source.info.n_frames, found.located
-    _require_array("located", located, (n_frames,), "bool", "b")
-    if not located.any():
-        raise BrokenContract("no frame is located; raise a LocationError with the reason instead")
-    poses = found.camera_from_world
-    _require_array("camera_from_world", poses, (n_frames, 3, 4), "float64")
-    if not np.isnan(poses[~located]).all():
-        raise BrokenContract("camera_from_world must be NaN where a frame is not located")
-    if (bent := np.flatnonzero(located)[~_are_rigid(poses[located])]).size:
-        raise BrokenContract(f"the pose of frame {bent[0]} must be a finite rotation and translation")
-    for name in ("std_position", "std_rotation_deg"):
-        std = getattr(found, name)
-        _require_array(name, std, (n_frames,), "float64")
-        if not ((std[located] >= 0).all() and np.isnan(std[~located]).all()):
-            raise BrokenContract(f"{name} must be 0 or more where a frame is located, inf if not known, and NaN elsewhere")
-    _require_camera(found)
-    n_points = len(found.points.positions)
-    _require_finite("points.positions", found.points.positions, (n_points, 3))
-    if np.shape(found.points.flux) != (n_points,):
-        raise BrokenContract(f"expected a flux for each of {n_points} points")
-    for view in found.views:
-        _require_view(view, n_points, n_frames)
-    explained = located.copy()
-    for each in found.lost:
-        explained[each.span.start : each.span.stop] = True
-    if not explained.all():
-        raise BrokenContract(f"frame {np.argmin(explained)} is not located, and no entry of lost says why")
-    for doubt in found.doubts:
-        _require_instance(doubt, Reason)
-    estimate: PoseEstimate = found
-    return estimate
-
-
-def _require_camera(found: PoseEstimate) -> None:
-    matrix = found.camera_matrix
-    _require_finite("camera_matrix", matrix, (3, 3))
-    if not (min(matrix[0, 0], matrix[1, 1]) > 0 and matrix[2].tolist() == [0, 0, 1]):
-        raise BrokenContract(f"camera_matrix must have positive focal lengths, got {matrix.tolist()}")
-    _require_finite("distortion", found.distortion, (4,))
-    if not found.std_focal_px >= 0:
-        raise BrokenContract(f"std_focal_px must be 0 or more, got {found.std_focal_px!r}")
-
-
-def _require_view(view: PosedView, n_points: int, n_frames: int) -> None:
-    of = f"the view of {view.span}"
-    if view.span.stop > n_frames or not view.span.start <= view.instant <= view.span.stop - 1:
-        raise BrokenContract(f"{of} is seen from the instant {view.instant:g}, or reaches beyond the capture")
-    _require_finite(f"the pose of {of}", view.camera_from_world, (3, 4))
-    if not _are_rigid(view.camera_from_world[None]).all():
-        raise BrokenContract(f"the pose of {of} must be a rotation and translation")
-    indices = np.asarray(view.points)
-    if indices.dtype.kind not in "iu" or ((indices < 0) | (indices >= n_points)).any():
-        raise BrokenContract(f"{of} must show points 0 to {n_points - 1}, got {shown(view.points)}")
-    _require_finite(f"xy of {of}", view.xy, (len(indices), 2))
-
-
-def _are_rigid(poses: FloatArray) -> BoolArray:
-    """Return which poses (N, 3, 4) are finite and made of a rotation and a translation: (N,)."""
-    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    rotations = np.where(finite[:, None, None], poses[:, :, :3], 0)
-    off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2))
-    rigid: BoolArray = finite & (off < _ORTHONORMAL) & (np.linalg.det(rotations) > 0)
-    return rigid
-
-
 # For several kinds
 
 
-def _require_instance(found: object, *kinds: type) -> None:
+def require_instance(found: object, *kinds: type) -> None:
+    """Refuse what is of none of these types."""
     if not isinstance(found, kinds):
         raise BrokenContract(f"expected {' or '.join(kind.__name__ for kind in kinds)}, got {shown(found)}")
 
@@ -424,20 +353,21 @@ def _require_methods(*names: str) -> Callable[..., Any]:
     return require
 
 
-def _require_array(name: str, array: object, shape: tuple[int, ...], dtype: str, kinds: str = "f") -> None:
+def require_array(name: str, array: object, shape: tuple[int, ...], dtype: str, kinds: str = "f") -> None:
     """Refuse what is not an array of a shape; `kinds` are those of numbers that can become the `dtype`."""
     if not (isinstance(array, np.ndarray) and array.shape == shape and array.dtype.kind in kinds):
         raise BrokenContract(f"{name} must be {shape} of {dtype}, got {shown(array)}")
 
 
-def _require_finite(name: str, array: Any, shape: tuple[int, ...]) -> None:
-    _require_array(name, array, shape, "float64")
+def require_finite(name: str, array: Any, shape: tuple[int, ...]) -> None:
+    """Refuse what is not a finite array of a shape."""
+    require_array(name, array, shape, "float64")
     if not np.isfinite(array).all():
         raise BrokenContract(f"{name} must be finite")
 
 
 def _require_homography(found: Any) -> None:
-    _require_array("a homography", found, (3, 3), "float64; a failure is NotLocated", "fiu")
+    require_array("a homography", found, (3, 3), "float64; a failure is NotLocated", "fiu")
     with np.errstate(all="ignore"):
         right = found[2, 2] != 0 and (np.abs(found / found[2, 2]) < _LARGEST).all() and abs(np.linalg.det(found)) > 0
     if not right:
@@ -448,8 +378,8 @@ def _require_homography(found: Any) -> None:
 
 def _require_images(found: Any, shape: tuple[int, ...]) -> None:
     """Require `flux` and `weight` of a shape: flux is finite exactly where the weight is positive, and NaN elsewhere."""
-    _require_array("flux", found.flux, shape, "float32")
-    _require_array("weight", found.weight, shape, "float32")
+    require_array("flux", found.flux, shape, "float32")
+    require_array("weight", found.weight, shape, "float32")
     flux, weight = np.asarray(found.flux, np.float32), np.asarray(found.weight, np.float32)
     finite, lowest = np.isfinite(flux), weight.min()
     bounded = 0 <= lowest <= weight.max() < np.inf
@@ -477,7 +407,6 @@ REQUIRED: Mapping[str, Callable[..., Any]] = {
     "at": require_homographies,
     "refine": require_refined,
     "render": require_panorama,
-    "estimate": require_poses,
 }
 
 

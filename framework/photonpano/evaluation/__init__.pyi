@@ -3,13 +3,6 @@ from .inputs import Truth as Truth
 from .inputs import load_panorama as load_panorama
 from .inputs import load_run_trajectory as load_run_trajectory
 from .inputs import load_truth as load_truth
-from .poses import PoseScore as PoseScore
-from .poses import RunPoses as RunPoses
-from .poses import align_positions as align_positions
-from .poses import evaluate_poses as evaluate_poses
-from .poses import has_poses as has_poses
-from .poses import load_run_poses as load_run_poses
-from .poses import pose_errors as pose_errors
 from .run_scores import Evaluation as Evaluation
 from .run_scores import evaluate as evaluate
 from .scores import ImageScore as ImageScore

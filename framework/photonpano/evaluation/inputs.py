@@ -23,6 +23,8 @@ from photonpano.geometry import (
     translation,
 )
 from photonpano.notebooks import facts
+from photonpano.plugins.contributions import RunKindContribution
+from photonpano.plugins.registry import discover
 from photonpano.reading import read_arrays, reading
 from photonpano.text import pixels
 from photonpano.values import BoolArray, FloatArray, FluxImage, Homography
@@ -111,10 +113,11 @@ def load_truth(path: Path) -> Truth:
     `homographies` are those of an ideal lens, and `undistorted_corners` (4, 2) are its pixels of the frame's corners.
     """
     optional = ("scene", "undistorted_corners", "rotations", "camera_matrix", "distortion")
-    if set(read_arrays(path, _TRUTH, ("camera_from_world", "homographies"))) == {"camera_from_world"}:
-        raise InputError(
-            f"{path} is the truth of a camera that travels, which has poses and no homographies; score a run with `pose` by it"
-        )
+    if not read_arrays(path, _TRUTH, ("homographies",)):
+        others = {kind.truth: kind for kind in discover().run_kinds.values()}
+        for held in read_arrays(path, _TRUTH, others):
+            what, section = others[held].name, others[held].section
+            raise InputError(f"{path} is a truth with {what} and no homographies; score a run with `{section}` by it")
     arrays = read_numbers(path, _TRUTH, ("homographies", "frame_shape"), optional)
     scene = arrays.get("scene")
     frame_shape, homographies = frame_shape_of(path, arrays), _homographies(path, arrays)
@@ -129,16 +132,21 @@ def load_truth(path: Path) -> Truth:
     )
 
 
+def kind_of_run(folder: Path) -> RunKindContribution | None:
+    """Return the kind of the run in a folder; None if it is a run for a panorama."""
+    return next((kind for kind in discover().run_kinds.values() if (folder / kind.file).exists()), None)
+
+
 def load_run_trajectory(folder: Path) -> RunTrajectory:
     """Read the trajectory of a run folder; `InputError` if the file is missing or damaged."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; give the run folder that `photonpano run` wrote")
     path = folder / "trajectory.npz"
-    if (folder / "poses.npz").exists() and not path.exists():
-        raise InputError(
-            f"{folder} is a run with `pose`: it has the poses of a camera that travels, and neither homographies nor a panorama"
-        )
     if not path.exists():
+        if (kind := kind_of_run(folder)) is not None:
+            raise InputError(
+                f"{folder} is a run with `{kind.section}`: it has {kind.name}, and neither homographies nor a panorama"
+            )
         raise InputError(f"{folder} has no trajectory.npz, so no run has finished in it; give the folder of a finished run")
     required, of_camera = (
         ("homographies", "canvas", "frame_shape", "located", "std_px"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -89,8 +89,29 @@ class Evaluation:
             rows.append(("PSNR below the oracle", f"{self.below_oracle_db:.2f} dB"))
         return rows
 
+    def data(self) -> dict[str, Any]:
+        """Return the scores with their names, for programs."""
+        motion = self.trajectory
+        return {
+            "corner_error_px": {name: getattr(motion, f"{name}_px") for name in ("mean", "median", "p95", "max")},
+            "located_share": motion.located_share,
+            "within_three_std_share": self.honest_share,
+            "rotation": _given(self.rotation, "mean_deg", "max_deg", "focal_error", "focal_std"),
+            "panorama": _given(self.panorama, "psnr_db", "ssim", "compared_share"),
+            "oracle": _given(self.oracle, "psnr_db", "ssim", "compared_share"),
+            "below_oracle_db": self.below_oracle_db,
+        }
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the summary of a batch shows."""
+        return {"true_error_px": self.trajectory.mean_px, "psnr_db": None if self.panorama is None else self.panorama.psnr_db}
+
     def _repr_html_(self) -> str:
         return facts(self.rows())
+
+
+def _given(score: ImageScore | RotationScore | None, *names: str) -> dict[str, float | None] | None:
+    return None if score is None else {name: getattr(score, name) for name in names}
 
 
 def evaluate(run_folder: Path | str, truth_path: Path | str, render: Render | None = None) -> Evaluation:

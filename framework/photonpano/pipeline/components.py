@@ -12,7 +12,7 @@ from typing import Any
 
 from photonpano.capture import Capture, capture_of, part_of
 from photonpano.contracts.attribution import attributed
-from photonpano.contracts.protocols import PoseEstimator, Resampler, Source, light_of
+from photonpano.contracts.protocols import Resampler, Source, light_of
 from photonpano.contracts.requirements import shown
 from photonpano.corrections import Mask, corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
@@ -147,14 +147,13 @@ def build_levels(plan: Plan, source: Source, decisions: Journal, shortened: int 
     )
 
 
-def build_pose_estimator(plan: Plan, source: Source, decisions: Journal) -> PoseEstimator:
-    """Build the pose estimator of a plan that has one; `decisions` receives its choices."""
+def build_finder(plan: Plan, source: Source, decisions: Journal) -> Any:
+    """Build what finds something else than a panorama, for a plan of such a kind; `decisions` receives its choices."""
     from photonpano.pipeline.summary import summarise  # imports OpenCV, which is not needed to check a spec
 
-    assert plan.pose is not None
+    assert plan.finder is not None
     capture = _Once(lambda: summarise(source, thread_count(plan.run.threads)))
-    estimator: PoseEstimator = built(plan.pose, stage_context(plan, source, Recorder(decisions), capture), "the capture")
-    return estimator
+    return built(plan.finder, stage_context(plan, source, Recorder(decisions), capture), "the capture")
 
 
 def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:

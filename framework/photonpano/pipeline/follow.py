@@ -151,8 +151,9 @@ def _followable(plan: Plan) -> Callable[[Any], Any]:
     """Return the function that opens the part of the capture that has arrived: an `Arrived`, or a `Piped`."""
     contribution, config = plan.source.contribution, plan.source.config
     assert isinstance(contribution, SourceContribution)
-    if plan.pose is not None:
-        raise InputError("a spec with 'pose' cannot be followed: poses need the whole capture; run it without --follow")
+    if plan.kind is not None:
+        why = f"{plan.kind.name} need the whole capture; run it without --follow"
+        raise InputError(f"a spec with {plan.kind.section!r} cannot be followed: {why}")
     if contribution.arrived is None:
         raise InputError(
             f"{plan.source.label} cannot read a capture that is still being written; run it without --follow once it is "

@@ -1,11 +1,11 @@
-"""One run: begin, estimate the motion, refine and judge it, render the panorama, and end; or find the poses instead."""
+"""One run: begin, estimate the motion, refine and judge it, render the panorama, and end; or let another kind of run do it."""
 
 from __future__ import annotations
 
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -29,15 +29,15 @@ from photonpano.pipeline.follow import followed
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.obstacles import naming_obstacles, order_warning, run_others
 from photonpano.pipeline.passes import build_refiners, refine
-from photonpano.pipeline.pose_run import counts_of, estimate_poses, judge_poses, poses_record, poses_warnings, write_pose_files
 from photonpano.pipeline.rendering import render_into
 from photonpano.pipeline.run_folder import RunFolder, run_folder, write_exposures
 from photonpano.pipeline.state import State
 from photonpano.pipeline.summary import require_photons
+from photonpano.plugins.contributions import RunKindContribution
 from photonpano.record.contents import capture_files, fingerprint
-from photonpano.record.run_json import level_record, peak_memory_bytes, record_of, started_record, verdict_of, verdict_record
+from photonpano.record.run_json import level_record, peak_memory_bytes, record_of, started_record, verdict_of
 from photonpano.record.schema import CaptureRecord, RunRecord
-from photonpano.report import OpenCapture, render_failure, render_pose_report, render_report
+from photonpano.report import OpenCapture, render_failure, render_report
 from photonpano.report.notebook import ShownReport, run_html
 from photonpano.residuals.findings import Findings
 from photonpano.residuals.verdict import judge
@@ -58,9 +58,10 @@ class RunResult:
     Attributes:
         directory: the run folder.
         record: the content of its `run.json`.
-        verdict: whether motion and panorama, or the poses, explain the photons.
+        verdict: whether motion and panorama, or what was found instead, explain the photons.
         was_finished: whether `resume` found that nothing was left to do.
         others: the runs of the other shots of the capture, longer ones first; those that failed are missing.
+        kind: that of a run that finds something else than a panorama; None for a panorama.
     """
 
     directory: Path
@@ -68,10 +69,16 @@ class RunResult:
     verdict: Verdict | None
     was_finished: bool = False
     others: tuple[RunResult, ...] = ()
+    kind: RunKindContribution | None = field(default=None, repr=False)
+
+    @property
+    def rows(self) -> Sequence[tuple[str, str]]:
+        """What a kind of run shows of its results, with names; nothing for a panorama."""
+        return () if self.kind is None else self.kind.runs.rows(self.record)
 
     def _repr_html_(self) -> str:
         """Show picture, verdict and files in a notebook, and those of other shots."""
-        return run_html(self.directory, self.record) + "".join(each._repr_html_() for each in self.others)
+        return run_html(self.directory, self.record, self.rows) + "".join(each._repr_html_() for each in self.others)
 
     def viewer(self, height_px: int = 900) -> ShownReport:
         """Return the report with its viewer, some megabytes, which a notebook shows as the last line of a cell.
@@ -93,7 +100,7 @@ def run(
     follow: bool = False,
     end_after: float = END_AFTER_S,
 ) -> RunResult:
-    """Run a plan and write its run folder: panorama, coverage, trajectory, record and report; or poses, for a plan with `pose`.
+    """Run a plan and write its run folder: panorama, coverage, trajectory, record and report; or what its `kind` finds.
 
     Where the capture holds shots that nothing ties together, the longest is run, and then each other one into a folder of its
     own: `runs/scan.panorama-2` beside `runs/scan`, and so on, longer ones first. One that fails is a warning.
@@ -105,7 +112,7 @@ def run(
         resume: go on with a run of the same spec, capture and versions that was interrupted. If it was finished, its results
             are returned.
         from_level: take the levels before this one from the run before, whose work was kept; compute this one and what follows.
-            The work is kept again. A run of poses keeps no work.
+            The work is kept again. Only a run for a panorama keeps work.
         keep_work: keep what each level has found, beside the run folder, for `from_level`.
         follow: follow a capture that is still being written: run the frames that are there, and write a page with the panorama
             so far to the folder `DIR.live` beside the run folder. Once the capture is complete, it is run as any other.
@@ -127,8 +134,8 @@ def run(
             return run(complete, progress, overwrite=overwrite, keep_work=keep_work)
     with begun_run(plan, usual(progress), Continuation(resume, from_level, keep_work), overwrite=overwrite) as begun:
         if not begun.was_finished:
-            (make_panorama if plan.pose is None else find_poses)(begun)
-    result = RunResult(plan.output.directory, begun.record, begun.verdict, begun.was_finished)
+            (make_panorama if plan.kind is None else plan.kind.runs.run)(begun)
+    result = RunResult(plan.output.directory, begun.record, begun.verdict, begun.was_finished, kind=plan.kind)
     again = partial(run, progress=progress, overwrite=overwrite, resume=resume, from_level=from_level, keep_work=keep_work)
     return replace(result, others=tuple(run_others(plan, result.record, again, usual(progress))))
 
@@ -153,23 +160,6 @@ def make_panorama(run: BegunRun) -> None:
     record = record_of(run.started_record(), plan, state.results, explained, verdict, panorama, chosen, findings)
     light, capture = light_of(source), OpenCapture(source, state.results)
     run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)
-
-
-def find_poses(run: BegunRun) -> None:
-    """Estimate the poses, write their files, and end the run."""
-    plan, source, start = run.plan, run.source, time.perf_counter()
-    with naming_obstacles(source):
-        found = estimate_poses(plan, source, run.journal, run.progress)
-    run.observers.stage_finished(None, "pose", time.perf_counter() - start, counts_of(found))
-    files = write_pose_files(run.folder.staging, found, source.info, plan.output.exposures)
-    verdict = judge_poses(found)
-    record: RunRecord = {
-        **run.started_record(),
-        "poses": poses_record(found, verdict),
-        "verdict": verdict_record(verdict),
-        "warnings": [*poses_warnings(found), *files],
-    }
-    run.end(record, lambda record: render_pose_report(record, found), verdict)
 
 
 def _last_decisions(state: State, findings: Findings) -> Iterator[Decision]:
@@ -237,8 +227,9 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
     The block ends the run, unless it was finished before. If the block fails, a report of that lies beside the run folder,
     which stays as it was.
     """
-    if plan.pose is not None and (how.keep or how.from_level is not None):
-        raise InputError("a run with `pose` has no levels to keep or to go on from: leave out --keep-work and --from-level")
+    if plan.kind is not None and (how.keep or how.from_level is not None):
+        no_levels = f"a run with `{plan.kind.section}` has no levels to keep or to go on from"
+        raise InputError(f"{no_levels}: leave out --keep-work and --from-level")
     observers, read = Observers(plan.observers, plan.output.directory), [*capture_files(plan), *filter(None, [plan.file])]
     with (
         observers.watching(plan.document) as finished,
@@ -268,11 +259,11 @@ def failure_path(directory: Path) -> Path:
 
 
 def _work(run: BegunRun, how: Continuation) -> AbstractContextManager[Work | None]:
-    """Open the work folder of a run; poses are found in one step, of which nothing is kept."""
+    """Open the work folder of a run; one that finds something else than a panorama does it in one step, and keeps nothing."""
     plan = run.plan
-    if plan.pose is not None:
+    if plan.kind is not None:
         if how.resume:
-            run.progress.note("a run with `pose` keeps no work: it begins anew")
+            run.progress.note(f"a run with `{plan.kind.section}` keeps no work: it begins anew")
         return nullcontext()
     depends_on = run_fingerprint(plan, run.capture, run.source.info.frame_shape)
     return work_folder(plan.output.directory, depends_on, how, run.progress)

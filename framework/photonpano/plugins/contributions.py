@@ -23,10 +23,10 @@ from photonpano.contracts.protocols import (
     Locator,
     Merger,
     Piped,
-    PoseEstimator,
     Refiner,
     Renderer,
     Resampler,
+    RunKind,
     Source,
 )
 from photonpano.errors import CaptureUnreadError
@@ -148,7 +148,7 @@ class Kind:
     """One kind of component. Hooks, the reader of specs, the JSON Schema and the conformance kit go by this row."""
 
     name: str  # what a component of this kind is, such as `locator`
-    section: str  # where a spec chooses it, such as `locate` or `output.formats`
+    section: str  # where a spec chooses it, such as `locate` or `output.formats`; empty for kinds of runs
     # the record that the hook yields; what its `build` returns is the interface of the component
     contribution: type[Any] = field(repr=False)
     default: str | None = None  # the component that a spec uses if it names none
@@ -409,16 +409,28 @@ class ExporterContribution(
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseEstimatorContribution(
-    StageContribution,
-    kind="pose-estimator",
-    section="pose",
-    meaning="instead of a panorama, the pose of each frame of a camera that travels through a scene: a name, or {use, with}. "
-    "The sections of the panorama do not apply then. Experimental",
-):
-    """Offers a pose estimator. Experimental: the record may change with any version."""
+class RunKindContribution(Contribution, kind="run-kind", section=""):
+    """Offers a kind of run that finds something else than a panorama. Experimental: the record may change with any version.
 
-    build: Callable[[Any, StageContext], PoseEstimator]
+    Its name is what it finds, in the plural, such as "poses": messages have it, and `run.json` has what was found under it.
+    """
+
+    build: Callable[[Any, Any], RunKind]
+    # the record of the components that find it: a spec with their section asks for such a run, and has none of a panorama
+    component: type[StageContribution]
+    file: str  # the file by which the run folder of such a run is known, such as "poses.npz"
+    truth: str = ""  # the array by which the truth of its captures is known, such as "camera_from_world"
+    config: type[Config] = Config
+
+    @property
+    def section(self) -> str:
+        """The section of a spec that asks for such a run."""
+        return KINDS[self.component.kind].section
+
+    @property
+    def runs(self) -> RunKind:
+        """What does such runs, with the libraries that it needs."""
+        return self.build(self.config(), None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ByteSize, TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
-from photonpano.plugins.contributions import KINDS, Contribution
+from photonpano.plugins.contributions import KINDS, Contribution, RunKindContribution
 from photonpano.text import byte_size, listed
 
 Schema: TypeAlias = "Mapping[str, Any]"  # A JSON Schema, or a part of one
@@ -207,6 +207,8 @@ class ConfigRow:
 
 def snippet(contribution: Contribution) -> str:
     """Return the section of a spec that uses a component, with all defaults; a key that is required has a value `<...>`."""
+    if isinstance(contribution, RunKindContribution):
+        return f"{contribution.section}:\n  use: <{contribution.component.kind}>\n"
     outer, _, inner = KINDS[contribution.kind].section.partition(".")
     if inner:
         keys = {row.key: row for row in config_rows(contribution.config) if "." not in row.key and row.default != _COMPUTED}

@@ -26,10 +26,10 @@ from photonpano.plugins.contributions import (
     InterpolatorContribution,
     LocatorContribution,
     MergerContribution,
-    PoseEstimatorContribution,
     RefinerContribution,
     RendererContribution,
     ResamplerContribution,
+    RunKindContribution,
     SourceContribution,
     hookspec,
 )
@@ -116,11 +116,11 @@ def photonpano_exporters() -> Iterable[ExporterContribution]:
 
 
 @hookspec
-def photonpano_pose_estimators() -> Iterable[PoseEstimatorContribution]:
-    """Offer pose estimators: they find the pose of each frame of a camera that travels through a scene. Experimental.
+def photonpano_run_kinds() -> Iterable[RunKindContribution]:
+    """Offer kinds of runs that find something else than a panorama, such as poses. Experimental.
 
-    A run with `pose` calls its estimator once, and has no levels. If there are no poses to be found, that is a
-    `LocationError`. Example: `docs/reference/plugins.md#photonpano_pose_estimators`.
+    A spec with the section of such a kind asks for it, and a run calls it once. The kind of component that finds it has a hook
+    as well, without arguments. Example: `docs/reference/plugins.md#photonpano_run_kinds`.
     """
     return ()
 
@@ -148,7 +148,7 @@ def photonpano_run_started(directory: Path, spec: Mapping[str, Any]) -> None:
 def photonpano_stage_finished(
     directory: Path, level: int | None, stage: str, seconds: float, summary: Mapping[str, float | None]
 ) -> None:
-    """Watch a stage end: all four when a level is done, then "render"; in a run with `pose` only "pose".
+    """Watch a stage end: all four when a level is done, then "render"; a kind of run has stages of its own.
 
     Arguments, what `summary` has for each stage, and example: `docs/reference/plugins.md#photonpano_stage_finished`.
     """

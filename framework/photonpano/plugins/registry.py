@@ -16,11 +16,21 @@ import pluggy
 
 from photonpano.errors import PluginError, described
 from photonpano.plugins import hookspecs
-from photonpano.plugins.contributions import API_VERSION, KINDS, PROJECT, Contribution, Kind, Requirement, install_command
+from photonpano.plugins.contributions import (
+    API_VERSION,
+    KINDS,
+    PROJECT,
+    Contribution,
+    Kind,
+    Requirement,
+    RunKindContribution,
+    hookspec,
+    install_command,
+)
 from photonpano.text import listed, suggestion
 
 PREFIX = f"{PROJECT}_"
-# All hooks: those that offer components, in the order in which a run needs these, and those that watch.
+# The hooks of the framework: those that offer components, in the order in which a run needs these, and those that watch.
 HOOKS = tuple(name for name in vars(hookspecs) if name.startswith(PREFIX))
 # The hooks that offer nothing: a run calls them, so that a plugin can watch it.
 OBSERVATION_HOOKS = tuple(name for name in HOOKS if name not in {kind.hook for kind in KINDS.values()})
@@ -62,11 +72,14 @@ def _registered(plugin: object) -> pluggy.PluginManager:
     """Register a plugin with a manager of its own, so that its mistakes affect no other plugin."""
     manager = pluggy.PluginManager(PROJECT)
     manager.add_hookspecs(hookspecs)
+    of_plugins = [kind.hook for kind in KINDS.values() if kind.hook not in HOOKS]
+    for name in of_plugins:
+        manager.add_hookspecs(type(name, (), {name: hookspec(lambda: ())}))
     for name in dir(plugin):
         if not name.startswith(PREFIX) or not callable(getattr(plugin, name)):
             continue
-        if name not in HOOKS:  # which pluggy would ignore
-            raise PluginError(f"there is no hook {name!r}; known: {listed(HOOKS)}")
+        if name not in (*HOOKS, *of_plugins):  # which pluggy would ignore
+            raise PluginError(f"there is no hook {name!r}; known: {listed((*HOOKS, *of_plugins))}")
         if manager.parse_hookimpl_opts(plugin, name) is None:
             raise PluginError(f"{name} is not marked with @photonpano.hookimpl")
     try:
@@ -187,6 +200,12 @@ class Catalog:
     disabled: tuple[DisabledPlugin, ...] = ()  # the plugins that were not imported, so that their components are not known
     observers: tuple[Observer, ...] = ()  # the plugins that watch runs
 
+    @property
+    def run_kinds(self) -> dict[str, RunKindContribution]:
+        """The kinds of runs on offer that find something else than a panorama, by the sections that ask for them."""
+        offered = (entry.contribution for entry in self.rows)
+        return {each.section: each for each in offered if isinstance(each, RunKindContribution)}
+
     def names(self, kind: str) -> tuple[str, ...]:
         """Return the names on offer for a kind, such as "locator", in alphabetical order."""
         return tuple(sorted({entry.name for entry in self.rows if entry.kind == kind}))
@@ -203,8 +222,8 @@ class Catalog:
         """Look a component up, whether or not its libraries are installed: see `Entry.unavailable`.
 
         Args:
-            kind: "source", "resampler", "merger", "locator", "interpolator", "refiner", "renderer", "exporter",
-                "pose-estimator" or "executor".
+            kind: "source", "resampler", "merger", "locator", "interpolator", "refiner", "renderer", "exporter", "run-kind",
+                "executor", or a kind that a plugin has defined.
             name: the name of the component in specs.
 
         Raises:

@@ -1,1 +1,1 @@
-"""What a run leaves as files: `run.json` and its schema, fingerprints of captures, pictures, and poses for other programs."""
+"""What a run leaves as files: `run.json` and its schema, fingerprints of captures, and pictures."""

@@ -50,12 +50,12 @@ class BatchRow:
         was_finished: whether the run was finished before, so that nothing was left to do.
         verdict: "trusted" or "doubtful"; None unless the run is done.
         reason: why it failed, is doubtful, or has no score; empty if there is nothing to say.
-        reduced_chi2: how well the panorama explains the photons, see `photonpano.Verdict`; None for poses.
-        expected_error_px: expected corner error of the motion, in px of a frame; None for poses.
+        reduced_chi2: how well the panorama explains the photons, see `photonpano.Verdict`; None without a panorama.
+        expected_error_px: expected corner error of the motion, in px of a frame; None without a panorama.
         true_error_px: mean corner error against the truth beside the capture, in px of a frame; None without a truth.
         psnr_db: of the panorama against the true scene, in dB; None without a true scene.
-        expected_position_error: expected error of the positions of poses, as a share of the length of the path; None for a
-            panorama.
+        expected_position_error: expected error of the positions of the camera, as a share of the length of the path; None for
+            a panorama.
         true_position_error: their error against the truth, as a share of the length of the path; None without a truth.
         n_frames: frames of the capture.
         seconds: time that the run took.

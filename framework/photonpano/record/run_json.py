@@ -136,7 +136,6 @@ def started_record(
         "peak_memory_bytes": peak_memory_bytes(),
         "capture": capture,
         "rendered_from": None,
-        "poses": None,
     }
 
 
@@ -380,8 +379,8 @@ def peak_memory_bytes() -> int | None:
 def _choices(plan: Plan) -> Iterator[tuple[str, Choice]]:
     """Yield the sections of a spec with the component that each chooses, level by level."""
     yield "source", plan.source
-    if plan.pose is not None:
-        yield "pose", plan.pose
+    if plan.kind is not None and plan.finder is not None:
+        yield plan.kind.section, plan.finder
         return
     for level in plan.levels:
         yield from (("resample", level.resample), ("merge", level.merge), ("locate", level.locate))

@@ -185,15 +185,14 @@ class ReasonRecord(TypedDict):
 
 
 class VerdictRecord(TypedDict):
-    """Whether motion and panorama, or poses, explain the photons.
+    """Whether motion and panorama, or what was found instead, explain the photons.
 
     `status` is "trusted" or "doubtful". `residual_ratio` is the scatter of the shifts of short spans of frames, in units of
-    what noise explains: about 1 if nothing is left. None if there are too few frames to tell. Of poses it is the median
-    distance of points from where exposures show them, in units of what photon noise explains, None where the pose estimator
-    does not know that noise. `reduced_chi2` is how well the panorama explains the photons of spans, without the share that they
-    have in it themselves: 1 where only photon noise is left; None for poses. `untested` lists the tests that could not be made,
-    and why, in clauses that begin with "whether"; `notes` is what was found, too, that is too small to make motion or panorama
-    wrong.
+    what noise explains: about 1 if nothing is left. None if there are too few frames to tell. Another kind of run
+    has residuals of its own there. `reduced_chi2` is how well the panorama explains the photons of spans, without the share
+    that they have in it themselves: 1 where only photon noise is left; None without a panorama. `untested` lists the tests
+    that could not be made, and why, in clauses that begin with "whether"; `notes` is what was found, too, that is too small to
+    make motion or panorama wrong.
     """
 
     status: str
@@ -202,32 +201,6 @@ class VerdictRecord(TypedDict):
     untested: NotRequired[Sequence[str]]
     notes: NotRequired[Sequence[ReasonRecord]]
     reduced_chi2: NotRequired[float | None]
-
-
-class LostFramesRecord(TypedDict):
-    """Frames whose pose was not found, as a half-open span [start, stop), and why."""
-
-    frames: Sequence[int]
-    reason: str
-
-
-class PosesRecord(TypedDict):
-    """The poses of a camera that travels.
-
-    `located` counts frames. `std_position` and `std_rotation_deg` are the expected errors of the located frames, root mean
-    square; the length of the path is 1. They are None where the estimator knows none. `points` and `exposures` count those of
-    `sparse`; `levels` is what the pose estimator records, and `doubts` are the reasons of the verdict as sentences.
-    """
-
-    camera: CameraRecord
-    located: int
-    std_position: float | None
-    std_rotation_deg: float | None
-    points: int
-    exposures: int
-    lost: Sequence[LostFramesRecord]
-    levels: Sequence[Mapping[str, float | int | str | None]]
-    doubts: Sequence[str]
 
 
 class FileContent(TypedDict):
@@ -265,8 +238,9 @@ class CaptureRecord(TypedDict):
 class RunRecord(TypedDict):
     """The content of `run.json`.
 
-    `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none, as one of poses, which has `poses`
-    instead; that is None elsewhere. `findings` are those of a panorama, by the names of the fields of `Findings`.
+    `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none, as one of another kind, which has
+    what it found under the name of its kind instead. `findings` are those of a panorama, by the names of the fields of
+    `Findings`.
     `peak_memory_bytes` is None where the system does not report it.
     `capture` is the fingerprint of what was read; `files` lists the other files of the run folder.
     `rendered_from` is the run folder whose motion was rendered again, None where the motion was estimated.
@@ -296,4 +270,3 @@ class RunRecord(TypedDict):
     capture: CaptureRecord
     files: NotRequired[Mapping[str, FileContent]]
     rendered_from: str | None
-    poses: PosesRecord | None

@@ -6,4 +6,3 @@ from .other_pages import render_failure as render_failure
 from .other_pages import render_live as render_live
 from .page import OpenCapture as OpenCapture
 from .page import render_report as render_report
-from .pose_page import render_pose_report as render_pose_report

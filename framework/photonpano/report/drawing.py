@@ -272,19 +272,19 @@ def jpeg_uri(image: NDArray[np.uint8], quality: int = _JPEG_QUALITY) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
-def filled(template: str, **values: Any) -> str:
-    """Return the page that a template makes of its values."""
-    page: str = _environment().get_template(template).render(**values)
+def filled(template: str, package: str = "photonpano.report", /, **values: Any) -> str:
+    """Return the page that a template of a package makes of its values; it may extend those of this one."""
+    page: str = _environment(package).get_template(template).render(**values)
     return page
 
 
 @cache
-def _environment() -> Environment:
-    """Return the environment of the templates, with filters that write numbers."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+def _environment(package: str) -> Environment:
+    """Return the environment of the templates of a package, with filters that write numbers."""
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
-        loader=PackageLoader("photonpano.report"),
+        loader=ChoiceLoader([PackageLoader(each) for each in (package, "photonpano.report")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from html import escape
 from pathlib import Path
 
@@ -30,9 +30,9 @@ class ShownReport:
         return f'<iframe title="report" style="{style}" srcdoc="{escape(self._page)}"></iframe>'
 
 
-def run_html(folder: Path, record: RunRecord) -> str:
-    """Return what a notebook shows of a run; a picture that is no longer there is left out."""
-    return _picture(folder / "panorama.png") + facts(_rows(record, from_here(folder)))
+def run_html(folder: Path, record: RunRecord, own: Iterable[tuple[str, str]] = ()) -> str:
+    """Return what a notebook shows of a run, with rows of its `own`; a picture that is no longer there is left out."""
+    return _picture(folder / "panorama.png") + facts(_rows(record, from_here(folder), own))
 
 
 def _picture(path: Path) -> str:
@@ -46,9 +46,9 @@ def _picture(path: Path) -> str:
     return picture_of_png(png.tobytes(), "the panorama")
 
 
-def _rows(record: RunRecord, place: Path) -> Iterator[tuple[str, str]]:
+def _rows(record: RunRecord, place: Path, own: Iterable[tuple[str, str]]) -> Iterator[tuple[str, str]]:
     source, panorama, verdict = record["source"], record["panorama"], record["verdict"]
-    motion, poses = record["motion"], record["poses"]
+    motion = record["motion"]
     frames = counted(source["n_frames"], "frame")
     if verdict is not None:
         judged = verdict_of(verdict)
@@ -63,8 +63,7 @@ def _rows(record: RunRecord, place: Path) -> Iterator[tuple[str, str]]:
         yield "panorama", f"{panorama['height']}x{panorama['width']} px, of which {seen} were seen"
     if motion is not None:
         yield "expected error", f"{pixels(motion['std_px'])} px, and {pixels(motion['worst_std_px'])} px in the worst frame"
-    if poses is not None:
-        yield "poses", f"of {poses['located']:,} of {frames}"
+    yield from own
     yield "time", duration(record["seconds"])
     yield "run folder", str(place)
     if "report.html" in record["files"]:

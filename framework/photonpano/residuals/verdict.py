@@ -231,7 +231,7 @@ def _standing(run: TestedRun) -> Found:
 @FACTS.doubtful_above(
     0.5,
     "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
-    "keep away from what is near, or ask for the poses of a camera that travels (pose); the motion may be that of either part",
+    "keep away from what is near, or find the path of the camera in place of a panorama; the motion may be that of either part",
 )
 def _layers(run: TestedRun) -> Found | None:
     # Later levels leave out what is near.

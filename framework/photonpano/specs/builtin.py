@@ -35,7 +35,7 @@ def check_stream(plan: Plan, info: StreamInfo) -> list[Problem]:
 
     Reads no data. What levels share is reported once, and each problem at its place in the spec.
     """
-    choices = [] if plan.pose is None else [plan.pose]
+    choices = [] if plan.finder is None else [plan.finder]
     for level in plan.levels:
         choices += [level.resample, level.merge, level.locate, level.interpolate, *level.fallbacks]
     found: dict[tuple[str, str], Problem] = {}
@@ -81,19 +81,15 @@ def complaints(choice: Choice, *stream: StreamInfo) -> tuple[str, ...]:
 _TURNING = ("rotation", "auto")  # the models that may find that a camera turns
 
 
-def check_settings(found: dict[str, Any], posed: bool, spec: Spec) -> None:
+def check_settings(found: dict[str, Any], spec: Spec) -> None:
     """Check the settings of each section, None where they have problems, against each other; problems go to the spec."""
-    motion, camera, output, render, run = (found[name] for name in ("motion", "camera", "output", "render", "run"))
+    motion, camera, output, render = (found[name] for name in ("motion", "camera", "output", "render"))
     if motion is not None and camera is not None:
-        _check_camera(motion, camera, posed, spec)
-    if output is not None and output.exposures and not posed:
-        message = "true needs a section `pose`: a panorama has no exposures with poses; remove it"
+        _check_camera(motion, camera, spec)
+    if output is not None and output.exposures and spec.kind is None:
+        sections = listed((f"`{section}`" for section in spec.catalog.run_kinds), "or") or "of a plugin"
+        message = f"true needs a section {sections}: of a panorama, keep: exposures writes them; remove it"
         spec.wrong(spec.root.at("output", "exposures"), message)
-    if output is not None and output.keep is not None and posed:
-        message = "exposures are those of the levels of a panorama; remove it, or write exposures: true"
-        spec.wrong(spec.root.at("output", "keep"), message)
-    if run is not None and run.time_limit is not None and posed:
-        spec.wrong(spec.root.at("run", "time_limit"), "a pose estimator cannot end early; remove it")
     if (
         motion is not None
         and render is not None
@@ -104,8 +100,8 @@ def check_settings(found: dict[str, Any], posed: bool, spec: Spec) -> None:
         spec.wrong(spec.root.at("render", "projection"), message)
 
 
-def _check_camera(motion: MotionSettings, camera: CameraSettings, posed: bool, spec: Spec) -> None:
-    """Refuse what planar models and pose estimators cannot find of the camera, and a start that rotations do not have."""
+def _check_camera(motion: MotionSettings, camera: CameraSettings, spec: Spec) -> None:
+    """Refuse what planar models and other kinds of runs cannot find of the camera, and a start that rotations do not have."""
     if motion.model == "rotation" and motion.start != "none":
         message = f"{motion.start} is a start of planar models, not of motion.model: rotation"
         spec.wrong(spec.root.at("motion", "start"), message)
@@ -114,23 +110,25 @@ def _check_camera(motion: MotionSettings, camera: CameraSettings, posed: bool, s
         spec.wrong(spec.root.at("motion", "prior"), message)
     elif motion.prior is not None and not motion.prior.imu.is_file():
         spec.wrong(spec.root.at("motion", "prior", "imu"), f"there is no file {motion.prior.imu}; check the path")
-    if motion.model in _TURNING and not posed:
+    if motion.model in _TURNING and spec.kind is None:
         return
     unfindable = "find needs motion.model: rotation or auto, which measure the camera; give a number here"
     without_focal = "distortion is in units of the focal length: give camera.focal_px"
-    if posed:
-        unfindable = "find does not apply with `pose`: calibrate the lens, or measure it in a run with motion.model: rotation"
+    if spec.kind is not None:
+        instead = "calibrate the lens, or measure it in a run with motion.model: rotation"
+        unfindable = f"find does not apply with `{spec.kind.section}`: {instead}"
     else:
         without_focal += ", or take motion.model: rotation or auto"
     distortion, written = camera.distortion.model_dump(), spec.root.at("camera", "distortion")
     for key, number in distortion.items():
         if number == "find":
             spec.wrong(written.at(key), unfindable)
-    if camera.focal_px == "find" and any(number != 0 and not (posed and number == "find") for number in distortion.values()):
+    known = (number for number in distortion.values() if spec.kind is None or number != "find")
+    if camera.focal_px == "find" and any(known):
         spec.wrong_key(written, without_focal)
 
 
-def check_flat_field(corrections: Iterable[Correction], levels: Iterable[LevelPlan], posed: bool, spec: Spec) -> None:
+def check_flat_field(corrections: Iterable[Correction], levels: Iterable[LevelPlan], spec: Spec) -> None:
     """Refuse a flat field where nothing can be divided by it."""
     index = next((place for place, each in enumerate(corrections) if isinstance(each, FlatField)), None)
     if index is None:
@@ -138,8 +136,8 @@ def check_flat_field(corrections: Iterable[Correction], levels: Iterable[LevelPl
     mergers = [level.merge.contribution for level in levels]
     refusing = [each.name for each in mergers if isinstance(each, MergerContribution) and not each.accepts_corrected_sums]
     written = spec.root.at("corrections", index)
-    if posed:
-        spec.wrong(written, "flat-field does not apply with `pose`: it is measured along a panorama; remove it")
+    if spec.kind is not None:
+        spec.wrong(written, f"flat-field does not apply with `{spec.kind.section}`: it is measured along a panorama; remove it")
     elif refusing:
         message = f"flat-field divides sums of frames, and {refusing[0]!r} merges single frames; choose another merger"
         spec.wrong(written, message)

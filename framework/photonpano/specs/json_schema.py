@@ -39,7 +39,7 @@ def json_schema(catalog: Catalog) -> Schema:
     A name that two plugins offer is left out, since using it is an error.
     """
     offered = Counter((entry.kind, entry.name) for entry in catalog.rows)
-    entries = [entry for entry in catalog.rows if offered[entry.kind, entry.name] == 1]
+    entries = [entry for entry in catalog.rows if offered[entry.kind, entry.name] == 1 and KINDS[entry.kind].section]
     models: list[type[BaseModel]] = [*(entry.contribution.config for entry in entries), LevelSettings, *SETTINGS.values()]
     models += CORRECTIONS.values()
     unique = dict.fromkeys(models)
@@ -50,7 +50,7 @@ def json_schema(catalog: Catalog) -> Schema:
         definitions[_definition(reference)]["type"] = SECTION
     definitions[OutputSettings.__name__].pop("required")  # the run folder has a default that depends on the spec's name
     sections, overrides = {}, {}
-    for kind in KINDS.values():
+    for kind in filter(lambda kind: kind.section, KINDS.values()):
         own = [entry for entry in entries if entry.kind == kind.name]
         sections[kind.section] = (
             _component(kind, own, schemas, kind.default) if not kind.meaning else _items(kind, own, schemas)
@@ -78,7 +78,7 @@ def json_schema(catalog: Catalog) -> Schema:
         "type": "object",
         "additionalProperties": False,
         "required": ["version", "source"],
-        "if": {"required": ["pose"]},
+        "if": {"anyOf": [{"required": [section]} for section in catalog.run_kinds] or [False]},
         "then": {"properties": dict.fromkeys(PANORAMA_ONLY, False)},
         "properties": {
             "version": {"const": VERSION, "description": "the version of the format"},

@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from photonpano.corrections import Correction
 from photonpano.errors import InputError, Problem
-from photonpano.plugins.contributions import KINDS, Config, Contribution
+from photonpano.plugins.contributions import KINDS, Config, Contribution, RunKindContribution
 from photonpano.plugins.description import (
     Schema,
     alternative,
@@ -54,6 +54,17 @@ class Spec:
     recognised: Decision | None = None  # the source that recognised the capture, where the spec leaves it open
     remark: str = ""  # added to the message of every problem
 
+    @property
+    def kind(self) -> RunKindContribution | None:
+        """The kind of run that the spec asks for; None for a panorama."""
+        kinds = self.catalog.run_kinds.items()
+        return next((kind for section, kind in kinds if section in self.root.data), None)
+
+    @property
+    def sections(self) -> tuple[str, ...]:
+        """All sections, those of kinds of runs included."""
+        return (*SECTIONS, *self.catalog.run_kinds)
+
     def wrong(self, value: Written, message: str) -> None:
         """Report a problem with a value."""
         place = value.place
@@ -83,7 +94,7 @@ class Spec:
 
     def unknown_key(self, key: str, section: Written, known: Iterable[str]) -> str:
         """Return the message for an unknown key: where it belongs, else the nearest of the keys that are known."""
-        if key in SECTIONS:
+        if key in self.sections:
             return f"unknown key; `{key}` is a section of its own, not part of another"
         here = re.sub(r"levels\.\d+\.", "", section.place.where)
         if homes := [f"`{home}`" for home in self._homes(key) if home != here]:
@@ -199,7 +210,7 @@ class Plan:
 
     source: Choice  # the capture
     corrections: tuple[Correction, ...]  # the corrections of its frames, in order
-    levels: tuple[LevelPlan, ...]  # one plan for each level, in order; none with `pose`, which has no refiners either
+    levels: tuple[LevelPlan, ...]  # one plan for each level, in order; none with a `kind`, which has no refiners either
     refine: tuple[Choice, ...]  # the refiners that correct the motion after the last level, in order
     renderer: Choice  # the component that renders the panorama
     formats: tuple[Choice, ...]  # the exporters that write it as files of other formats
@@ -221,8 +232,9 @@ class Plan:
     observers: tuple[Observer, ...] = ()  # the plugins that watch the run
     recognised: Decision | None = None  # the source that recognised the capture, where the spec leaves it open
     corrects_itself: bool = False  # `corrections` is `auto`: the run masks what stands still, and divides by a vignette
-    # the pose estimator, which takes the place of the levels, of refiners and of the panorama; None for a panorama
-    pose: Choice | None = None
+    # the kind of a run that finds something else than a panorama, and what finds it, in the place of levels and refiners
+    kind: RunKindContribution | None = None
+    finder: Choice | None = None
 
     def having(self, section: str, **values: Any) -> Plan:
         """Return this plan with other values of keys of a section; for `source`, of keys of its component."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from photonpano.errors import SpecError
-from photonpano.plugins.contributions import KINDS
+from photonpano.plugins.contributions import KINDS, RunKindContribution
 from photonpano.specs.builtin import check_flat_field, check_settings, complaints
 from photonpano.specs.components import AUTO, ComponentResolver, Stage, resolved_corrections, written_corrections
 from photonpano.specs.plan import Choice, LevelPlan, Plan, Spec, validate
@@ -17,7 +17,6 @@ from photonpano.specs.settings import (
     MAX_LEVELS,
     NOT_SETTINGS,
     PANORAMA_ONLY,
-    SECTIONS,
     SETTINGS,
     STAGES,
     UNTIL_CONVERGED,
@@ -42,15 +41,15 @@ class _Resolver:
     """Resolves one spec; every method adds the problems that it finds to the spec, and goes on."""
 
     def __init__(self, root: Written, spec: Spec) -> None:
-        self.posed = "pose" in root.data
-        self.root = spec.root = _without_panorama(root, spec) if self.posed else root
+        self.root = spec.root = root if spec.kind is None else _without_panorama(root, spec, spec.kind)
         self.spec = spec
         self.components = ComponentResolver(spec)
 
     def plan(self) -> Plan | None:
         """Resolve every section; None if there are problems."""
         spec, root, components = self.spec, self.root, self.components
-        spec.check_keys(root, SECTIONS)
+        run_kind = spec.kind
+        spec.check_keys(root, spec.sections)
         version = root.at("version")
         if "version" not in root.data:
             spec.wrong_key(version, f"required: {VERSION}, the version of the format")
@@ -69,17 +68,21 @@ class _Resolver:
         renderer = self.renderer()
         formats = components.items(KINDS["exporter"], root.at("output", "formats"))
         exporters = components.formats(formats)
-        executor, pose = root.at("run", "executor").spelled_out(), root.at("pose").spelled_out()
+        executor = root.at("run", "executor").spelled_out()
         works = None if executor.data is None else components.item(KINDS["executor"], executor)
-        poser = components.item(KINDS["pose-estimator"], pose.having({}) if pose.data is None else pose) if self.posed else None
+        of_kind, finder = {}, None
+        if run_kind is not None:
+            found = root.at(run_kind.section).spelled_out()
+            of_kind[run_kind.section] = found
+            finder = components.item(KINDS[run_kind.component.kind], found.having({}) if found.data is None else found)
         written = root.having({"light": root.at("light").spelled_out("mode")})
         settings: dict[str, Any] = {
             name: validate(model, written.at(name).without(*NOT_SETTINGS.get(name, ())), spec)
             for name, model in SETTINGS.items()
         }
-        check_settings(settings, self.posed, spec)
-        check_flat_field(corrections or (), plans, self.posed, spec)
-        if source.choice is None or renderer is None or (self.posed and poser is None) or spec.problems:
+        check_settings(settings, spec)
+        check_flat_field(corrections or (), plans, spec)
+        if source.choice is None or renderer is None or (run_kind is not None and finder is None) or spec.problems:
             return None
         spelled_out = stages | {"source": source}
         sections = {name: stage.section for name, stage in spelled_out.items() if stage.section} | {
@@ -87,13 +90,13 @@ class _Resolver:
             "levels": Written([level for level, _ in levels], root.at("levels").place),
             "output": written.at("output").having({"formats": Written(formats, root.at("output", "formats").place)}),
             "run": written.at("run").having({"executor": executor}),
-            "pose": pose,
+            **of_kind,
         }
         plan = Plan(
             source.choice,
             corrections or (),
-            () if self.posed else tuple(plans),
-            () if self.posed else tuple(filter(None, refiners)),
+            () if run_kind else tuple(plans),
+            () if run_kind else tuple(filter(None, refiners)),
             renderer,
             exporters,
             works,
@@ -105,7 +108,8 @@ class _Resolver:
             observers=spec.catalog.observers,
             recognised=spec.recognised,
             corrects_itself=corrections is None,
-            pose=poser,
+            kind=run_kind,
+            finder=finder,
         )
         return replace(plan, document=document_of(plan, stages))
 
@@ -152,18 +156,22 @@ class _Resolver:
         return spelled_out, LevelPlan(**choices, fallbacks=selected["locate"].fallbacks, scale=settings.scale)
 
 
-def _without_panorama(root: Written, spec: Spec) -> Written:
-    """Refuse the sections that do not apply with `pose`, and return the others."""
+def _without_panorama(root: Written, spec: Spec, kind: RunKindContribution) -> Written:
+    """Refuse the sections that do not apply to a kind of run without a panorama, and return the others."""
+    without = f"does not apply with `{kind.section}`"
     for key in PANORAMA_ONLY:
         if key in root.data:
-            message = "does not apply with `pose`, which finds poses instead of a panorama; remove it, or remove `pose`"
+            message = f"{without}, which finds {kind.name} instead of a panorama; remove it, or remove `{kind.section}`"
             spec.wrong_key(root.at(key), message)
-    formats, executor = root.at("output", "formats"), root.at("run", "executor")
-    if formats.data is not None:
-        message = "does not apply with `pose`: there is no panorama to write; `photonpano export` writes poses"
-        spec.wrong_key(formats, message)
-    if executor.data is not None:
-        spec.wrong_key(executor, "does not apply with `pose`: poses are found in threads of one process")
+    keys = {
+        ("output", "formats"): f"there is no panorama to write; {kind.name} are written in all their formats",
+        ("output", "keep"): "exposures are those of the levels of a panorama; remove it, or write exposures: true",
+        ("run", "executor"): f"{kind.name} are found in threads of one process",
+        ("run", "time_limit"): f"a {kind.component.kind.replace('-', ' ')} cannot end early; remove it",
+    }
+    for path, why in keys.items():
+        if root.at(*path).data is not None:
+            spec.wrong_key(root.at(*path), f"{without}: {why}")
     own = root.without(*PANORAMA_ONLY)
     return own.having({"output": own.at("output").without("formats")}) if "output" in own.data else own
 
@@ -178,15 +186,15 @@ def document_of(plan: Plan, stages: Mapping[str, Stage]) -> dict[str, Any]:
         **chosen,
         "refine": [_component(refiner) for refiner in plan.refine],
         "levels": UNTIL_CONVERGED if plan.until_converged else [_level(level, chosen) for level in plan.levels],
-        **({} if plan.pose is None else {"pose": _component(plan.pose)}),
+        **({} if plan.kind is None or plan.finder is None else {plan.kind.section: _component(plan.finder)}),
         **{name: getattr(plan, name).model_dump(mode="json") for name in SETTINGS},
     }
     document["render"] = _component(plan.renderer) | document["render"]
     document["run"] |= {} if plan.executor is None else {"executor": _component(plan.executor)}
     document["output"] |= {"formats": [_component(each) for each in plan.formats]}
-    inapplicable = ("exposures",) if plan.pose is None else ("formats", "keep")
+    inapplicable = ("exposures",) if plan.kind is None else ("formats", "keep")
     document["output"] = {key: value for key, value in document["output"].items() if key not in inapplicable}
-    return document if plan.pose is None else {key: document[key] for key in document if key not in PANORAMA_ONLY}
+    return document if plan.kind is None else {key: document[key] for key in document if key not in PANORAMA_ONLY}
 
 
 def _stage(name: str, choice: Any, fallbacks: Iterable[Choice]) -> dict[str, Any]:

@@ -119,10 +119,10 @@ class DistortionSettings(Config):
 
 
 class CameraSettings(Config):
-    """The camera, for the model rotation and for poses, and its lens."""
+    """The camera and its lens."""
 
     focal_px: Literal["find"] | Annotated[float, Field(ge=10, le=1e6)] = Field(
-        "find", description="focal length in px of a frame; find measures it, for the model rotation and for poses"
+        "find", description="focal length in px of a frame; find measures it, but not for planar models"
     )
     centre_px: tuple[float, float] | None = Field(
         None, description="(x, y) of the principal point, in px of a frame; by default the middle of the frames"
@@ -207,7 +207,8 @@ class OutputSettings(Config):
         "follows if `--set` chooses one"
     )
     exposures: bool = Field(
-        False, description="with `pose`: whether the exposures whose poses were found are written, as pictures in images/"
+        False,
+        description="of a run without a panorama: whether its exposures are written, as pictures in images/",
     )
     keep: Literal["exposures"] | None = Field(
         None,
@@ -257,7 +258,7 @@ SETTINGS: dict[str, type[BaseModel]] = {
 # The keys that choose a component; and those of the framework's own sections that do.
 CHOICE = ("use", "with")
 NOT_SETTINGS = {"render": CHOICE, "output": ("formats",), "run": ("executor",)}
-# All sections of a spec, in the order in which they are written.
-SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", "pose", *SETTINGS)
-# The sections that do not apply with `pose`.
+# The sections of a spec, in the order in which they are written; each kind of run that a plugin offers adds its own.
+SECTIONS = ("version", "source", "corrections", *STAGES, "refine", "levels", *SETTINGS)
+# The sections that do not apply to a run that finds something else than a panorama.
 PANORAMA_ONLY = (*STAGES, "refine", "levels", "motion", "light", "graph", "render")

@@ -10,7 +10,6 @@ from .images import MergerConformance as MergerConformance
 from .images import RendererConformance as RendererConformance
 from .locators import LocatorConformance as LocatorConformance
 from .motions import InterpolatorConformance as InterpolatorConformance
-from .motions import PoseEstimatorConformance as PoseEstimatorConformance
 from .motions import RefinerConformance as RefinerConformance
 from .motions import ResamplerConformance as ResamplerConformance
 from .sources import SourceConformance as SourceConformance

@@ -307,7 +307,7 @@ def lit_probability(flux: FloatArray | np.float64) -> FloatArray:
 
 
 def _to_scene(frame: float) -> Homography:
-    """Return the pose of the moving camera, which pans by 0.1 px and rolls by 0.02 degrees per frame."""
+    """Return where the moving camera looks, which pans by 0.1 px and rolls by 0.02 degrees per frame."""
     roll = rolled(0.02 * (frame - N_FRAMES / 2), SHAPE)
     return np.asarray(translation(300 + 0.1 * frame, -80 + 0.04 * frame) @ roll)
 

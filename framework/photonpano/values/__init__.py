@@ -24,16 +24,11 @@ from .frames import Still as Still
 from .frames import StreamInfo as StreamInfo
 from .frames import true_spans as true_spans
 from .motion import Ambiguity as Ambiguity
-from .motion import CameraGuess as CameraGuess
 from .motion import Edge as Edge
 from .motion import Located as Located
-from .motion import LostFrames as LostFrames
 from .motion import NotLocated as NotLocated
 from .motion import Patches as Patches
-from .motion import PosedView as PosedView
-from .motion import PoseEstimate as PoseEstimate
 from .motion import Refined as Refined
-from .motion import ScenePoints as ScenePoints
 from .motion import SpanResiduals as SpanResiduals
 from .verdict import Reason as Reason
 from .verdict import Verdict as Verdict

@@ -45,12 +45,12 @@ class Verdict:
     Attributes:
         status: "trusted" or "doubtful".
         reasons: why it is doubtful, the most telling first.
-        residual_ratio: in units of what noise explains, for a panorama the scatter of the shifts of short spans, and for poses
-            the residuals of points in exposures; None if it is unknown.
+        residual_ratio: in units of what noise explains, for a panorama the scatter of the shifts of short spans, and for other
+            kinds of runs residuals of their own; None if it is unknown.
         untested: which tests could not be made, and why: clauses that begin with "whether".
         notes: what else was found; it is too small to make the motion or the panorama wrong.
         reduced_chi2: of the photons against the panorama, on average over the spans, without what a span adds to the panorama
-            itself; 1 if only photon noise is left. None for poses.
+            itself; 1 if only photon noise is left. None without a panorama.
     """
 
     status: Literal["trusted", "doubtful"]

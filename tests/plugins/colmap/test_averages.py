@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from photonpano import CameraGuess, FrameSpan, LocationError, OutputError, StageContext, StreamInfo, discover
-from photonpano.evaluation import pose_errors
+from photonpano import FrameSpan, LocationError, OutputError, StageContext, StreamInfo, discover
 from photonpano.execution.context import Quiet
 from photonpano.geometry import camera_matrix
 from photonpano.testing import MemorySource
-from photonpano.testing.motions import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
+from photonpano_poses import CameraGuess, pose_errors
+from photonpano_poses.testing import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
 
 pytest.importorskip("pycolmap")
 

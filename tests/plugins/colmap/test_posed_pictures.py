@@ -7,21 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonpano import (
-    Config,
-    FrameSpan,
-    PosedView,
-    PoseEstimate,
-    PoseEstimatorContribution,
-    ScenePoints,
-    discover,
-    export,
-    run,
-)
+from photonpano import Config, FrameSpan, discover, run
 from photonpano.geometry import Camera, camera_matrix, transform_points
 from photonpano.specs import parse_spec
 from photonpano.testing.captures import Scene
-from photonpano.testing.motions import FOCAL_PX, N_POSES, POSES_SHAPE, true_poses
+from photonpano_poses import PosedView, PoseEstimate, PoseEstimatorContribution, ScenePoints, export
+from photonpano_poses.testing import FOCAL_PX, N_POSES, POSES_SHAPE, true_poses
 
 pycolmap = pytest.importorskip("pycolmap")
 

@@ -7,11 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from photonpano import CameraGuess, FrameSpan, Group, StageContext
-from photonpano.evaluation import pose_errors
+from photonpano import FrameSpan, Group, StageContext
 from photonpano.execution.context import Quiet
 from photonpano.geometry import Camera, positions_of, rotation_matrices
-from photonpano.testing.motions import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
+from photonpano_poses import CameraGuess, pose_errors
+from photonpano_poses.testing import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
 
 pytest.importorskip("pycolmap")
 pytest.importorskip("gtsam")

@@ -151,5 +151,5 @@ def test_disabling_unknown_plugin_is_logged(words, message, disabled, install, m
     install("alpha", "1.2", GOOD)
     monkeypatch.setenv("PHOTONPANO_DISABLE_PLUGINS", words)
     assert len(of_toys(discover().disabled)) == disabled
-    known = "alpha, colmap, core, dask, direct, framework, kornia, opencv, photonpano, sensors, simulator and zarr"
+    known = "alpha, colmap, core, dask, direct, framework, kornia, opencv, photonpano, poses, sensors, simulator and zarr"
     assert caplog.messages == ([f"PHOTONPANO_DISABLE_PLUGINS {message.format(known=known)}"] if message else [])

@@ -11,23 +11,16 @@ import numpy as np
 import pytest
 import typer
 
-from photonpano import (
-    FrameSpan,
-    PosedView,
-    PoseEstimate,
-    PoseEstimatorContribution,
-    ScenePoints,
-    SourceContribution,
-    StageContext,
-)
+from photonpano import FrameSpan, SourceContribution, StageContext
 from photonpano.api.cli.errors import reported
 from photonpano.geometry import camera_matrix, translation
 from photonpano.pipeline.run import run
 from photonpano.plugins.contributions import KINDS as OF_CATALOG
 from photonpano.plugins.registry import Catalog, Observer, discover, make_entry
 from photonpano.specs import parse_spec
-from photonpano.testing import KnownMotion, MemorySource, Scene, motions
+from photonpano.testing import KnownMotion, MemorySource, Scene
 from photonpano.testing.captures import recorded
+from photonpano_poses import PosedView, PoseEstimate, PoseEstimatorContribution, ScenePoints, testing
 
 from .strange import FRAMES, KINDS, ORIGIN, SHAPE, Keys, Outcome
 
@@ -84,9 +77,9 @@ def known_path(context: StageContext) -> KnownPath:
         poses = np.tile(np.eye(3, 4), (FRAMES, 1, 1))
         poses[:, 0, 3] = -np.linspace(0, 1, FRAMES)
         return KnownPath(poses, camera_matrix(60, (31.5, 23.5)), SHAPE)
-    poses = motions.true_poses()
+    poses = testing.true_poses()
     poses[:, :, 3] += 0.001 * np.random.default_rng(0).normal(size=(len(poses), 3))
-    return KnownPath(poses, camera_matrix(motions.FOCAL_PX, (79.5, 63.5)), motions.POSES_SHAPE)
+    return KnownPath(poses, camera_matrix(testing.FOCAL_PX, (79.5, 63.5)), testing.POSES_SHAPE)
 
 
 @pytest.fixture(scope="package")

@@ -13,13 +13,13 @@ from photonpano import (
     InterpolatorContribution,
     LocatorContribution,
     MergerContribution,
-    PoseEstimatorContribution,
     RefinerContribution,
     RendererContribution,
     ResamplerContribution,
     SourceContribution,
 )
 from photonpano.plugins.registry import Origin
+from photonpano_poses import PoseEstimatorContribution
 
 ORIGIN = Origin("strange-plugin", "1.2", "strange = strange.hooks")
 SHAPE, FRAMES = (48, 64), 160

@@ -29,7 +29,8 @@ from photonpano.geometry import from_parameters, inverse, normalised, parameters
 from photonpano.merging import MergeRenderer
 from photonpano.testing import KnownMotion, MemorySource, SourceConformance
 from photonpano.testing.conformance import Conformance
-from photonpano.testing.motions import REFERENCE, SHAPE, capture
+from photonpano.testing.motions import REFERENCE, SHAPE
+from photonpano_poses.testing import PoseEstimatorConformance, capture
 
 from .conftest import known_path
 from .strange import Around, around, given, instead
@@ -123,7 +124,7 @@ GOOD: Mapping[Any, Build] = {
     testing.InterpolatorConformance: Straight,
     testing.RefinerConformance: Steps,
     testing.RendererConformance: renderer,
-    testing.PoseEstimatorConformance: lambda context: given("estimate", turning_refused)(known_path(context)),
+    PoseEstimatorConformance: lambda context: given("estimate", turning_refused)(known_path(context)),
 }
 
 
@@ -177,7 +178,7 @@ def at_given(change: Callable[[np.ndarray], Any]) -> Build:
 
 
 def estimates(change: Callable[[Any], dict[str, Any]]) -> Build:
-    return after(testing.PoseEstimatorConformance, "estimate", lambda it, *_: replace(it, **change(it)))
+    return after(PoseEstimatorConformance, "estimate", lambda it, *_: replace(it, **change(it)))
 
 
 def reads(method: str, answer: Callable[[Any, FrameSpan], Any]) -> Build:
@@ -374,7 +375,7 @@ BROKEN: Mapping[Any, Mapping[str, Build]] = {
             renderer(context)
         ),
     },
-    testing.PoseEstimatorConformance: {
+    PoseEstimatorConformance: {
         "estimate_finds_the_poses": estimates(lambda it: {"camera_from_world": np.roll(it.camera_from_world, 80, axis=0)}),
         "estimate_is_deterministic": estimates(
             lambda it: {"camera_from_world": it.camera_from_world + next(NUMBERS) * np.eye(3, 4, 3)}

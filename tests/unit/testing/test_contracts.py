@@ -12,11 +12,13 @@ import pytest
 
 from photonpano import FrameSpan, Group, NotLocated, Refined, testing
 from photonpano.geometry import translation
+from photonpano_poses.testing import PoseEstimatorConformance
 
 from .strange import KINDS, NOTHING, SHAPE, Around, Outcome, around, holed, instead, require_named
 
 Change: TypeAlias = Callable[[Any], Any]
 KITS = {kit.kind: kit for name in testing.__all__ if name.endswith("Conformance") for kit in [getattr(testing, name)]}
+KITS["pose-estimator"] = PoseEstimatorConformance
 
 
 def answer(method: str, **parts: Callable[[Any], Any]) -> Change:

@@ -1,9 +1,17 @@
-"""The program `photonpano`. The module of a command is imported when it is used: that keeps `--help` fast."""
+"""The program `photonpano`. The module of a command is imported when it is used: that keeps `--help` fast.
+
+Plugins add commands by entry points of the group `photonpano.commands`: the name of a command, and the module that declares it.
+"""
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cached_property
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -27,7 +35,6 @@ _COMMANDS = {
     "compare": ("judging", "Lay runs of one capture side by side."),
     "render": ("rendering", "Render a finished run again, with other settings."),
     "video": ("rendering", "Make a video along the motion of a finished run."),
-    "export": ("export", "Write poses of a camera for other programs, and pictures with them."),
     "clean": ("run_folders", "Remove what killed processes have left."),
     "convert": ("copies", "Convert binary frames to a packed .npy file or a zarr array."),
     "dark": ("copies", "Measure dark counts and hot pixels, with the lens covered."),
@@ -39,7 +46,20 @@ _COMMANDS = {
     "plugins list": ("plugins", "List components that a spec can use, with their plugins."),
     "plugins show": ("plugins", "Describe a component: its keys, and YAML to paste."),
 }
+_OFFERED = "photonpano.commands"  # the entry-point group
 _GROUPS = {"plugins": "List and describe the components of the installed plugins."}
+
+
+def _offered() -> dict[str, tuple[str, str]]:
+    """Return the modules of the commands of plugins, and the first line of each, which is read without importing it."""
+    offered = {}
+    for each in entry_points(group=_OFFERED):
+        with suppress(ModuleNotFoundError, SyntaxError):  # a damaged plugin costs its own commands only
+            spec = find_spec(each.value)
+            text = Path(spec.origin).read_text(encoding="utf-8") if spec is not None and spec.origin else ""
+            first, _, _ = (ast.get_docstring(ast.parse(text)) or "").partition("\n")
+            offered[each.name] = (each.value, first)
+    return offered
 
 
 class _Command(TyperCommand):
@@ -51,7 +71,7 @@ class _Command(TyperCommand):
 
     @cached_property
     def loaded(self) -> Any:
-        return loaded(self.words, f"photonpano.api.{self._module}")
+        return loaded(self.words, self._module)
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
         return self.loaded.make_context(*arguments, **options)
@@ -70,7 +90,8 @@ class _Program(_Commands):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         groups = {}
-        for words, (module, summary) in _COMMANDS.items():
+        own = {words: (f"photonpano.api.{module}", summary) for words, (module, summary) in _COMMANDS.items()}
+        for words, (module, summary) in (own | _offered()).items():
             group, _, _ = words.rpartition(" ")
             if group and group not in groups:
                 help_of_group: Any = {"help": _GROUPS[group], "no_args_is_help": True, "rich_markup_mode": None}

@@ -7,7 +7,6 @@ from .motion import LocatesTurns as LocatesTurns
 from .motion import Locator as Locator
 from .motion import Merger as Merger
 from .motion import PanoramaView as PanoramaView
-from .motion import PoseEstimator as PoseEstimator
 from .motion import Refiner as Refiner
 from .motion import Resampler as Resampler
 from .motion import Trajectory as Trajectory
@@ -15,6 +14,8 @@ from .motion import camera_of_motion as camera_of_motion
 from .panorama import Exporter as Exporter
 from .panorama import FinishedPanorama as FinishedPanorama
 from .panorama import Renderer as Renderer
+from .runs import RunKind as RunKind
+from .runs import Score as Score
 from .sources import Arrived as Arrived
 from .sources import Closing as Closing
 from .sources import ColouredSource as ColouredSource

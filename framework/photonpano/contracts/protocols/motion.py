@@ -1,4 +1,4 @@
-"""The interfaces of the components that estimate motion: the four steps of a level, refiners, and pose estimators."""
+"""The interfaces of the components that estimate motion: the four steps of a level, and refiners."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photonpano.contracts.protocols.sources import Source
-from photonpano.execution.context import Progress
 from photonpano.values import (
-    CameraGuess,
     FloatArray,
     Group,
     Homography,
     Located,
     NotLocated,
-    PoseEstimate,
     Refined,
     SpanResiduals,
     VirtualExposure,
@@ -205,22 +202,4 @@ class Refiner(Protocol):
 
         Returns:
             None if the photons show nothing to correct.
-        """
-
-
-class PoseEstimator(Protocol):
-    """Estimates where a camera was in each frame, in six degrees of freedom (paper, section 6). Experimental."""
-
-    def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
-        """Estimate the poses of a capture.
-
-        The framework refuses an estimate with poses for frames that are not located, or without poses for those that are.
-
-        Args:
-            source: the capture.
-            camera: what the spec says about it; what it gives stays as it is.
-            progress: receives stages and messages.
-
-        Raises:
-            LocationError: there are no poses to be found; the message says why, with numbers, and what to do.
         """

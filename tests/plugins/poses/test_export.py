@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from photonpano import InputError, OutputError, export
+from photonpano import InputError, OutputError
 from photonpano.geometry import Camera, rotation_matrices
+from photonpano_poses import export
 
 SHAPE = (60, 90)
 N_FRAMES = 20

@@ -1,28 +1,72 @@
-"""The poses of a run with `pose`: estimate them, write their files, describe them for `run.json`, and judge them."""
+"""A run with `pose`: estimate the poses, write their files, describe them for `run.json`, judge them, and end the run."""
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from photonpano.contracts.protocols import Source
-from photonpano.errors import OutputError
-from photonpano.execution.context import Progress
+from photonpano import FloatArray, FluxImage, OutputError, Plan, StreamInfo, Verdict
+from photonpano.contracts.attribution import blaming
 from photonpano.geometry import Camera, positions_of
 from photonpano.photometry import tone_mapped
-from photonpano.pipeline.components import build_pose_estimator
+from photonpano.pipeline.components import build_finder
 from photonpano.pipeline.estimate import require_centre
+from photonpano.pipeline.obstacles import naming_obstacles
+from photonpano.pipeline.run import BegunRun
 from photonpano.record.picture_files import png_of
-from photonpano.record.poses import Poses, colmap, in_standard_world, nerfstudio, ply, tum
-from photonpano.record.schema import PosesRecord
-from photonpano.specs.plan import Plan
-from photonpano.values import CameraGuess, FloatArray, FluxImage, Journal, PoseEstimate, StreamInfo, Verdict
+from photonpano.record.run_json import verdict_record
+from photonpano.text import counted
 from photonpano.values.verdict import Found, Test, judged
+from photonpano_poses.contract import CameraGuess, PoseEstimate, require_poses
+from photonpano_poses.files import Poses, colmap, in_standard_world, nerfstudio, ply, tum
+from photonpano_poses.page import render_pose_report
+from photonpano_poses.scores import PoseScore, evaluate_poses
 
 _WHITE_QUANTILE = 0.995  # quantile of the flux of an exposure that is white in its picture
 _SHOWN_LOST = 3  # spans of lost frames that a warning names
+_FEW = 0.1  # if fewer positions lie within 3 expected errors, the truth is probably of another capture
+logger = logging.getLogger("photonpano")
+
+
+class PoseRuns:
+    """Does runs with `pose`, and describes them: a `RunKind`."""
+
+    def run(self, run: BegunRun) -> None:
+        """Estimate the poses, write their files, and end the run."""
+        plan, source, start = run.plan, run.source, time.perf_counter()
+        require_centre(plan, source)
+        with naming_obstacles(source):
+            estimator = build_finder(plan, source, run.journal)
+            estimate = estimator.estimate(source, camera_guess(plan), run.progress)
+            with blaming(estimator):
+                found = in_standard_world(require_poses(estimate, source))
+        run.observers.stage_finished(None, "pose", time.perf_counter() - start, counts_of(found))
+        files = write_pose_files(run.folder.staging, found, source.info, plan.output.exposures)
+        verdict = judge_poses(found)
+        warnings, of_poses = [*poses_warnings(found), *files], {"poses": poses_record(found, verdict)}
+        record: Any = {**run.started_record(), **of_poses, "verdict": verdict_record(verdict), "warnings": warnings}
+        run.end(record, lambda record: render_pose_report(record, found), verdict)
+
+    def rows(self, record: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Return how many frames have a pose."""
+        return [("located", f"{record['poses']['located']:,} of {counted(record['source']['n_frames'], 'frame')}")]
+
+    def figures(self, record: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the expected error of the positions."""
+        return {"expected_position_error": record["poses"]["std_position"]}
+
+    def evaluate(self, run_folder: Path, truth: Path) -> PoseScore:
+        """Score the poses of a run, and warn of a truth that is probably that of another capture."""
+        score = evaluate_poses(run_folder, truth)
+        if score.honest_shares is not None and score.honest_shares[2] < _FEW:
+            share = f"{100 * score.honest_shares[2]:.0f} % of the positions are within 3 std_position"
+            logger.warning("%s: is %s of this capture?", share, truth)
+        return score
 
 
 def camera_guess(plan: Plan) -> CameraGuess:
@@ -30,13 +74,6 @@ def camera_guess(plan: Plan) -> CameraGuess:
     camera, given = plan.camera, plan.camera.distortion.model_dump()
     k1, k2, p1, p2 = (float(given[name]) for name in ("k1", "k2", "p1", "p2"))
     return CameraGuess(None if camera.focal_px == "find" else camera.focal_px, camera.centre_px, (k1, k2, p1, p2))
-
-
-def estimate_poses(plan: Plan, source: Source, journal: Journal, progress: Progress) -> PoseEstimate:
-    """Return the poses, checked, in a world in which the path has the length 1; `journal` receives decisions."""
-    require_centre(plan, source)
-    estimator = build_pose_estimator(plan, source, journal)
-    return in_standard_world(estimator.estimate(source, camera_guess(plan), progress))
 
 
 def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:
@@ -65,15 +102,11 @@ def view_names(estimate: PoseEstimate, n_frames: int) -> tuple[str, ...]:
 
 def _write(folder: Path, estimate: PoseEstimate, stream: StreamInfo) -> None:
     camera = Camera(estimate.camera_matrix, estimate.distortion)
+    saved = ("camera_from_world", "camera_matrix", "distortion", "located", "std_position", "std_rotation_deg")
     np.savez(
         folder / "poses.npz",
         allow_pickle=False,
-        camera_from_world=estimate.camera_from_world,
-        camera_matrix=estimate.camera_matrix,
-        distortion=estimate.distortion,
-        located=estimate.located,
-        std_position=estimate.std_position,
-        std_rotation_deg=estimate.std_rotation_deg,
+        **{name: getattr(estimate, name) for name in saved},
         frame_shape=np.array(stream.frame_shape),
         frame_rate_hz=np.array(np.nan if stream.frame_rate_hz is None else stream.frame_rate_hz),
     )
@@ -125,10 +158,13 @@ def counts_of(estimate: PoseEstimate) -> Mapping[str, int]:
     }
 
 
-def poses_record(estimate: PoseEstimate, verdict: Verdict) -> PosesRecord:
-    """Describe an estimate and the doubts of its verdict, in a world in which the path has the length 1."""
+def poses_record(estimate: PoseEstimate, verdict: Verdict) -> dict[str, Any]:
+    """Describe an estimate and the doubts of its verdict for `run.json`, in a world in which the path has the length 1.
+
+    Expected errors are those of the located frames, root mean square; None where the estimator knows none.
+    """
     camera = Camera(estimate.camera_matrix, estimate.distortion)
-    counts, std_focal_px = counts_of(estimate), float(estimate.std_focal_px)
+    std_focal_px = float(estimate.std_focal_px)
     return {
         "camera": {
             "focal_px": camera.focal_px,
@@ -137,11 +173,9 @@ def poses_record(estimate: PoseEstimate, verdict: Verdict) -> PosesRecord:
             "distortion": camera.distortion.tolist(),
             "std_distortion": [0.0] * 4,
         },
-        "located": counts["located"],
+        **counts_of(estimate),
         "std_position": _rms(estimate.std_position[estimate.located]),
         "std_rotation_deg": _rms(estimate.std_rotation_deg[estimate.located]),
-        "points": counts["points"],
-        "exposures": counts["exposures"],
         "lost": [{"frames": [each.span.start, each.span.stop], "reason": each.reason} for each in estimate.lost],
         "levels": [dict(level) for level in estimate.levels],
         "doubts": [str(reason) for reason in verdict.reasons],

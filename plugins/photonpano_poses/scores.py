@@ -7,20 +7,20 @@ trajectory error (ATE) after the best similarity (Umeyama 1991), and the relativ
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import InputError
+from photonpano import BoolArray, FloatArray, InputError
 from photonpano.evaluation.scores import of_focal_length
 from photonpano.geometry import Camera, nearest_rotations, positions_of, rotation_vectors
 from photonpano.notebooks import facts
 from photonpano.reading import read_arrays
 from photonpano.record.contents import require_one_run
-from photonpano.values import BoolArray, FloatArray
+from photonpano_poses.contract import are_rigid
 
 POSES = "poses.npz"
 _ORTHONORMAL = 1e-3  # maximum deviation of R R^T from the identity in a pose
@@ -40,14 +40,6 @@ class RunPoses:
     std_position: FloatArray
     std_rotation_deg: FloatArray
     frame_shape: tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TruePoses:
-    """True poses of a capture, (T, 3, 4) in m, and its focal length; None if it is not known."""
-
-    camera_from_world: FloatArray
-    focal_px: float | None = None
 
 
 def has_poses(folder: Path) -> bool:
@@ -76,8 +68,8 @@ def load_run_poses(folder: Path) -> RunPoses:
     return RunPoses(Camera(matrix, distortion), poses, located, std_position, std_rotation_deg, (height, width))
 
 
-def load_true_poses(path: Path) -> TruePoses:
-    """Read an `.npz` archive of `camera_from_world` (T, 3, 4) in m, and if it is known `camera_matrix` (3, 3).
+def load_true_poses(path: Path) -> tuple[FloatArray, float | None]:
+    """Read true poses, `camera_from_world` (T, 3, 4) in m of an `.npz` archive, and the focal length; None if it has none.
 
     Raises `InputError` if the file is no such archive, or has no poses.
     """
@@ -90,7 +82,7 @@ def load_true_poses(path: Path) -> TruePoses:
     poses = _poses(path, arrays)
     _require_rigid(path, poses)
     matrix = arrays.get("camera_matrix")
-    return TruePoses(poses, None if matrix is None or matrix.shape != (3, 3) else float(matrix[0, 0]))
+    return poses, None if matrix is None or matrix.shape != (3, 3) else float(matrix[0, 0])
 
 
 def _poses(path: Path, arrays: Mapping[str, NDArray[Any]], others: tuple[str, ...] = ()) -> FloatArray:
@@ -105,9 +97,7 @@ def _poses(path: Path, arrays: Mapping[str, NDArray[Any]], others: tuple[str, ..
 
 
 def _require_rigid(path: Path, poses: FloatArray) -> None:
-    rotations = poses[:, :, :3]
-    off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(initial=0)
-    if not np.isfinite(poses).all() or not off < _ORTHONORMAL or not (np.linalg.det(rotations) > 0).all():
+    if not are_rigid(poses, _ORTHONORMAL).all():
         raise InputError(f"{path}: camera_from_world must be finite rotations and translations")
 
 
@@ -165,6 +155,15 @@ class PoseScore:
             rows.append(("focal length", of_focal_length(self.focal_error)))
         return rows
 
+    def data(self) -> dict[str, Any]:
+        """Return the scores with their names, for programs."""
+        named = {each.name: each.name for each in fields(self)} | {"honest_shares": "within_std_shares"}
+        return {named[name]: getattr(self, name) for name in named if name not in ("errors_m", "errors_deg")}
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the summary of a batch shows."""
+        return {"true_position_error": self.ate_share}
+
     def _repr_html_(self) -> str:
         return facts(self.rows())
 
@@ -185,8 +184,8 @@ def evaluate_poses(run_folder: Path | str, truth: Path | str, rpe_frames: int | 
     if rpe_frames is not None and rpe_frames < 1:
         raise ValueError(f"rpe_frames must be at least 1, got {rpe_frames}")
     require_one_run(folder, ["poses.npz"])
-    run, true = load_run_poses(folder), load_true_poses(truth)
-    n_frames, true_frames = len(run.located), len(true.camera_from_world)
+    run, (true, focal_px) = load_run_poses(folder), load_true_poses(truth)
+    n_frames, true_frames = len(run.located), len(true)
     if n_frames != true_frames:
         raise InputError(
             f"{truth} is the truth of {true_frames} frames, but the run in {folder} has {n_frames}; they belong to different "
@@ -194,10 +193,10 @@ def evaluate_poses(run_folder: Path | str, truth: Path | str, rpe_frames: int | 
         )
     frames = rpe_frames or max(1, round(_RPE_SHARE * n_frames))
     try:
-        score = pose_errors(run.camera_from_world, true.camera_from_world, run.located, frames, run.std_position)
+        score = pose_errors(run.camera_from_world, true, run.located, frames, run.std_position)
     except ValueError as error:
         raise InputError(f"{folder} and {truth} cannot be compared: {error}") from error
-    return score if true.focal_px is None else replace(score, focal_error=run.camera.focal_px / true.focal_px - 1)
+    return score if focal_px is None else replace(score, focal_error=run.camera.focal_px / focal_px - 1)
 
 
 def pose_errors(

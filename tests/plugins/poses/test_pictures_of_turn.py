@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from photonpano import InputError, export, run
+from photonpano import InputError, run
 from photonpano.pipeline.run import RunResult
 from photonpano.specs import parse_spec
+from photonpano_poses import export
 
 SHAPE, GROUP = (96, 144), 20
 LENS = {"k1": -0.1}

@@ -1,4 +1,4 @@
-"""Write the poses of a camera for programs that reconstruct scenes, and pictures with them."""
+"""Write poses of a camera for other programs, and pictures with them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from photonpano.api.command import command
 from photonpano.api.run_folders import OpenedRun, opened_run
 from photonpano.capture import with_background
 from photonpano.errors import InputError
-from photonpano.evaluation import RunPoses, RunTrajectory, has_poses, load_run_poses, load_run_trajectory
+from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.files.folders import atomic_folder, require_new
@@ -25,10 +25,11 @@ from photonpano.pipeline.film import Film
 from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import capture_files, require_one_run
 from photonpano.record.picture_files import Picture, advancing, write_pngs
-from photonpano.record.poses import POSE_FORMATS, PoseFormat, Poses, ply, read_colmap
 from photonpano.record.run_json import read_record
 from photonpano.text import counted
 from photonpano.values import FloatArray
+from photonpano_poses.files import POSE_FORMATS, PoseFormat, Poses, ply, read_colmap
+from photonpano_poses.scores import RunPoses, has_poses, load_run_poses
 
 PosedPictures = tuple[Poses, Iterator[Picture]]  # pictures are (H, W) or (H, W, 3), red first
 

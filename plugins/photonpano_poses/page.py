@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from photonpano import FloatArray
 from photonpano.geometry import nearest_rotations, positions_of
 from photonpano.photometry import linear_to_srgb
-from photonpano.record.schema import RunRecord
 from photonpano.report.drawing import (
     INK,
     MUTED,
@@ -27,13 +27,13 @@ from photonpano.report.drawing import (
     svg_of,
 )
 from photonpano.report.page import head_of
-from photonpano.values import FloatArray, PoseEstimate
+from photonpano_poses.contract import PoseEstimate
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
 
 
-def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
+def render_pose_report(record: Any, estimate: PoseEstimate) -> str:
     """Return the report of a run with `pose` as one HTML page that needs no other file, no network and no script.
 
     The path of the estimate has the length 1.
@@ -41,6 +41,7 @@ def render_pose_report(record: RunRecord, estimate: PoseEstimate) -> str:
     shape = record["source"]["height"], record["source"]["width"]
     return filled(
         "poses.html",
+        "photonpano_poses",
         **head_of(record),
         poses=record["poses"],
         path_views=path_views(estimate, shape),

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from photonpano import PoseEstimate, Reason, ScenePoints
-from photonpano.pipeline.pose_run import judge_poses
+from photonpano import Reason
+from photonpano_poses import PoseEstimate, ScenePoints
+from photonpano_poses.run import judge_poses
 
 N_FRAMES = 40
 GOOD = PoseEstimate(

@@ -17,10 +17,10 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import InputError, LocationError
+from photonpano import FloatArray, InputError, LocationError
 from photonpano.geometry import Camera, positions_of
 from photonpano.photometry import srgb_to_linear, tone_mapped
-from photonpano.values import FloatArray, PoseEstimate, ScenePoints
+from photonpano_poses.contract import PoseEstimate, ScenePoints
 
 PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "openmvg", "tum"]
 

@@ -13,25 +13,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import photonpano
-from photonpano import (
-    CameraGuess,
-    Config,
-    FrameSpan,
-    InputError,
-    LostFrames,
-    PosedView,
-    PoseEstimate,
-    PoseEstimatorContribution,
-    Reason,
-    ScenePoints,
-    discover,
-    hookimpl,
-    run,
-)
+import photonpano_poses
+from photonpano import Config, FrameSpan, InputError, Reason, discover, hookimpl, run
 from photonpano.pipeline.run import RunResult
 from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import changed_files
 from photonpano.specs import Plan, parse_spec
+from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, PoseEstimatorContribution, ScenePoints
 
 N_FRAMES, LOST = 300, FrameSpan(280, 300)
 CATALOG = discover()
@@ -168,14 +156,12 @@ def test_other_files_hold_the_same_poses(finished: RunResult, tmp_path: Path) ->
     to_world = np.array(view["transform_matrix"]) @ np.diag([1, -1, -1, 1])
     np.testing.assert_allclose(np.linalg.inv(to_world)[:3], poses[74], atol=1e-9)
     assert (folder / "points.ply").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 60\n")
-    exported = photonpano.export(folder, "tum", tmp_path / "poses", every=2)
+    exported = photonpano_poses.export(folder, "tum", tmp_path / "poses", every=2)
     assert exported.n_frames == LOST.start / 2
     np.testing.assert_allclose(np.loadtxt(tmp_path / "poses" / "trajectory.txt"), tum[::2])
 
 
-def test_doubts_and_lost_frames_are_in_record_report_and_warnings(
-    plan_of: Callable[..., Plan], tmp_path: Path, with_report: None
-) -> None:
+def test_doubts_and_lost_frames_are_in_record_report_and_warnings(plan_of: Callable[..., Plan], tmp_path: Path) -> None:
     doubt = Reason("the points lie on a plane", 120.0, 100.0, "width over depth", "move more")
     result = run(plan_of(lambda it: replace(it, doubts=(doubt,), residual_ratio=0.4)))
     record = result.record
@@ -214,7 +200,7 @@ def test_resume_of_finished_poses_returns_them_and_of_changed_ones_begins_anew_f
 
 
 def test_explain_and_check_describe_a_spec_with_pose(plan_of: Callable[..., Plan]) -> None:
-    text = photonpano.explain(plan := plan_of(), catalog=CATALOG.including(plan_of().pose.contribution))
+    text = photonpano.explain(plan := plan_of(), catalog=CATALOG.including(plan_of().finder.contribution))
     assert "pose:\n  use: toy" in text
     assert "levels" not in text
     assert plan.levels == plan.refine == ()

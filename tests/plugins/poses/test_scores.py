@@ -10,10 +10,10 @@ import tifffile
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from photonpano import InputError, evaluate_poses, evaluation
+from photonpano import InputError, evaluation
 from photonpano.api.cli.app import app
-from photonpano.evaluation import pose_errors
 from photonpano.geometry import Camera, Canvas, rotation_matrices, translation
+from photonpano_poses import evaluate_poses, pose_errors
 
 N_FRAMES, RATE = 200, 1000.0
 MATRIX = np.array([[90.0, 0, 44.5], [0, 90, 29.5], [0, 0, 1]])

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from photonpano import PoseEstimate, ScenePoints
 from photonpano.geometry import rotation_matrices
-from photonpano.record.poses import in_standard_world
+from photonpano_poses import PoseEstimate, ScenePoints
+from photonpano_poses.files import in_standard_world
 
 
 def test_standard_world_keeps_what_the_cameras_see() -> None:

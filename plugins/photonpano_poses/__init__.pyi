@@ -1,0 +1,16 @@
+from .contract import CameraGuess as CameraGuess
+from .contract import LostFrames as LostFrames
+from .contract import PosedView as PosedView
+from .contract import PoseEstimate as PoseEstimate
+from .contract import PoseEstimator as PoseEstimator
+from .contract import PoseEstimatorContribution as PoseEstimatorContribution
+from .contract import ScenePoints as ScenePoints
+from .contract import require_poses as require_poses
+from .exporting import ExportedPoses as ExportedPoses
+from .exporting import export as export
+from .run import PoseRuns as PoseRuns
+from .scores import PoseScore as PoseScore
+from .scores import align_positions as align_positions
+from .scores import evaluate_poses as evaluate_poses
+from .scores import load_run_poses as load_run_poses
+from .scores import pose_errors as pose_errors

@@ -1,0 +1,219 @@
+"""The contract of pose estimators: what they are told and find, their interface, the record that offers one, and the rules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonpano import BoolArray, FloatArray, FluxImage, FrameSpan, Progress, Reason, Source, StageContext
+from photonpano.contracts.requirements import BrokenContract, require_array, require_finite, require_instance, shown
+from photonpano.plugins.contributions import StageContribution
+
+
+@dataclass(frozen=True, slots=True)
+class CameraGuess:
+    """What is known of a camera before its poses are estimated.
+
+    Attributes:
+        focal_px: focal length in px of a frame; None if it is to be found.
+        centre_px: (x, y) of the principal point, in px of a frame, integers are pixel centres; None for the middle of a frame.
+        distortion: k1, k2, p1, p2 of the lens as OpenCV defines them, which are known.
+    """
+
+    focal_px: float | None = None
+    centre_px: tuple[float, float] | None = None
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScenePoints:
+    """Points of the scene.
+
+    Attributes:
+        positions: (N, 3) float64, in the world.
+        flux: (N,) float32, photons per pixel per frame where exposures show them; NaN where it is not known.
+    """
+
+    positions: FloatArray
+    flux: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedView:
+    """A virtual exposure whose pose was found from the points that it shows.
+
+    Attributes:
+        span: the frames that were merged.
+        instant: the instant from which it is seen, in frames.
+        camera_from_world: (3, 4), its pose.
+        points: (K,) indices of the points that were found in it.
+        xy: (K, 2) where these were found, in px of a frame with its distortion; integers are pixel centres.
+        flux: returns the exposure, (H, W) float32, photons per pixel per frame, NaN where unknown. It may read the capture.
+    """
+
+    span: FrameSpan
+    instant: float
+    camera_from_world: FloatArray
+    points: NDArray[np.intp]
+    xy: FloatArray
+    flux: Callable[[], FluxImage]
+
+
+@dataclass(frozen=True, slots=True)
+class LostFrames:
+    """Frames whose pose was not found.
+
+    Attributes:
+        span: the frames.
+        reason: a clause that completes "not located: ...", with the numbers that decided.
+    """
+
+    span: FrameSpan
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEstimate:
+    """The pose of every frame, and the points that the camera has seen.
+
+    Convention:
+        Points of the world are (x, y, z): x right, y down, z ahead. A pose (3, 4) maps them to points of the camera,
+        X_c = R X_w + t, with the same axes; ideal pixels are K X_c, integers are pixel centres. The scale and the origin of
+        the world are free: a run moves them, so that the first located camera is the origin and looks along z, and so
+        that the path of the located cameras has the length 1.
+
+    Attributes:
+        camera_matrix: (3, 3) K, in px of a frame.
+        distortion: (4,) k1, k2, p1, p2 as OpenCV defines them.
+        std_focal_px: expected error of the focal length; 0 if it was given, inf if it is not known.
+        camera_from_world: (T, 3, 4) float64; NaN where a frame is not located, never an identity.
+        located: (T,) whether the pose of a frame was found.
+        std_position: (T,) expected distance of the camera from its true place, root mean square, in units of the world; NaN
+            where not located, inf where it is not known.
+        std_rotation_deg: (T,) expected angle between the found and the true rotation, root mean square, in degrees; NaN where
+            not located, inf where it is not known.
+        points: of the scene.
+        views: the exposures whose poses were found, in order of their instants.
+        lost: the frames that are not located, with reasons.
+        levels: a record for each level: numbers and texts by name.
+        doubts: why the poses may be wrong, as far as the estimator can tell; empty if it trusts them.
+        residual_ratio: median distance of the points from where the views show them, in units of what photon noise explains;
+            None if that is not known.
+    """
+
+    camera_matrix: FloatArray
+    distortion: FloatArray
+    std_focal_px: float
+    camera_from_world: FloatArray
+    located: BoolArray
+    std_position: FloatArray
+    std_rotation_deg: FloatArray
+    points: ScenePoints
+    views: tuple[PosedView, ...] = ()
+    lost: tuple[LostFrames, ...] = ()
+    levels: tuple[Mapping[str, float | int | str | None], ...] = ()
+    doubts: tuple[Reason, ...] = ()
+    residual_ratio: float | None = None
+
+
+class PoseEstimator(Protocol):
+    """Estimates where a camera was in each frame, in six degrees of freedom (paper, section 6). Experimental."""
+
+    def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
+        """Estimate the poses of a capture.
+
+        A run refuses an estimate with poses for frames that are not located, or without poses for those that are.
+
+        Args:
+            source: the capture.
+            camera: what the spec says about it; what it gives stays as it is.
+            progress: receives stages and messages.
+
+        Raises:
+            LocationError: there are no poses to be found; the message says why, with numbers, and what to do.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseEstimatorContribution(
+    StageContribution,
+    kind="pose-estimator",
+    section="pose",
+    meaning="instead of a panorama, the pose of each frame of a camera that travels through a scene: a name, or {use, with}. "
+    "The sections of the panorama do not apply then. Experimental",
+):
+    """Offers a pose estimator. Experimental: the record may change with any version."""
+
+    build: Callable[[Any, StageContext], PoseEstimator]
+
+
+def require_poses(found: Any, source: Source) -> PoseEstimate:
+    """Return the estimate of a pose estimator; `BrokenContract` if a run refuses it."""
+    require_instance(found, PoseEstimate)
+    n_frames, located = source.info.n_frames, found.located
+    require_array("located", located, (n_frames,), "bool", "b")
+    if not located.any():
+        raise BrokenContract("no frame is located; raise a LocationError with the reason instead")
+    poses = found.camera_from_world
+    require_array("camera_from_world", poses, (n_frames, 3, 4), "float64")
+    if not np.isnan(poses[~located]).all():
+        raise BrokenContract("camera_from_world must be NaN where a frame is not located")
+    if (bent := np.flatnonzero(located)[~are_rigid(poses[located])]).size:
+        raise BrokenContract(f"the pose of frame {bent[0]} must be a finite rotation and translation")
+    for name in ("std_position", "std_rotation_deg"):
+        std = getattr(found, name)
+        require_array(name, std, (n_frames,), "float64")
+        if not ((std[located] >= 0).all() and np.isnan(std[~located]).all()):
+            raise BrokenContract(f"{name} must be 0 or more where a frame is located, inf if not known, and NaN elsewhere")
+    _require_camera(found)
+    n_points = len(found.points.positions)
+    require_finite("points.positions", found.points.positions, (n_points, 3))
+    if np.shape(found.points.flux) != (n_points,):
+        raise BrokenContract(f"expected a flux for each of {n_points} points")
+    for view in found.views:
+        _require_view(view, n_points, n_frames)
+    explained = located.copy()
+    for each in found.lost:
+        explained[each.span.start : each.span.stop] = True
+    if not explained.all():
+        raise BrokenContract(f"frame {np.argmin(explained)} is not located, and no entry of lost says why")
+    for doubt in found.doubts:
+        require_instance(doubt, Reason)
+    estimate: PoseEstimate = found
+    return estimate
+
+
+def _require_camera(found: PoseEstimate) -> None:
+    matrix = found.camera_matrix
+    require_finite("camera_matrix", matrix, (3, 3))
+    if not (min(matrix[0, 0], matrix[1, 1]) > 0 and matrix[2].tolist() == [0, 0, 1]):
+        raise BrokenContract(f"camera_matrix must have positive focal lengths, got {matrix.tolist()}")
+    require_finite("distortion", found.distortion, (4,))
+    if not found.std_focal_px >= 0:
+        raise BrokenContract(f"std_focal_px must be 0 or more, got {found.std_focal_px!r}")
+
+
+def _require_view(view: PosedView, n_points: int, n_frames: int) -> None:
+    of = f"the view of {view.span}"
+    if view.span.stop > n_frames or not view.span.start <= view.instant <= view.span.stop - 1:
+        raise BrokenContract(f"{of} is seen from the instant {view.instant:g}, or reaches beyond the capture")
+    require_finite(f"the pose of {of}", view.camera_from_world, (3, 4))
+    if not are_rigid(view.camera_from_world[None]).all():
+        raise BrokenContract(f"the pose of {of} must be a rotation and translation")
+    indices = np.asarray(view.points)
+    if indices.dtype.kind not in "iu" or ((indices < 0) | (indices >= n_points)).any():
+        raise BrokenContract(f"{of} must show points 0 to {n_points - 1}, got {shown(view.points)}")
+    require_finite(f"xy of {of}", view.xy, (len(indices), 2))
+
+
+def are_rigid(poses: FloatArray, tolerance: float = 1e-6) -> BoolArray:
+    """Return which poses (N, 3, 4) are finite, a translation and a rotation up to the largest element of R R^T - I: (N,)."""
+    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    rotations = np.where(finite[:, None, None], poses[:, :, :3], 0)
+    off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2))
+    rigid: BoolArray = finite & (off < tolerance) & (np.linalg.det(rotations) > 0)
+    return rigid
