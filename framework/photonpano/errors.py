@@ -55,7 +55,7 @@ class PluginError(PhotonpanoError):
 _LONGEST = 200  # characters of a path in a spec, or of an override, that a message shows
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
     """One thing that is wrong with a spec."""
 

@@ -151,8 +151,12 @@ class _Assembly:
         poses = PoseSpline(instants, piece.poses).at(frames)
         poses[~located] = np.nan
         apart, angles = left_out(instants, piece.poses)
-        std_position = _between(frames, instants, noise.std_position, apart, located, piece.halves.std_position)
-        std_rotation = _between(frames, instants, noise.std_rotation, angles, located, piece.halves.std_rotation)
+        std_position = _between(
+            frames, instants, noise.std_position, apart=apart, located=located, of_halves=piece.halves.std_position
+        )
+        std_rotation = _between(
+            frames, instants, noise.std_rotation, apart=angles, located=located, of_halves=piece.halves.std_rotation
+        )
         std_rotation = np.hypot(std_rotation, tilt(piece.poses, np.maximum(noise.std_position, piece.halves.std_position)))
         views = tuple(self._view(place) for place in range(len(piece.images)))
         return PoseEstimate(
@@ -322,7 +326,7 @@ def _exposure(source: Source, span: FrameSpan) -> VirtualExposure:
 
 
 def _between(
-    frames: FloatArray, instants: FloatArray, std: FloatArray, apart: FloatArray, located: BoolArray, of_halves: float
+    frames: FloatArray, instants: FloatArray, std: FloatArray, *, apart: FloatArray, located: BoolArray, of_halves: float
 ) -> FloatArray:
     """Return the expected error of each frame, from poses and interpolation between them; NaN if not located.
 

@@ -270,7 +270,7 @@ def lit_counts(source: Source, span: FrameSpan) -> Image:
 
 
 @compiled
-def _add(
+def _add(  # noqa: PLR0917
     frames: Image,
     frame_weight: Image,
     inverse_depth: Image,
@@ -371,7 +371,10 @@ def find_tremor(
         borders = np.linspace(group.start, group.stop, max(1, round(len(group) / size)) + 1).round().astype(int).tolist()
         spans = [FrameSpan(*ends) for ends in pairwise(borders)]
         maps = between(posed.pose, path.at([span.centre for span in spans]), camera.matrix)
-        return [_measured(source, *each, posed, prediction) for each in zip(spans, *maps, strict=True)]
+        return [
+            _measured(source, span, turn, shift=shift, posed=posed, predicted=prediction)
+            for span, turn, shift in zip(spans, *maps, strict=True)
+        ]
 
     found = [equations for each in pool.map(measured, exposures, predicted) for equations in each]
     if len(found) < _FEWEST:
@@ -461,7 +464,7 @@ _DIFFERENCES = [np.array(kernel, np.float32) for kernel in ([[-0.5, 0, 0.5]], [[
 
 
 def _measured(
-    source: Source, span: FrameSpan, turn: FloatArray, shift: FloatArray, posed: PosedExposure, predicted: _Prediction
+    source: Source, span: FrameSpan, turn: FloatArray, *, shift: FloatArray, posed: PosedExposure, predicted: _Prediction
 ) -> _Equations:
     """Return the motion of the camera in a span, beyond that along which its group was merged."""
     valid = capture_of(source).masked_in(span).valid.astype(np.float32)
@@ -507,7 +510,7 @@ def _add_information(predicted: _Prediction, slope_x: Image, slope_y: Image, noi
 
 
 @compiled
-def _add_residuals(
+def _add_residuals(  # noqa: PLR0917
     frames: Image, frame_weight: Image, predicted: _Prediction, turn: FloatArray, shift: FloatArray, sums: FloatArray
 ) -> None:
     """Add the right-hand side of the equations of a span, and the light that it sees, to the (8,) sums; see `path.between`."""
@@ -547,7 +550,7 @@ def _add_residuals(
 
 
 @compiled
-def _moves(row: int, column: int, q: float, lens: Lens, along_x: FloatArray, along_y: FloatArray) -> None:
+def _moves(row: int, column: int, q: float, lens: Lens, along_x: FloatArray, along_y: FloatArray) -> None:  # noqa: PLR0917
     """Write, (6,) each, how rotations about the camera's axes and translations along them move a pixel, in focal lengths."""
     x = (lens.ideal[row, column, 0] - lens.centre[0]) / lens.focal
     y = (lens.ideal[row, column, 1] - lens.centre[1]) / lens.focal

@@ -117,7 +117,7 @@ def find_patches(
 
 
 @compiled
-def _find(
+def _find(  # noqa: PLR0913, PLR0917
     template: Image,
     image: Image,
     middles: FloatArray,
@@ -238,7 +238,7 @@ class Observations:
         return Observations(self.points[which], self.views[which], self.pixels[which], self.covariance[which])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Adjusted:
     """Poses and points that agree best with all observations."""
 
@@ -268,7 +268,9 @@ def adjust(poses: FloatArray, points: FloatArray, observations: Observations, ca
     expected, shared = observations.covariance + _FLOOR_PX**2 * np.eye(2), _shared(observations)
     covariance = expected
     for _ in range(_REWEIGHTINGS):
-        graph, values = _problem(poses, points, observations, covariance * shared[:, None, None], camera, finds_focal)
+        graph, values = _problem(
+            poses, points, observations, covariance=covariance * shared[:, None, None], camera=camera, finds_focal=finds_focal
+        )
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
         if finds_focal:
             camera = Camera(camera_matrix(values.atCal3Bundler(CAMERA(0)).fx(), camera.centre_px))
@@ -294,18 +296,20 @@ def adjust(poses: FloatArray, points: FloatArray, observations: Observations, ca
     with_k1 = np.append(np.arange(last), size + 1)
     of_k1 = np.linalg.inv(information[np.ix_(with_k1, with_k1)])[-1]
     return Adjusted(
-        poses,
-        points,
-        confirmed,
-        of_views,
-        np.sqrt(moved),
-        np.sqrt(turned),
-        camera.focal_px,
-        float(np.sqrt(variances[size])) if finds_focal else 0.0,
-        float(of_k1 @ gradient[with_k1]),
-        float(np.sqrt(of_k1[-1])),
-        float(np.median(np.linalg.norm(residuals, axis=1))),
-        float(np.sqrt(np.median(np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(expected), residuals)) / _MEDIAN_OF_TWO)),
+        poses=poses,
+        points=points,
+        confirmed=confirmed,
+        information=of_views,
+        std_position=np.sqrt(moved),
+        std_rotation=np.sqrt(turned),
+        focal_px=camera.focal_px,
+        std_focal_px=float(np.sqrt(variances[size])) if finds_focal else 0.0,
+        missed_k1=float(of_k1 @ gradient[with_k1]),
+        std_k1=float(np.sqrt(of_k1[-1])),
+        residual_px=float(np.median(np.linalg.norm(residuals, axis=1))),
+        excess=float(
+            np.sqrt(np.median(np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(expected), residuals)) / _MEDIAN_OF_TWO)
+        ),
     )
 
 
@@ -313,6 +317,7 @@ def _problem(
     poses: FloatArray,
     points: FloatArray,
     observations: Observations,
+    *,
     covariance: FloatArray,
     camera: Camera,
     finds_focal: bool,

@@ -144,7 +144,7 @@ def _matches_of(moving: Features, fixed: Features, pairs: NDArray[np.intp], guid
     return Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided, moving.sizes[pairs[:, 0]])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Piece:
     """Images whose poses are connected."""
 
@@ -293,13 +293,13 @@ def _piece(found: pycolmap.Reconstruction, finds_focal: bool) -> Piece:
         observed.append((indices, xy))
     [camera] = found.cameras.values()
     return Piece(
-        np.array([_index(image.name) for image in images], np.intp),
-        np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
-        np.array([found.points3D[identifier].xyz for identifier in sorted(found.points3D)]).reshape(-1, 3),
-        tuple(observed),
-        float(camera.params[0]),
-        readings,
-        compared_halves(found, finds_focal),
+        images=np.array([_index(image.name) for image in images], np.intp),
+        poses=np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
+        points=np.array([found.points3D[identifier].xyz for identifier in sorted(found.points3D)]).reshape(-1, 3),
+        observed=tuple(observed),
+        focal_px=float(camera.params[0]),
+        readings=readings,
+        halves=compared_halves(found, finds_focal),
     )
 
 

@@ -59,7 +59,9 @@ class StratifiedEstimator:
             for number in range(2, self._config.levels + 1):
                 before = scene.path.poses
                 with progress.stage(f"level {number}: merge, locate, adjust", 1, "level") as advance:
-                    level = _refine(source, scene, len(first.views[0].span), camera, guess.focal_px is None, pool)
+                    level = _refine(
+                        source, scene, len(first.views[0].span), camera=camera, finds_focal=guess.focal_px is None, pool=pool
+                    )
                     advance(1)
                 camera = Camera(camera_matrix(level.adjusted.focal_px, camera.centre_px), camera.distortion)
                 scene = level.scene
@@ -198,7 +200,7 @@ class Merged:
     tremor: Tremor | None  # the last one found; None if the capture is too short
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _PosedLevel:
     """The exposures of a level, located."""
 
@@ -225,13 +227,13 @@ class _PosedLevel:
 
 
 def _refine(
-    source: Source, scene: Scene, group_size: int, camera: Camera, finds_focal: bool, pool: ThreadPoolExecutor
+    source: Source, scene: Scene, group_size: int, *, camera: Camera, finds_focal: bool, pool: ThreadPoolExecutor
 ) -> _PosedLevel:
     """Locate groups (paper, section 4) that are merged and registered through the depth of the scene."""
     groups = resample(scene.located, group_size)
     merged = merge(source, groups, scene, camera, pool)
     points, observations = locate(merged.exposures, camera, pool)
-    return interpolate(groups, merged, points, observations, camera, finds_focal)
+    return interpolate(groups, merged, points, observations=observations, camera=camera, finds_focal=finds_focal)
 
 
 def resample(located: BoolArray, group_size: int) -> tuple[Group, ...]:
@@ -315,6 +317,7 @@ def interpolate(
     groups: Sequence[Group],
     merged: Merged,
     points: FloatArray,
+    *,
     observations: Observations,
     camera: Camera,
     finds_focal: bool,
@@ -342,7 +345,15 @@ def interpolate(
     inner = [(before.span.stop + after.span.start - 1) / 2 for before, after in pairwise(kept)]
     borders = np.array([kept[0].span.start - 0.5, *inner, kept[-1].span.stop - 0.5])
     path = merged.path.corrected(borders, means / units)
-    return _PosedLevel(groups, located, adjusted, observations, exposures, path, merged.tremor)
+    return _PosedLevel(
+        groups=groups,
+        is_located=located,
+        adjusted=adjusted,
+        observations=observations,
+        exposures=exposures,
+        path=path,
+        tremor=merged.tremor,
+    )
 
 
 def _overlap(here: PosedExposure, there: PosedExposure, camera: Camera) -> bool:

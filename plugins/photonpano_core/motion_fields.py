@@ -233,7 +233,7 @@ def _between(image: Image, top: int, left: int, a: np.float32, b: np.float32) ->
 
 
 @compiled
-def mean_of_seen(counts: Image, weight: Image, least: float, steepest: float, area: float, mean: Image, frames: Image) -> None:
+def mean_of_seen(counts: Image, weight: Image, least: float, steepest: float, area: float, mean: Image, frames: Image) -> None:  # noqa: PLR0917
     """Divide counts by weights, (H, W), where these exceed `least`, and their gradient is below `steepest` relative to them.
 
     Writes the mean count of a frame, and the frames of one pixel whose noise equals that of an average over `area` pixels, 1 or

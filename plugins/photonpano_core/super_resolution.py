@@ -86,7 +86,7 @@ class SuperResolutionRenderer:
         self._chosen: tuple[Trajectory, FrameSpan, int] | None = None
         self._lock = Lock()
 
-    def render(
+    def render(  # noqa: PLR0917
         self,
         source: Source,
         trajectory: Trajectory,
@@ -387,7 +387,7 @@ def _photons(source: Source, lit: FluxImage, seen: FluxImage, light: LitFrames |
 
 
 @compiled
-def add_observations(
+def add_observations(  # noqa: PLR0917
     counts: FluxImage, usable: BoolArray, amounts: FluxImage, to_grid: FloatArray, first: int, lit: FluxImage, seen: FluxImage
 ) -> None:
     """Add the pixels of a sum of frames, (h, w), to the cells that their centres fall into.

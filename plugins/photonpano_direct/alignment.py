@@ -69,7 +69,7 @@ class Quality:
     patches: Patches | None  # where patches lie, in px of the layer; None without texture
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Aligned:
     """An aligned template."""
 
@@ -97,10 +97,10 @@ class Aligned:
             self.template,
             self.buffers,
             self.homography,
-            self.pixels,
-            self.weights,
-            noise_ratio,
-            _coordinates(shape),
+            pixels=self.pixels,
+            weights=self.weights,
+            noise_ratio=noise_ratio,
+            coordinates=_coordinates(shape),
         )
         patches = _patches_of(sums, self.homography, shape, common, noise_ratio) if np.isfinite(std_px) else None
         if camera_matrix is not None and np.isfinite(std_px):
@@ -112,6 +112,7 @@ def align(
     template: Layer,
     fixed: Layer,
     homography: Homography,
+    *,
     prior_mean: Homography,
     basis: FloatArray,
     tolerance_px: float,
@@ -136,7 +137,9 @@ def align(
         buffers,
     )
     if status == _CONVERGED:
-        return Aligned(template, homography, pixels, squares, weights, buffers)
+        return Aligned(
+            template=template, homography=homography, pixels=pixels, squares=squares, weights=weights, buffers=buffers
+        )
     if status == _DIVERGED:
         return NotLocated(f"the alignment diverges: {why_implausible(homography, shape, 0.0)}")
     if status == _FLAT:
@@ -164,7 +167,7 @@ def buffers_of(layer: Layer) -> Buffers:
 
 
 @compiled
-def _descend(
+def _descend(  # noqa: PLR0913, PLR0917
     moving: Layer,
     fixed: Layer,
     homography: Homography,

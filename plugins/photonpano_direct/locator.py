@@ -314,7 +314,7 @@ class _Alignment:
             start = scaled_ahead(self._camera.homographies(turned[0]))
         judged = min(JUDGED, n_layers - 1)
         coarse = self._descend(moving, fixed, start, start, range(judged, n_layers))
-        moving, coarse = self._of_majority(moving, fixed, coarse, start, judged, searches)
+        moving, coarse = self._of_majority(moving, fixed, coarse, start=start, judged=judged, searches=searches)
         fine = self._descend(moving, fixed, coarse.homography, start, range(judged))
         found = [*coarse.found, *fine.found]
         # The failure of a coarse layer does not count: the next one starts where it started.
@@ -339,10 +339,10 @@ class _Alignment:
                 moving.layers[depth],
                 fixed.layers[depth],
                 rescaled(homography, scale),
-                rescaled(prior_mean, scale),
-                basis,
-                self._config.converged_px * (1 if depth == 0 else _COARSE_TOLERANCE),
-                self._config.max_iterations,
+                prior_mean=rescaled(prior_mean, scale),
+                basis=basis,
+                tolerance_px=self._config.converged_px * (1 if depth == 0 else _COARSE_TOLERANCE),
+                max_steps=self._config.max_iterations,
             )
             if isinstance(aligned, Aligned) and aligned.overlap < self._config.min_overlap:
                 least = self._config.min_overlap
@@ -367,7 +367,7 @@ class _Alignment:
         return np.ascontiguousarray(turn_slopes(np.eye(3), matrix)), True
 
     def _of_majority(
-        self, moving: Pyramid, fixed: Pyramid, first: _Descent, start: Homography, judged: int, searches: bool
+        self, moving: Pyramid, fixed: Pyramid, first: _Descent, *, start: Homography, judged: int, searches: bool
     ) -> tuple[Pyramid, _Descent]:
         """Restrict an alignment to the larger part that follows one motion, if the images do not follow it as a whole.
 

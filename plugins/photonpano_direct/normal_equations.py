@@ -147,7 +147,7 @@ class Buffers(NamedTuple):
 
 
 @compiled
-def residuals_and_moments(
+def residuals_and_moments(  # noqa: PLR0917
     moving: Layer, fixed: Layer, homography: Homography, buffers: Buffers, moments_x: FloatArray, moments_y: FloatArray
 ) -> tuple[int, float, float]:
     """Compute the residuals of a template, their weights, and the moments of the weighted residuals times derivatives.
@@ -429,6 +429,7 @@ def information_of(
     moving: Layer,
     buffers: Buffers,
     homography: Homography,
+    *,
     pixels: int,
     weights: float,
     noise_ratio: float,

@@ -199,7 +199,7 @@ class RegistratorLocator:
         return motion_from_images(moving[0], fixed[0], found[-1], self._config, evidence=evidence)
 
     def _aligned(
-        self, layers: int, evaluations: list[int], moving: View, fixed: View, start: Homography, depth: int
+        self, layers: int, evaluations: list[int], moving: View, *, fixed: View, start: Homography, depth: int
     ) -> Homography | NotLocated:
         descent = _Descent(moving, fixed, free_parameters(depth, layers), self._device)
         with one_thread():

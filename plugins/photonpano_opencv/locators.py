@@ -175,7 +175,9 @@ class KeypointMatcher(PointLocator):
         descriptors = self._descriptors(moving, fixed)
         if initial is not None:
             predicted = transform_points(initial, moving.points)
-            pairs = match_nearby(*descriptors, predicted, fixed.points, self._config.search_px, self._ratio)
+            pairs = match_nearby(
+                *descriptors, predicted, points=fixed.points, radius_px=self._config.search_px, ratio=self._ratio
+            )
             yield Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided=True)
         pairs = match_everywhere(*descriptors, self._ratio)
         yield Matches(moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], guided=False)
@@ -194,7 +196,9 @@ class KeypointMatcher(PointLocator):
         for radius, max_std_px in zip(_GUIDED_RADII, (np.inf, config.max_std_px), strict=True):
             limits = config.model_copy(update={"threshold_px": radius * config.threshold_px, "max_std_px": max_std_px})
             predicted = transform_points(homography, moving.points)
-            pairs = match_nearby(*descriptors, predicted, fixed.points, limits.threshold_px, _GUIDED_RATIO)
+            pairs = match_nearby(
+                *descriptors, predicted, points=fixed.points, radius_px=limits.threshold_px, ratio=_GUIDED_RATIO
+            )
             here, there, sizes = moving.points[pairs[:, 0]], fixed.points[pairs[:, 1]], moving.sizes[pairs[:, 0]]
             # One round: matches that were searched within the threshold are all inliers.
             motion = motion_from_points(
@@ -306,6 +310,7 @@ def match_nearby(
     moving: NDArray[np.float32],
     fixed: NDArray[np.float32],
     predicted: FloatArray,
+    *,
     points: NDArray[np.float32],
     radius_px: float,
     ratio: float,

@@ -68,11 +68,11 @@ def pictures_of_poses(folder: Path, every: int, *, undistorted: bool) -> PosedPi
 def pictures_of_turn(
     folder: Path,
     output: Path,
+    *,
     every: int,
     bits: Literal[8, 16],
     capture: Path | str | None,
     catalog: Catalog | None,
-    *,
     undistorted: bool,
 ) -> Iterator[PosedPictures]:
     """Merge groups of frames side by side, as long as those of the last level, as the camera sees them in their middle.
@@ -90,11 +90,11 @@ def pictures_of_turn(
         instants = np.array([span.centre for span in spans])
         digits = len(str(len(motion.located) - 1))
         poses = Poses(
-            Camera(camera.matrix) if undistorted else camera,
-            motion.frame_shape,
-            tuple(f"exposure_{span.start:0{digits}}.png" for span in spans),
-            nearest_rotations(camera.rotations(motion.trajectory.at(instants))),
-            instants / (rate or 1.0),
+            camera=Camera(camera.matrix) if undistorted else camera,
+            frame_shape=motion.frame_shape,
+            names=tuple(f"exposure_{span.start:0{digits}}.png" for span in spans),
+            rotations=nearest_rotations(camera.rotations(motion.trajectory.at(instants))),
+            seconds=instants / (rate or 1.0),
         )
         (height, width), left, top = motion.frame_shape, 0, 0
         box = (0, 0, width, height)
@@ -117,8 +117,15 @@ def _film(opened: OpenedRun, box: tuple[int, int, int, int]) -> Film:
         raise InputError(f"{opened.folder}: the run made no panorama, and the pictures are as bright as that")
     source, canvas = with_background(opened.source, None), canvas_of_box(box, 1.0)  # what moves is shown, wherever it is
     # A path that is smoothed over no frames is that of the camera.
-    view = (opened.motion, canvas, settings.tolerance_px, 0.0, recorded["white_flux"], settings.white_balance)
-    return Film(source, *view)
+    return Film(
+        source=source,
+        motion=opened.motion,
+        canvas=canvas,
+        tolerance_px=settings.tolerance_px,
+        smooth_frames=0.0,
+        white_flux=recorded["white_flux"],
+        white_balance=settings.white_balance,
+    )
 
 
 def _pixels(shape: tuple[int, int]) -> FloatArray:
@@ -169,7 +176,7 @@ def _lines(found: ExportedPoses) -> Iterator[str]:
     bits=typer.Option(metavar="8|16", parser=int),
     frame_rate_hz=typer.Option("--frame-rate", min=1e-6, metavar="HZ"),
 )
-def export(
+def export(  # noqa: PLR0913
     run_folder: Path | str,
     file_format: PoseFormat,
     output: Path | str,
@@ -236,7 +243,9 @@ def export(
             poses, pictures = pictures_of_poses(folder, every, undistorted=undistorted)
         elif images:
             stack.enter_context(one_thread_inside())
-            made = pictures_of_turn(folder, output, every, bits, capture, catalog, undistorted=undistorted)
+            made = pictures_of_turn(
+                folder, output, every=every, bits=bits, capture=capture, catalog=catalog, undistorted=undistorted
+            )
             poses, pictures = stack.enter_context(made)
         files = {name: text.encode() for name, text in POSE_FORMATS[file_format](poses).items()}
         if images and file_format == "colmap":
@@ -280,4 +289,11 @@ def _poses(folder: Path, every: int, frame_rate_hz: float | None, needs_seconds:
     digits = len(str(len(run.located) - 1))
     names = tuple(f"frame_{frame:0{digits}}.png" for frame in frames.tolist())
     places = None if positions is None else positions[frames]
-    return Poses(camera, run.frame_shape, names, rotations[frames], frames / (rate or 1.0), places)
+    return Poses(
+        camera=camera,
+        frame_shape=run.frame_shape,
+        names=names,
+        rotations=rotations[frames],
+        seconds=frames / (rate or 1.0),
+        positions=places,
+    )

@@ -31,7 +31,7 @@ _MIDDLE_GREY = 128
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Poses:
     """Where a camera was, and where it looked."""
 
@@ -195,7 +195,16 @@ def read_colmap(folder: Path, camera: Camera, frame_shape: tuple[int, int]) -> P
     positions[at], flux[at] = rows[:, 1:4], srgb_to_linear(rows[:, 4] / 255)
     observed = tuple((each[:, 2].astype(np.intp) - 1, each[:, :2] - 0.5) for each in seen)
     seconds, to_world = np.zeros(len(names)), np.swapaxes(from_world, -1, -2)
-    return Poses(camera, frame_shape, names, to_world, seconds, places, observed, ScenePoints(positions, flux))
+    return Poses(
+        camera=camera,
+        frame_shape=frame_shape,
+        names=names,
+        rotations=to_world,
+        seconds=seconds,
+        positions=places,
+        observed=observed,
+        points=ScenePoints(positions, flux),
+    )
 
 
 def ply(points: ScenePoints) -> bytes:

@@ -123,7 +123,9 @@ def viewpoints(shown: FloatArray, poses: FloatArray) -> tuple[Viewpoint, Viewpoi
     radius = float(np.linalg.norm(shown - middle, axis=1).max()) or 1.0
     principal = np.linalg.eigh(np.cov(shown.T))[1].T  # the least first
     right, down, ahead = nearest_rotations(poses[:, :, :3].mean(axis=0))
-    least, second = (_viewpoint(axis, right, -down, ahead, middle, _AWAY * radius) for axis in principal[:2])
+    least, second = (
+        _viewpoint(axis, right, -down, ahead=ahead, middle=middle, distance=_AWAY * radius) for axis in principal[:2]
+    )
     return least, second
 
 
@@ -145,7 +147,7 @@ def scene_views(estimate: PoseEstimate, shape: tuple[int, int]) -> tuple[str, st
 
 
 def _viewpoint(
-    axis: FloatArray, right: FloatArray, up: FloatArray, ahead: FloatArray, middle: FloatArray, distance: float
+    axis: FloatArray, right: FloatArray, up: FloatArray, *, ahead: FloatArray, middle: FloatArray, distance: float
 ) -> Viewpoint:
     """Look along an axis, from the side that is above and behind the cameras."""
     side = axis if axis @ (up - ahead) >= 0 else -axis

@@ -123,7 +123,14 @@ def _write(folder: Path, estimate: PoseEstimate, stream: StreamInfo) -> None:
         poses = estimate.camera_from_world[frames]
         names = tuple(map(str, frames.tolist()))
         to_world = np.swapaxes(poses[:, :, :3], -1, -2)
-        located = Poses(camera, stream.frame_shape, names, to_world, frames / rate, positions_of(poses))
+        located = Poses(
+            camera=camera,
+            frame_shape=stream.frame_shape,
+            names=names,
+            rotations=to_world,
+            seconds=frames / rate,
+            positions=positions_of(poses),
+        )
         (folder / "poses.tum").write_text(tum(located)["trajectory.txt"], encoding="utf-8")
 
 
@@ -131,14 +138,14 @@ def _of_views(camera: Camera, estimate: PoseEstimate, stream: StreamInfo, rate: 
     """Return the poses of the exposures, with what they show."""
     poses = np.array([view.camera_from_world for view in estimate.views]).reshape(-1, 3, 4)
     return Poses(
-        camera,
-        stream.frame_shape,
-        view_names(estimate, stream.n_frames),
-        np.swapaxes(poses[:, :, :3], -1, -2),
-        np.array([view.instant for view in estimate.views]) / rate,
-        positions_of(poses),
-        tuple((np.asarray(view.points), view.xy) for view in estimate.views),
-        estimate.points,
+        camera=camera,
+        frame_shape=stream.frame_shape,
+        names=view_names(estimate, stream.n_frames),
+        rotations=np.swapaxes(poses[:, :, :3], -1, -2),
+        seconds=np.array([view.instant for view in estimate.views]) / rate,
+        positions=positions_of(poses),
+        observed=tuple((np.asarray(view.points), view.xy) for view in estimate.views),
+        points=estimate.points,
     )
 
 

@@ -26,7 +26,7 @@ POSES = "poses.npz"
 _ORTHONORMAL = 1e-3  # maximum deviation of R R^T from the identity in a pose
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RunPoses:
     """Content of `poses.npz` in a run folder.
 
@@ -65,7 +65,14 @@ def load_run_poses(folder: Path) -> RunPoses:
         raise InputError(f"{path}: camera_matrix must be (3, 3), distortion (4,) and frame_shape (2,); run the spec again")
     height, width = (int(side) for side in arrays["frame_shape"])
     std_position, std_rotation_deg = (arrays[name].astype(np.float64) for name in per_frame[1:])
-    return RunPoses(Camera(matrix, distortion), poses, located, std_position, std_rotation_deg, (height, width))
+    return RunPoses(
+        camera=Camera(matrix, distortion),
+        camera_from_world=poses,
+        located=located,
+        std_position=std_position,
+        std_rotation_deg=std_rotation_deg,
+        frame_shape=(height, width),
+    )
 
 
 def load_true_poses(path: Path) -> tuple[FloatArray, float | None]:

@@ -81,6 +81,7 @@ def bin_source(
     name: str,
     summary: str,
     config: type[BinConfig],
+    *,
     layout: FrameLayout,
     recognise: Callable[[Path], Recognised | None],
     footer_bytes: int = 0,
@@ -222,15 +223,15 @@ SWISSSPAD_HALF = bin_source(
     "swissspad-half",
     "Binary frames of half of SwissSPAD2, 256 x 512 px, in .bin files of 512",
     SwissSpadHalfConfig,
-    HALF,
-    lambda path: _recognise_swissspad(path, "half"),
+    layout=HALF,
+    recognise=lambda path: _recognise_swissspad(path, "half"),
 )
 SWISSSPAD_FULL = bin_source(
     "swissspad-full",
     "Binary frames of all of SwissSPAD2, 512 x 512 px, in .bin files of 256",
     SwissSpadFullConfig,
-    FULL,
-    lambda path: _recognise_swissspad(path, "full"),
+    layout=FULL,
+    recognise=lambda path: _recognise_swissspad(path, "full"),
 )
 
 
@@ -249,9 +250,9 @@ SPAD512 = bin_source(
     "spad512",
     "Binary frames of the SPAD512, 512 x 512 px, in .bin files of 1000, or of 256 with a footer",
     Spad512Config,
-    _SPAD512,
-    _recognise_spad512,
-    _FOOTER_BYTES,
+    layout=_SPAD512,
+    recognise=_recognise_spad512,
+    footer_bytes=_FOOTER_BYTES,
 )
 
 

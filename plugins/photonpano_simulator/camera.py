@@ -335,7 +335,7 @@ class Views:
 
 
 @compiled
-def _look_around(
+def _look_around(  # noqa: PLR0917
     points: FloatArray,
     rays: FloatArray,
     width: int,

@@ -37,7 +37,7 @@ _NO_LIMBS = np.zeros((0, 5))
 _BLANK = np.ones((1, 1), np.float32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Cover:
     """Something flat and upright."""
 
@@ -110,7 +110,19 @@ class Foreground:
                 azimuth, elevation, slant = np.deg2rad((*board.at_deg, board.slant_deg)).tolist()
                 ahead = np.full(config.n_frames, azimuth)
                 texture = texture_of(np.array(size), board.seed) * np.float32(flux * board.flux)
-                covers.append(Cover("board", size, ahead, elevation, board.distance_m, board.size_m, slant, None, texture))
+                covers.append(
+                    Cover(
+                        kind="board",
+                        size=size,
+                        azimuth=ahead,
+                        elevation=elevation,
+                        distance_m=board.distance_m,
+                        size_m=board.size_m,
+                        slant=slant,
+                        swing=None,
+                        texture=texture,
+                    )
+                )
             if config.clutter is not None:
                 clutter = _clutter(config, config.clutter, rotations)
                 covers += self._sized(clutter, config.clutter.share, "clutter", "boards", flux)
@@ -211,7 +223,19 @@ def _clutter(config: SimulationConfig, clutter: Clutter, rotations: FloatArray) 
                 texture_of(np.array(texels), clutter.seed * 100 + place) * np.float32(flux * light[place]) if flux else _BLANK
             )
             ahead, elevation, slant = np.full(config.n_frames, azimuth), float(elevations[place]), float(slants[place])
-            covers.append(Cover("board", texels, ahead, elevation, float(distance), metres, slant, None, texture))
+            covers.append(
+                Cover(
+                    kind="board",
+                    size=texels,
+                    azimuth=ahead,
+                    elevation=elevation,
+                    distance_m=float(distance),
+                    size_m=metres,
+                    slant=slant,
+                    swing=None,
+                    texture=texture,
+                )
+            )
         return covers
 
     return make
@@ -245,7 +269,19 @@ def _people(config: SimulationConfig, people: People, rotations: FloatArray) -> 
             swing = _SWING * paces[place] * np.sin(2 * np.pi * walks[place] / (_STRIDE * texels[1]))
             texture = _clothes(texels, light[place], people.seed * 100 + place) * np.float32(flux) if flux else _BLANK
             elevation = float(elevations[place])
-            covers.append(Cover("person", texels, azimuth, elevation, float(distance), metres, 0.0, swing, texture))
+            covers.append(
+                Cover(
+                    kind="person",
+                    size=texels,
+                    azimuth=azimuth,
+                    elevation=elevation,
+                    distance_m=float(distance),
+                    size_m=metres,
+                    slant=0.0,
+                    swing=swing,
+                    texture=texture,
+                )
+            )
         return covers
 
     return make
@@ -273,7 +309,7 @@ def _clothes(size: tuple[int, int], light: FloatArray, seed: int) -> NDArray[np.
 
 
 @compiled
-def _look(
+def _look(  # noqa: PLR0913, PLR0917
     points: FloatArray,
     to_texels: FloatArray,
     capsules: FloatArray,

@@ -42,7 +42,7 @@ _SAME = 1e-6  # relative difference below which two inverse depths are of the sa
 _METERED = 9  # frames along the path over which the mean flux is taken
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TravelTruth:
     """The truth of a capture of a scene with depth."""
 
@@ -104,13 +104,13 @@ def truth_of(arrays: Mapping[str, NDArray[Any]], name: str = "the truth") -> Tra
     textures = tuple(piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True))
     height, width = arrays["frame_shape"].tolist()
     return TravelTruth(
-        arrays["camera_from_world"],
-        Camera(arrays["camera_matrix"], arrays.get("distortion", np.zeros(4))),
-        (height, width),
-        arrays["taken"],
-        arrays["light"],
-        Scene(Planes(**{field: arrays[name] for name, field in _PLANES.items()}), textures),
-        float(arrays["texture_flux"]),
+        camera_from_world=arrays["camera_from_world"],
+        camera=Camera(arrays["camera_matrix"], arrays.get("distortion", np.zeros(4))),
+        frame_shape=(height, width),
+        taken=arrays["taken"],
+        light=arrays["light"],
+        scene=Scene(Planes(**{field: arrays[name] for name, field in _PLANES.items()}), textures),
+        flux=float(arrays["texture_flux"]),
     )
 
 
@@ -183,13 +183,15 @@ class TravelSource(SimulatedSource):
         frames = np.linspace(0, len(poses) - 1, _METERED).astype(int)
         mean = float(np.mean([metered.flux(poses[frame], frame) for frame in frames]))
         self._truth = TravelTruth(
-            poses[self._taken],
-            camera,
-            config.frame_shape,
-            self._taken,
-            self._light[self._taken],
-            with_objects(scene, config.objects, poses[0], camera.matrix, config.frame_shape, mean),
-            config.flux * config.sensor.quantum_efficiency / mean,
+            camera_from_world=poses[self._taken],
+            camera=camera,
+            frame_shape=config.frame_shape,
+            taken=self._taken,
+            light=self._light[self._taken],
+            scene=with_objects(
+                scene, config.objects, poses[0], matrix=camera.matrix, frame_shape=config.frame_shape, mean=mean
+            ),
+            flux=config.flux * config.sensor.quantum_efficiency / mean,
         )
         self._order = np.argsort(self._taken, kind="stable")
         # Rendered from the first thread on, it is made once.

@@ -220,7 +220,7 @@ def _render(maps: FloatArray, rows: NDArray[np.int64], radii: FloatArray, atlas:
 
 
 @compiled
-def _cover(
+def _cover(  # noqa: PLR0917
     i: int,
     p: np.int32,
     m: FloatArray,
@@ -268,7 +268,7 @@ def _clipped(constant: float, slope: float, low: float, high: float) -> tuple[fl
 
 
 @compiled
-def _inside_ellipse(
+def _inside_ellipse(  # noqa: PLR0917
     a: float, b: float, w: float, m: FloatArray, radii: FloatArray, low: float, high: float
 ) -> tuple[float, float]:
     """Return the part of an interval inside the disc: ((a - w/2) / r)^2 + ((b - w/2) / s)^2 <= w^2 with linear a, b, w."""
@@ -285,7 +285,7 @@ def _inside_ellipse(
 
 
 @compiled
-def _shade(
+def _shade(  # noqa: PLR0917
     i: int, owners: NDArray[np.int32], differs: NDArray[np.int32], maps: FloatArray, atlas: Atlas, row: NDArray[np.float32]
 ) -> None:
     """Write the flux of row `i`."""
@@ -305,7 +305,7 @@ def _shade(
 
 
 @compiled
-def _mix(owners: NDArray[np.int32], maps: FloatArray, j: int, i: int, atlas: Atlas, pixel: NDArray[np.float32]) -> None:
+def _mix(owners: NDArray[np.int32], maps: FloatArray, j: int, i: int, atlas: Atlas, pixel: NDArray[np.float32]) -> None:  # noqa: PLR0917
     """Add the flux of a pixel that several planes share; the entries of `owners` are used up."""
     n_parts = _PARTS * _PARTS
     for k in range(n_parts):
@@ -322,7 +322,7 @@ def _mix(owners: NDArray[np.int32], maps: FloatArray, j: int, i: int, atlas: Atl
 
 
 @compiled
-def _add(m: FloatArray, p: int, x: float, y: float, weight: float, atlas: Atlas, pixels: NDArray[np.float32]) -> None:
+def _add(m: FloatArray, p: int, x: float, y: float, weight: float, atlas: Atlas, pixels: NDArray[np.float32]) -> None:  # noqa: PLR0917
     """Add averages of the texture of a plane over the areas of successive pixels of a row, of which the first is at (x, y)."""
     # Their areas are taken as that of the middle one: its sides on the plane, and their lengths in texels of the finest level.
     middle = x + (len(pixels) - 1) / 2
@@ -347,7 +347,7 @@ def _add(m: FloatArray, p: int, x: float, y: float, weight: float, atlas: Atlas,
 
 
 @compiled
-def _sample(
+def _sample(  # noqa: PLR0913, PLR0917
     m: FloatArray,
     x: float,
     y: float,

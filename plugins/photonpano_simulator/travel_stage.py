@@ -118,7 +118,7 @@ _MOST_TEXELS = 24_000_000  # beyond, all textures are coarser; texels take 2 byt
 _DARKEST = 0.004  # reflectance below which nothing is painted, so that every place gives some light
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Sheet:
     """A rectangle that is to be drawn: its picture by name, or linear reflectance."""
 
@@ -211,14 +211,14 @@ class Stage:
         corner, along, down = edges
         draw = draw or thing["draw"]
         return _Sheet(
-            place.axes @ corner + place.origin,
-            place.axes @ along,
-            place.axes @ down,
-            draw if isinstance(draw, str) else self._chance.one(draw),
-            names,
-            thing.get("units", 1000.0),
-            thing.get("detail", 1.0),
-            thing.get("glow", 0.0),
+            corner=place.axes @ corner + place.origin,
+            along=place.axes @ along,
+            down=place.axes @ down,
+            picture=draw if isinstance(draw, str) else self._chance.one(draw),
+            names=names,
+            units=thing.get("units", 1000.0),
+            detail=thing.get("detail", 1.0),
+            glow=thing.get("glow", 0.0),
         )
 
     def _box(self, thing: Mapping[str, Any], place: _Place, names: Names) -> Iterator[tuple[_Sheet, None]]:
@@ -268,6 +268,7 @@ def with_objects(
     scene: Scene,
     objects: tuple[WorldObject, ...],
     pose: FloatArray,
+    *,
     matrix: FloatArray,
     frame_shape: tuple[int, int],
     mean: float,

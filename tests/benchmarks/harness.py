@@ -241,7 +241,7 @@ def rendered(source: Source, motion: FrameTrajectory, canvas: Canvas | None = No
     """Render a capture along a motion; on a canvas that holds all of it by default."""
     span = source.info.span
     canvas = canvas or plan_canvas(motion, span, source.info.frame_shape, 1.0, 2**31)
-    return render(source, motion, span, canvas, tolerance_px, Context(2))
+    return render(source, motion, span, canvas, tolerance_px, Context(threads=2))
 
 
 def to_reference(homographies: NDArray[np.float64], reference: int | None = None) -> NDArray[np.float64]:

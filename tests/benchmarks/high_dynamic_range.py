@@ -122,7 +122,7 @@ def measured(name: str, n_frames: int, seed: int, rms_px: float, dark: float, st
             true = -np.log1p(-np.minimum(lit, 1 - 1e-9))
         else:
             true = view(n_frames // 2)[12:-12, 12:-12]
-    gathered = DynamicRange(noise)
+    gathered = DynamicRange(noise=noise)
     std = np.empty_like(panorama.flux)
     for rows, found in noise.of_tile(panorama.flux, panorama.weight, 0, 0):
         gathered.add(panorama.flux[rows], panorama.weight[rows], found.photons)

@@ -190,7 +190,7 @@ def false_alarm(seed: int) -> tuple[str, bool, bool] | None:
     """
     with passing() as study:
         name, spec = steady_capture(study, seed)
-        plan, context = parse_spec(spec), Context(1)
+        plan, context = parse_spec(spec), Context(threads=1)
         with open_source(plan) as source:
             levels, timeline = build_levels(plan, source, []), timeline_of(source, context)
             try:

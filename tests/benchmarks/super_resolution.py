@@ -128,7 +128,7 @@ def fine_rendered(capture: Path) -> str:
         renderer, span = build_renderer(plan, source, []), source.info.span
         canvas = plan_canvas(trajectory, span, source.info.frame_shape, 2.0, 2**31)
         before = peak_memory_bytes()
-        _, seconds, worked, peak_mib = took(render, source, trajectory, span, canvas, 0.125, Context(THREADS), renderer)
+        _, seconds, worked, peak_mib = took(render, source, trajectory, span, canvas, 0.125, Context(threads=THREADS), renderer)
     each = (peak_mib * 2**20 - before) / (canvas.width * canvas.height)
     return (
         f"{canvas.width}x{canvas.height} px from {source.info.n_frames} frames: {seconds:.0f} s, {worked:.0f} s of processor "

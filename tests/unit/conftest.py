@@ -119,6 +119,8 @@ def make_level() -> Callable[..., Level]:
 
         locators = tuple(NamedLocator(name, of_toys(each, "locator", name)) for name, each in named.items())
         toys = {"resampler": SideBySide(), "merger": Noise(), "interpolator": Linear()} | components
-        return Level(number, scale, locators=locators, **{kind: of_toys(each, kind) for kind, each in toys.items()})
+        return Level(
+            number=number, scale=scale, locators=locators, **{kind: of_toys(each, kind) for kind, each in toys.items()}
+        )
 
     return make

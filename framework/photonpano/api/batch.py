@@ -225,10 +225,11 @@ def _lines(result: BatchResult, *, strict: bool = False) -> Iterator[str]:
     sweep=typer.Option(metavar="KEY=VALUE,VALUE"),
     jobs=typer.Option("--jobs", "-j", metavar="N", min=1),
 )
-def _batch(
+def _batch(  # noqa: PLR0913
     spec: Path,
     output: Path,
     captures: Sequence[str] = (),
+    *,
     lists: Sequence[Path] = (),
     changes: Sequence[str] = (),
     sweep: Sequence[str] = (),

@@ -242,7 +242,7 @@ def read_changes(
     for text, is_sweep in [*((each, False) for each in changes), *((each, True) for each in swept)]:
         key, sign, yaml = text.partition("=")
         key = key.strip()
-        place = Place(key, override=text)
+        place = Place(where=key, override=text)
         if not sign or not all(key.split(".")):
             problems.append(Place(override=text).problem("expected KEY=VALUE, such as run.seed=1"))
             continue

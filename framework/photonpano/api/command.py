@@ -36,7 +36,7 @@ class DoubtfulError(PhotonpanoError):
     """A run is doubtful, and only a trusted one is a success."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
     """A command of the program."""
 
@@ -59,7 +59,7 @@ def command(example: str, prints: Callable[..., Iterable[str]], **declared: Any)
 
     def declare(function: FunctionT) -> FunctionT:
         name = function.__name__.lstrip("_").replace("_", "-")
-        COMMANDS[name] = Command(function, prints, example, options=declared, **own)
+        COMMANDS[name] = Command(function=function, prints=prints, example=example, options=declared, **own)
         return function
 
     return declare

@@ -136,7 +136,7 @@ def convert(
     try:
         with build_source(plan) as source:
             require_new_capture(source, plan, output, overwrite)
-            return write_capture(source, plan, output, progress, goes_on, writer, compress)
+            return write_capture(source, plan, output, progress=progress, resumed=goes_on, writer=writer, compressed=compress)
     finally:
         if part.exists() and part.stat().st_mtime_ns != before:
             progress.note(f"the frames written so far are in {part}; the same command continues from there")
@@ -171,6 +171,7 @@ def write_capture(
     source: Source,
     plan: Plan,
     output: Path,
+    *,
     progress: Progress | None,
     resumed: Callable[[int], object] | None,
     writer: SourceContribution | None = None,
@@ -285,4 +286,13 @@ def dark(
         warnings.append(f"half of the pixels count more than {BRIGHT:g} photons per frame; was the lens covered?")
     uses = {"hot-pixels": "dark", "dark-counts": "dark"} if output.suffix == ".npz" else {"mask": "file"}
     corrections = [*written_corrections(plan.corrections), *({name: {key: str(output)}} for name, key in uses.items())]
-    return DarkMeasurement(output, info, measured.rates, valid, hot & valid, limit, corrections, tuple(warnings))
+    return DarkMeasurement(
+        path=output,
+        info=info,
+        rates=measured.rates,
+        valid=valid,
+        hot=hot & valid,
+        limit=limit,
+        corrections=corrections,
+        warnings=tuple(warnings),
+    )

@@ -90,7 +90,7 @@ def check_run(
     """
     with opened_run(Path(run_folder), catalog, moved=capture) as opened, one_thread_inside():
         record, plan = opened.record, opened.plan
-        context = Context(thread_count(plan.run.threads), usual(progress))
+        context = Context(threads=thread_count(plan.run.threads), progress=usual(progress))
         findings = findings_of(record)
         copies = timeline_of(opened.source, context).copies if findings.repeated else None
         source = replace(capture_of(opened.source), copies=copies)
@@ -155,9 +155,17 @@ def evaluate(
 
         def along_truth(trajectory: Trajectory, canvas: Canvas) -> Panorama:
             source, plan = opened.source, opened.plan
-            context = Context(thread_count(plan.run.threads), usual(progress))
+            context = Context(threads=thread_count(plan.run.threads), progress=usual(progress))
             renderer = build_renderer(plan, source, [])
-            images = render(source, trajectory, source.info.span, canvas, plan.render.tolerance_px, context, renderer)
+            images = render(
+                source,
+                trajectory,
+                source.info.span,
+                canvas,
+                tolerance_px=plan.render.tolerance_px,
+                context=context,
+                renderer=renderer,
+            )
             return composed(images, source)
 
         return evaluate_folder(run_folder, truth, along_truth)
@@ -295,14 +303,14 @@ def _compared(runs: Sequence[_Run], names: Sequence[str], truth: Path | None) ->
         image = None if scored is None else scored.panorama
         found.append(
             ComparedRun(
-                name,
-                run.folder,
-                run.record,
-                picture,
-                None if run is runs[0] else difference.corners_px,
-                None if scored is None else scored.trajectory.mean_px,
-                None if image is None else image.psnr_db,
-                None if image is None else image.ssim,
+                name=name,
+                folder=run.folder,
+                record=run.record,
+                picture=picture,
+                difference_px=None if run is runs[0] else difference.corners_px,
+                corner_error_px=None if scored is None else scored.trajectory.mean_px,
+                psnr_db=None if image is None else image.psnr_db,
+                ssim=None if image is None else image.ssim,
             )
         )
     return found

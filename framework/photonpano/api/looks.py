@@ -264,7 +264,7 @@ def _lines_of_preview(made: Preview) -> Iterator[str]:
     label=typer.Option("--label/--no-label"),
     fps=typer.Option(min=0.1, max=240, metavar="HZ"),
 )
-def preview(
+def preview(  # noqa: PLR0913
     plan: Plan,
     output: Path | str,
     group_size: int = 256,

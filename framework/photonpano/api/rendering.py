@@ -126,8 +126,10 @@ def render(
         one_thread_inside(),
     ):
         require_same_plane(opened)
-        context = Context(thread_count(opened.plan.run.threads), usual(progress))
-        rendered = render_into(written, opened.plan, opened.source, opened.vignette, opened.motion, context)
+        context = Context(threads=thread_count(opened.plan.run.threads), progress=usual(progress))
+        rendered = render_into(
+            written, opened.plan, opened.source, vignette=opened.vignette, motion=opened.motion, context=context
+        )
         record = written.commit(_record(opened, *rendered, time.perf_counter() - start))
     return RenderResult(opened.plan.output.directory, record)
 
@@ -215,7 +217,7 @@ def _lines(made: Video) -> Iterator[str]:
     fps=typer.Option(min=0.1, max=240, metavar="HZ"),
     speed=typer.Option(metavar="X"),
 )
-def video(
+def video(  # noqa: PLR0913
     run_folder: Path | str,
     output: Path | str,
     *,
@@ -339,14 +341,18 @@ def _film(opened: OpenedRun, view: View, trail: bool, smooth_frames: float) -> F
     still, *_ = showing(opened.source, motion.trajectory, motion.camera, plan.render.movers)
     brighter = plan.render.exposure_stops - opened.record["spec"]["render"]["exposure_stops"]
     return Film(
-        source,
-        motion,
-        canvas,
-        tolerance_px,
-        smooth_frames if view == "smooth" else None,
-        recorded["white_flux"] / 2**brighter,
-        plan.render.white_balance,
-        merged(still, motion, motion.span, canvas, tolerance_px, thread_count(plan.run.threads)) if trail else None,
+        source=source,
+        motion=motion,
+        canvas=canvas,
+        tolerance_px=tolerance_px,
+        smooth_frames=smooth_frames if view == "smooth" else None,
+        white_flux=recorded["white_flux"] / 2**brighter,
+        white_balance=plan.render.white_balance,
+        panorama=merged(
+            still, motion, motion.span, canvas=canvas, tolerance_px=tolerance_px, threads=thread_count(plan.run.threads)
+        )
+        if trail
+        else None,
     )
 
 

@@ -60,10 +60,11 @@ def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
     from_level=typer.Option(metavar="N"),
     end_after=typer.Option(metavar="SECONDS", min=0.1),
 )
-def _run(
+def _run(  # noqa: PLR0913
     spec: Path,
     output: Path | None = None,
     changes: Sequence[str] = (),
+    *,
     overwrite: bool = False,
     resume: bool = False,
     from_level: int | None = None,

@@ -57,7 +57,7 @@ _UNPACKED = ".unpacked.npy"
 _IDLE_S = 600.0  # an unfinished file to which nothing was written for this time is left over
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class OpenedRun:
     """A finished run, with its capture."""
 
@@ -105,7 +105,9 @@ def opened_run(
         lit = in_light_of(capture if vignette is None else divided_by(capture, vignette), folder)
         lit = before_background_of(lit, folder)
         source = through_lens(lit, model_of(plan)) if run.camera is None else seen_through(lit, run.camera)
-        yield OpenedRun(folder, record, plan, capture, source, vignette, _motion(run))
+        yield OpenedRun(
+            folder=folder, record=record, plan=plan, capture=capture, source=source, vignette=vignette, motion=_motion(run)
+        )
 
 
 @contextmanager
@@ -135,7 +137,16 @@ def _motion(run: RunTrajectory) -> FrameMotion:
     reference = int(np.abs(run.homographies - np.eye(3)).max(axis=(1, 2)).argmin())
     trajectory = FrameTrajectory(run.homographies)
     std_px = np.where(run.located, np.nan_to_num(run.std_px, posinf=np.inf), np.inf)
-    return FrameMotion(trajectory, span, run.homographies, run.located, std_px, reference, run.frame_shape, run.camera)
+    return FrameMotion(
+        trajectory=trajectory,
+        span=span,
+        homographies=run.homographies,
+        located=run.located,
+        std_px=std_px,
+        reference=reference,
+        frame_shape=run.frame_shape,
+        camera=run.camera,
+    )
 
 
 def load_panorama(run_folder: Path | str) -> Panorama:

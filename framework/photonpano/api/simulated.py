@@ -69,7 +69,7 @@ def simulate(
     with build_source(plan) as source:
         require_new_capture(source, plan, output, overwrite)
         if sharp_every is None:
-            return write_capture(source, plan, output, progress, None, writer)
+            return write_capture(source, plan, output, progress=progress, resumed=None, writer=writer)
         sharp, views = output.with_suffix(".sharp"), require_sharp_views(source)
         require_new(sharp, overwrite)
         frames = range(0, source.info.n_frames, sharp_every)
@@ -77,7 +77,7 @@ def simulate(
             with one_thread_inside(), usual(progress).stage(f"writing {sharp.name}", len(frames), "pictures") as advance:
                 pictures = sharp_pictures(views, frames, thread_count(plan.run.threads))
                 write_pngs(folder, advancing(pictures, advance), [f"frame_{frame:06}" for frame in frames])
-            return replace(write_capture(source, plan, output, progress, None, writer), sharp=sharp)
+            return replace(write_capture(source, plan, output, progress=progress, resumed=None, writer=writer), sharp=sharp)
 
 
 def _lines(made: tuple[RunResult, Evaluation], *, open_report: bool = False) -> Iterator[str]:

@@ -46,7 +46,7 @@ _TO_SQUARES = np.array([[0.5, 0, -0.5], [0, 0.5, -0.5], [0, 0, 1]])  # pixels of
 _WIDEST = np.pi / 2  # widest field of view, in radians, of which squares lie on a plane
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SeenCells:
     """Photons of squares of the scene in spans of frames: N observations of C squares in S spans."""
 
@@ -68,7 +68,7 @@ class SeenCells:
         return np.array([span.centre for span in self.spans])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Gains:
     """The light of spans of frames, up to a common factor."""
 
@@ -111,12 +111,12 @@ def seen_cells(source: Source, trajectory: Trajectory, spans: Sequence[FrameSpan
     cells = np.concatenate([part[0] for part in parts])
     times = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     return SeenCells(
-        tuple(spans),
-        cells,
-        times,
-        np.concatenate([part[1] for part in parts]),
-        np.concatenate([part[2] for part in parts]),
-        replace(canvas, height=canvas.height // 2, width=canvas.width // 2, transform=_TO_SQUARES @ canvas.transform),
+        spans=tuple(spans),
+        cells=cells,
+        times=times,
+        photons=np.concatenate([part[1] for part in parts]),
+        exposure=np.concatenate([part[2] for part in parts]),
+        canvas=replace(canvas, height=canvas.height // 2, width=canvas.width // 2, transform=_TO_SQUARES @ canvas.transform),
     )
 
 
@@ -200,12 +200,12 @@ def solve_gains(seen: SeenCells) -> Gains:
     squares = float((off * (difference**2 - expected)).sum() / max(off.sum(), 1e-12))
     unseen = np.bincount(seen.cells, minlength=seen.n_cells) == 0
     return Gains(
-        seen,
-        light,
-        np.sqrt(np.diag(covariance)),
-        np.where(unseen, np.nan, brightness),
-        float(np.sqrt(max(squares, 0))),
-        shifted,
+        seen=seen,
+        logarithm=light,
+        std=np.sqrt(np.diag(covariance)),
+        brightness=np.where(unseen, np.nan, brightness),
+        change=float(np.sqrt(max(squares, 0))),
+        shifted=shifted,
     )
 
 

@@ -20,7 +20,7 @@ from photonpano.values import BoolArray, FluxImage, FrameSpan, Still
 Decide: TypeAlias = Callable[[str, float, str], None]  # records a decision: what was chosen, its value, and the reason
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Pixels:
     """The pixels of a frame after some corrections; every array is (H, W)."""
 
@@ -38,7 +38,9 @@ class Pixels:
         """Return the pixels of a source without corrections."""
         shape, valid = capture.valid.shape, capture.valid
         nothing, dark, colour = np.zeros(shape, np.bool_), np.zeros(shape, np.float32), np.full(shape, -1, np.int8)
-        return cls(numbered(shape), valid, nothing, dark, colour, capture.masks)
+        return cls(
+            index=numbered(shape), valid=valid, interpolated=nothing, dark_rates=dark, colour=colour, masks=capture.masks
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -50,13 +52,13 @@ class Pixels:
         """Return the pixels in another order, given as their numbers (see `numbered`), or -1."""
         missing = order == MISSING
         return Pixels(
-            np.where(missing, MISSING, self.index.ravel()[order]),
-            self.valid.ravel()[order] & ~missing,
-            self.interpolated.ravel()[order] & ~missing,
-            np.where(missing, np.float32(0), self.dark_rates.ravel()[order]),
-            np.where(missing, np.int8(-1), self.colour.ravel()[order]),
-            tuple(MaskedSpan(each.span, each.valid.ravel()[order]) for each in self.masks),
-            self.still,
+            index=np.where(missing, MISSING, self.index.ravel()[order]),
+            valid=self.valid.ravel()[order] & ~missing,
+            interpolated=self.interpolated.ravel()[order] & ~missing,
+            dark_rates=np.where(missing, np.float32(0), self.dark_rates.ravel()[order]),
+            colour=np.where(missing, np.int8(-1), self.colour.ravel()[order]),
+            masks=tuple(MaskedSpan(each.span, each.valid.ravel()[order]) for each in self.masks),
+            still=self.still,
         )
 
     def alike(self) -> list[BoolArray]:

@@ -119,7 +119,15 @@ def _light_of(flicker: LocalFlicker, gains: Gains, n_frames: int) -> Light:
     phase = 2 * np.pi * flicker.frequency * frames
     waves, canvas = np.stack([np.cos(phase), np.sin(phase)]), gains.seen.canvas
     camera_matrix = None if canvas.planar else canvas.camera_matrix
-    return Light(slow / slow.mean(), waves, flicker.maps, canvas.transform, flicker.frequency, std, camera_matrix)
+    return Light(
+        gain=slow / slow.mean(),
+        waves=waves,
+        maps=flicker.maps,
+        to_map=canvas.transform,
+        frequency=flicker.frequency,
+        std=std,
+        camera_matrix=camera_matrix,
+    )
 
 
 def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:

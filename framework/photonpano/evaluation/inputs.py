@@ -168,14 +168,14 @@ def load_run_trajectory(folder: Path) -> RunTrajectory:
     if projection not in PROJECTIONS or (projection != "planar" and camera is None):
         raise InputError(f"{path}: the projection {projection} is not known, or lacks its camera_matrix")
     return RunTrajectory(
-        homographies,
-        canvas.astype(np.float64),
-        frame_shape_of(path, arrays),
-        located.astype(bool),
-        std_px.astype(np.float64),
-        camera,
-        projection,
-        arrays.get("horizon"),
+        homographies=homographies,
+        canvas=canvas.astype(np.float64),
+        frame_shape=frame_shape_of(path, arrays),
+        located=located.astype(bool),
+        std_px=std_px.astype(np.float64),
+        camera=camera,
+        projection=projection,
+        horizon=arrays.get("horizon"),
     )
 
 

@@ -176,7 +176,16 @@ def score(
     flux, weight = panorama()
     canvas = run.canvas_of((flux.shape[0], flux.shape[1]))
     true_homographies = truth.homographies if run.camera is None else truth.ideal_homographies
-    picture, oracle, white = picture_scores(flux, weight, truth, canvas, motion.alignment, true_homographies, render, origin)
+    picture, oracle, white = picture_scores(
+        flux,
+        weight,
+        truth,
+        canvas=canvas,
+        alignment=motion.alignment,
+        true_homographies=true_homographies,
+        render=render,
+        origin=origin,
+    )
     return replace(evaluation, panorama=picture, oracle=oracle, white_flux=white)
 
 
@@ -184,6 +193,7 @@ def picture_scores(
     flux: FluxImage,
     weight: FluxImage,
     truth: Truth,
+    *,
     canvas: Canvas,
     alignment: Homography,
     true_homographies: FloatArray,

@@ -134,7 +134,7 @@ class TimeLimit:
         return True
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Context:
     """How a computation runs; its result does not depend on it."""
 

@@ -42,7 +42,7 @@ class Run(NamedTuple):
 
 
 @compiled
-def visible_columns(
+def visible_columns(  # noqa: PLR0917
     to_image: Homography, y: int, left: float, right: float, top: float, bottom: float, width: int
 ) -> tuple[int, int]:
     """Return the half-open range of pixels of a grid row that map into a rectangle of the image, border included.
@@ -80,7 +80,7 @@ def visible_columns(
 
 
 @compiled
-def run_from(to_image: Homography, x: int, y: int, most: int, height: int, width: int) -> Run:
+def run_from(to_image: Homography, x: int, y: int, most: int, height: int, width: int) -> Run:  # noqa: PLR0917
     """Return the run of pixels of a grid row that starts at (x, y).
 
     Args:

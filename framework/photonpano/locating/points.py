@@ -152,7 +152,7 @@ def too_few_matches(count: int, limits: PointLimits, evidence: Mapping[str, floa
     return NotLocated(f"{count} matches, fewer than min_inliers = {limits.min_inliers}{keypoints}", evidence)
 
 
-def motion_from_points(
+def motion_from_points(  # noqa: PLR0913
     moving: Points,
     fixed: Points,
     start: Homography,
@@ -295,7 +295,7 @@ _FALSE_ALARMS = 1e-4
 _FAR_PX = 1e6  # points that are mapped further away are taken to lie there
 
 
-def turn_of(
+def turn_of(  # noqa: PLR0917
     attempts: Iterable[Matches],
     shape: tuple[int, int],
     limits: MatchingConfig,
@@ -321,7 +321,9 @@ def turn_of(
         `degrees_of_freedom` 3; `NotLocated` with the reason why the last matches fail if all of them do.
     """
     for matches in attempts:
-        motion = _turn(matches, shape, limits, Camera(camera_matrix), dict(evidence or {}), rounding_px)
+        motion = _turn(
+            matches, shape, limits, camera=Camera(camera_matrix), found=dict(evidence or {}), rounding_px=rounding_px
+        )
         if isinstance(motion, Located):
             break
     return motion
@@ -331,6 +333,7 @@ def _turn(
     matches: Matches,
     shape: tuple[int, int],
     limits: MatchingConfig,
+    *,
     camera: Camera,
     found: dict[str, float],
     rounding_px: float,

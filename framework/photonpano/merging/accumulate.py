@@ -284,7 +284,7 @@ class PhotonSum:
         return flux, weight
 
 
-def accumulate(
+def accumulate(  # noqa: PLR0917
     source: Source,
     chunks: Sequence[Chunk],
     onto: Homography | Canvas,
@@ -318,7 +318,7 @@ def accumulate(
         visible = _visible(capture, chunks, canvas)
         if off_grid := _frames(chunks) - _frames([chunk for chunk, _ in visible]):
             advance(off_grid)
-        counts, coverages = _sum_on(capture, terms, counts_of or capture.chunk, canvas, visible, advance)
+        counts, coverages = _sum_on(capture, terms, counts_of or capture.chunk, canvas=canvas, visible=visible, advance=advance)
     else:
         number = 1 if terms is None else terms.number
         counts, coverages = np.zeros(shape, np.float32), np.zeros((number, *shape), np.float32)
@@ -365,7 +365,9 @@ def _sum_of_run(source: Capture, terms: LightTerms | None, canvas: Canvas, chunk
     columns = [each for at in footprints for each in at.columns]
     left, right = min(each.start for each in columns), max(each.stop for each in columns)
     part = canvas.part(left, top, bottom - top, right - left)
-    counts, coverages = _sum_on(source, terms, source.chunk, part, _visible(source, chunks, part), lambda _: None)
+    counts, coverages = _sum_on(
+        source, terms, source.chunk, canvas=part, visible=_visible(source, chunks, part), advance=lambda _: None
+    )
     return _Part((slice(top, bottom), slice(left, right)), counts, coverages, _frames(chunks))
 
 
@@ -373,6 +375,7 @@ def _sum_on(
     source: Capture,
     terms: LightTerms | None,
     counts_of: Callable[[FrameSpan], Counts],
+    *,
     canvas: Canvas,
     visible: _Visible,
     advance: Callable[[int], None],

@@ -50,7 +50,7 @@ class Averages:
     light_variance: FluxImage  # of their gain, relative to it
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Averaging:
     """The motion that brings pixels of frames between pixels of a canvas, at instants all over the frames that are rendered."""
 
@@ -67,6 +67,7 @@ class Averaging:
         trajectory: Trajectory,
         span: FrameSpan,
         frame_shape: tuple[int, int],
+        *,
         canvas: Canvas,
         camera: Camera | None = None,
         std_px: FloatArray | None = None,
@@ -82,7 +83,14 @@ class Averaging:
         instants = span.start + (part * (np.arange(number) + np.random.default_rng(0).random(number))).astype(int)
         errors, light = (np.zeros(number) if each is None else each[instants] for each in (std_px, std_light))
         shown = np.isfinite(light)
-        return cls(trajectory.at(instants[shown]), frame_shape, canvas, camera, errors[shown], light[shown])
+        return cls(
+            homographies=trajectory.at(instants[shown]),
+            frame_shape=frame_shape,
+            canvas=canvas,
+            camera=camera,
+            std_px=errors[shown],
+            std_light=light[shown],
+        )
 
     def over(self, shape: tuple[int, int], top: int = 0, left: int = 0) -> Averages:
         """Average over the frames that show each pixel of a part of the canvas.
@@ -118,7 +126,7 @@ def _averaged(total: FluxImage, count: FluxImage) -> FluxImage:
 
 
 @compiled
-def _add_frame(
+def _add_frame(  # noqa: PLR0917
     shape: tuple[int, int],
     matrix: NDArray[np.float64],
     lens: Lens,
@@ -168,7 +176,7 @@ class FluxStd(NamedTuple):
     whole: FluxImage  # with what the expected errors of motion and light change
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CanvasNoise:
     """Noise model of a canvas: all that its noise depends on beside flux and weight.
 
@@ -192,26 +200,41 @@ class CanvasNoise:
         """
         capture = capture_of(source)
         std_light = None if capture.light is None else capture.light.std
-        averaging = Averaging.of(trajectory, span, capture.info.frame_shape, canvas, capture.camera, std_px, std_light)
+        averaging = Averaging.of(
+            trajectory,
+            span,
+            capture.info.frame_shape,
+            canvas=canvas,
+            camera=capture.camera,
+            std_px=std_px,
+            std_light=std_light,
+        )
         if capture.colour is None:
             return replace(cls._corrected(capture, trajectory, span, canvas), averaging=averaging)
         # The grey source equalises the colours, which are rendered without it.
         colours = [cls._corrected(each, trajectory, span, canvas) for each in list(capture.colours().values())[:_RGB]]
         slope, offset, share = (_stacked([getattr(each, name) for each in colours]) for name in ("slope", "offset", "share"))
-        return cls(capture.response, slope, offset, share, max(each.reduction for each in colours), averaging)
+        return cls(
+            response=capture.response,
+            slope=slope,
+            offset=offset,
+            share=share,
+            reduction=max(each.reduction for each in colours),
+            averaging=averaging,
+        )
 
     @classmethod
     def _corrected(cls, capture: Capture, trajectory: Trajectory, span: FrameSpan, canvas: Canvas) -> CanvasNoise:
         """Average the corrections of a capture over the frames that see each place of a canvas."""
         if not capture.corrects_sums:
-            return cls(capture.response)
+            return cls(response=capture.response)
         none = np.zeros(capture.info.frame_shape, np.uint32)
         offset = np.asarray(capture.corrected(none, 1), np.float32)
         slope = np.asarray(capture.corrected(none + 1, 1) - offset, np.float32)
         factors, valid = (slope, offset, capture.weights()), capture.valid
         means = [float(each[valid].mean()) for each in factors]
         if max(np.ptp(each[valid]) for each in factors) < _EVEN:
-            return cls(capture.response, means[0], means[1], means[2])
+            return cls(response=capture.response, slope=means[0], offset=means[1], share=means[2])
         reduction = max(1.0, max(canvas.shape) / _LARGEST_PX)
         height, width = (int(np.ceil(side / reduction)) for side in canvas.shape)
         instants = np.unique(np.linspace(span.start, span.stop - 1, min(len(span), _INSTANTS)).round())
@@ -221,7 +244,7 @@ class CanvasNoise:
             np.asarray(np.where(known > 0, total / np.maximum(known, np.float32(1e-6)), mean), np.float32)
             for total, mean in zip(sums, means, strict=True)
         )
-        return cls(capture.response, slope, offset, share, reduction)
+        return cls(response=capture.response, slope=slope, offset=offset, share=share, reduction=reduction)
 
     def std(self, flux: FluxImage, weight: FluxImage, top: int = 0, left: int = 0) -> FluxImage:
         """Return the standard deviation by photons, (h, w) or (h, w, 3), of a part of the canvas from `top`, `left` on."""
@@ -317,7 +340,7 @@ def _stacked(factors: list[Factor]) -> Factor:
     return np.stack([np.broadcast_to(np.asarray(each, np.float32), shape) for each in factors], axis=-1)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class DynamicRange:
     """The range of flux in a panorama, gathered tile by tile."""
 

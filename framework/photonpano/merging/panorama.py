@@ -59,7 +59,7 @@ class View:
     turns: bool = False  # whether the camera only turns, so that a cylinder or a sphere can show what it sees
 
 
-def plan_canvas(
+def plan_canvas(  # noqa: PLR0917
     trajectory: Trajectory,
     span: FrameSpan,
     frame_shape: tuple[int, int],
@@ -112,7 +112,7 @@ def _canvas(homographies: FloatArray, frame_shape: tuple[int, int], scale: float
                 f"a {view.projection} panorama needs a camera that only turns, and this motion is one homography a frame; "
                 "write motion: {model: rotation}, or render.projection: planar"
             )
-        return _plane(homographies, frame_shape, scale, extent, view.camera)
+        return _plane(homographies, frame_shape, scale, extent=extent, camera=view.camera)
     rotations, horizon = view.camera.rotations(homographies), None
     covered = covered_by(rotations, view.camera, frame_shape)
     projection = view.projection if view.projection != "auto" else _suitable(covered, extent)
@@ -122,7 +122,7 @@ def _canvas(homographies: FloatArray, frame_shape: tuple[int, int], scale: float
                 f"the frames cover {np.degrees(covered.field_of_view):.0f} degrees, and a plane holds up to "
                 f"{_WIDEST_PLANE_DEGREES}; write render.projection: {_suitable(covered, extent)}"
             )
-        return _plane(homographies, frame_shape, scale, extent, view.camera, turns=True)
+        return _plane(homographies, frame_shape, scale, extent=extent, camera=view.camera, turns=True)
     if view.level:
         horizon = level_horizon(rotations)
         covered = covered_by(horizon @ rotations, view.camera, frame_shape)
@@ -152,6 +152,7 @@ def _plane(
     homographies: FloatArray,
     frame_shape: tuple[int, int],
     scale: float,
+    *,
     extent: Extent,
     camera: Camera | None,
     turns: bool = False,
@@ -214,7 +215,7 @@ class MergeRenderer:
         """Take what works on several parts at once, such as that of a `StageContext`; the result does not depend on it."""
         self._in_order = in_order
 
-    def render(
+    def render(  # noqa: PLR0917
         self,
         source: Source,
         trajectory: Trajectory,
@@ -265,7 +266,7 @@ def tiles_of(canvas: Canvas, memory: int, bytes_per_pixel: int = BYTES_PER_PIXEL
     return tuple(tiles), reduction
 
 
-def render(
+def render(  # noqa: PLR0917
     source: Source,
     trajectory: Trajectory,
     span: FrameSpan,
@@ -280,11 +281,13 @@ def render(
     of them.
     """
     renderer = renderer or MergeRenderer(context.in_order)
-    (panorama,) = render_tiles(renderer, source, trajectory, span, [Tile(0, 0, canvas)], tolerance_px, context)
+    (panorama,) = render_tiles(
+        renderer, source, trajectory, span, tiles=[Tile(0, 0, canvas)], tolerance_px=tolerance_px, context=context
+    )
     return panorama
 
 
-def render_tiles(
+def render_tiles(  # noqa: PLR0917
     renderer: Renderer,
     source: Source,
     trajectory: Trajectory,
@@ -352,7 +355,7 @@ def _averaged(image: NDArray[np.generic], step: int) -> FluxImage:
     return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RenderedPanorama:
     """A panorama whose tiles have been written."""
 

@@ -337,7 +337,7 @@ def add_warped(counts: Texture, seen: Texture | None, amounts: FloatArray, footp
 
 
 @compiled
-def image_row(
+def image_row(  # noqa: PLR0917
     matrix: NDArray[np.float64], lens: Lens, grid: Grid, row: int, u: NDArray[np.float32], v: NDArray[np.float32]
 ) -> None:
     """Map a row of a grid to pixels of an image, to about 1e-6 of its size.
@@ -382,7 +382,7 @@ def image_row(
 
 
 @compiled
-def _add_warped(
+def _add_warped(  # noqa: PLR0917
     counts: Texture,
     seen: Texture,
     whole: bool,
@@ -417,7 +417,7 @@ def _add_warped(
 
 
 @compiled
-def sample(
+def sample(  # noqa: PLR0917
     image: Texture,
     nearest: NDArray[np.float32],
     nodes: NDArray[np.float32],

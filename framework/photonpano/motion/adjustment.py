@@ -146,7 +146,7 @@ def std_of(errors_px: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt((errors_px**2).mean(axis=(1, 2)) * 2))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Problem:
     """A connected graph whose nodes are to be found."""
 

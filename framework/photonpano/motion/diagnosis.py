@@ -38,7 +38,7 @@ class Contrast:
 class UntiedError(LocationError):
     """Too many exposures of a level are not tied to the others."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0917
         self,
         message: str,
         level: int,
@@ -76,10 +76,11 @@ def contrast_of(exposure: VirtualExposure) -> Contrast:
     return Contrast(signal_to_noise(exposure))
 
 
-def require_tied(
+def require_tied(  # noqa: PLR0913
     level: int,
     groups: Sequence[Group],
     edges: Sequence[Edge],
+    *,
     parts: NDArray[np.integer],
     contrasts: Mapping[int, Contrast],
     disconnected: Literal["error", "largest"],
@@ -127,7 +128,9 @@ def require_tied(
         height, width = frame_shape
         small = f"Frames of {height}x{width} px are too small for most scenes: use {_FEWEST_ROWS} rows and columns or more, and"
         lines = [lines[0], f"{small} {_FEWEST_PIXELS} pixels or more."]
-    raise UntiedError("\n".join(lines), level, groups, edges, parts, ratio, merged)
+    raise UntiedError(
+        message="\n".join(lines), level=level, groups=groups, edges=edges, parts=parts, signal_to_noise=ratio, merged=merged
+    )
 
 
 def tell_attempt(error: LocationError, what: str, failure: Exception) -> None:

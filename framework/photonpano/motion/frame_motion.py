@@ -28,7 +28,7 @@ _MOST_INSTANTS = 400
 _NEAR = 0.5  # a frame counts if its corners have more than this part of the depth of the instant's; others look elsewhere
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FrameMotion:
     """The motion of T frames.
 
@@ -75,7 +75,17 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
     homographies = np.concatenate([last.trajectory.at(block) for block in np.split(frames, frames[BLOCK_FRAMES::BLOCK_FRAMES])])
     trajectory = FrameTrajectory(homographies)
     camera = camera_of_motion(last.trajectory)
-    return FrameMotion(trajectory, span, homographies, located, std_px, reference, stream.frame_shape, camera, remaining_px)
+    return FrameMotion(
+        trajectory=trajectory,
+        span=span,
+        homographies=homographies,
+        located=located,
+        std_px=std_px,
+        reference=reference,
+        frame_shape=stream.frame_shape,
+        camera=camera,
+        remaining_px=remaining_px,
+    )
 
 
 def smooth_view(motion: FrameMotion, instant: float, std: float) -> Homography:

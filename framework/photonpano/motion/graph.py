@@ -89,7 +89,7 @@ class Rival(NamedTuple):
     apart_px: float = 0.0  # mean distance of the corners by it from those by the model that was taken, after the best alignment
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class GraphSolution:
     """The homographies of the exposures.
 
@@ -133,6 +133,7 @@ def solve(
     nodes: Sequence[Group],
     edges: Sequence[Edge],
     anchor: int,
+    *,
     frame_shape: tuple[int, int],
     start: FloatArray | None = None,
     model: MotionModel = HOMOGRAPHIES,
@@ -352,7 +353,7 @@ class _Fit:
         return self.adjustment.weights(self.norms, self.kept)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Tied:
     """The part of a graph that is tied to its anchor."""
 
@@ -383,7 +384,18 @@ class _Tied:
         motions = [motion for index in tied if isinstance(motion := located_edges[index][1].motion, Located)]
         spans = [group.span for group in nodes]
         shown = np.array([located_edges[index][1].locator not in (GYROSCOPE, TIE) for index in tied], dtype=bool)
-        return cls(located, order, parents, positions, pairs[tied], motions, frame_shape, instants_of(nodes), spans, shown)
+        return cls(
+            located=located,
+            order=order,
+            parents=parents,
+            positions=positions,
+            pairs=pairs[tied],
+            motions=motions,
+            frame_shape=frame_shape,
+            instants=instants_of(nodes),
+            spans=spans,
+            shown=shown,
+        )
 
     @property
     def anchor(self) -> int:
@@ -401,7 +413,13 @@ class _Tied:
         anchor = int(self.located[: self.anchor].sum())
         spans = [span for span, located in zip(self.spans, self.located, strict=True) if located]
         return Problem(
-            self.compact_pairs, anchor, self.motions, self.frame_shape, self.instants[self.located], spans, self.shown
+            pairs=self.compact_pairs,
+            anchor=anchor,
+            motions=self.motions,
+            frame_shape=self.frame_shape,
+            instants=self.instants[self.located],
+            spans=spans,
+            shown=self.shown,
         )
 
     def given(self, start: FloatArray | None) -> FloatArray | None:
@@ -458,19 +476,19 @@ class _Tied:
         if isinstance(adjustment, PlanarAdjustment) and model.planar == "homography":
             assess = adjustment.assess_beside_turns
         return GraphSolution(
-            homographies,
-            self.located,
-            tuple(int(position) for position in self.positions[~fit.kept]),
-            float(np.sqrt(np.mean(adjustment.residuals_px(found)[fit.kept] ** 2))),
-            partial(assess, found, fit.norms, fit.kept),
-            model,
-            found if isinstance(found, Rotations) else None,
-            adjustment.walks_px if isinstance(adjustment, PlanarAdjustment) else {},
-            adjustment.turning_px(found) if isinstance(adjustment, PlanarAdjustment) else None,
-            compare,
-            self.layers,
-            self.parallax,
-            partial(_freed, self, model, fit),
+            homographies=homographies,
+            located=self.located,
+            outliers=tuple(int(position) for position in self.positions[~fit.kept]),
+            residual_px=float(np.sqrt(np.mean(adjustment.residuals_px(found)[fit.kept] ** 2))),
+            assess=partial(assess, found, fit.norms, fit.kept),
+            model=model,
+            rotations=found if isinstance(found, Rotations) else None,
+            walks_px=adjustment.walks_px if isinstance(adjustment, PlanarAdjustment) else {},
+            turning_px=adjustment.turning_px(found) if isinstance(adjustment, PlanarAdjustment) else None,
+            compare=compare,
+            layers=self.layers,
+            parallax=self.parallax,
+            freed=partial(_freed, self, model, fit),
         )
 
     def alone(self, model: MotionModel) -> GraphSolution:
@@ -480,7 +498,15 @@ class _Tied:
         rotations = None if model.kind != "rotation" else Rotations(np.eye(3)[None], model.camera(self.frame_shape))
         unknown = np.full((1, 8, 1), np.nan)
         nothing = Assessment(np.full((1, 8, 8), np.nan), unknown, unknown, np.zeros(0))
-        return GraphSolution(homographies, self.located, (), 0.0, lambda: nothing, model, rotations)
+        return GraphSolution(
+            homographies=homographies,
+            located=self.located,
+            outliers=(),
+            residual_px=0.0,
+            assess=lambda: nothing,
+            model=model,
+            rotations=rotations,
+        )
 
 
 def _tree(n_nodes: int, pairs: NDArray[np.integer], anchor: int) -> tuple[NDArray[np.integer], NDArray[np.integer]]:

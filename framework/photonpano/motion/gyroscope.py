@@ -144,7 +144,7 @@ def _samples(reader: Any, columns: dict[str, int], file: Path) -> Iterator[list[
             raise InputError(f"{line}: expected a number for each of {named}, got {','.join(row)!r}") from None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Gyroscope:
     """Rates about the axes of the camera, and what was found of them."""
 
@@ -243,6 +243,7 @@ def fit_rates(
     source: Source,
     file: Path,
     camera: Camera,
+    *,
     timeline: Timeline,
     context: Context,
     noise: float,
@@ -293,7 +294,16 @@ def fit_rates(
     bias = ", ".join(f"{value:.3g} +- {std:.1g}" for value, std in np.rad2deg([motion[:3], std_bias]).T)
     text = f"time offset {found_s:.6g} +- {std_offset_s:.1g} s, axes ({axes}), bias ({bias}) deg/s"
     reason = f"photons along its rates stand out by {significance:.2g} standard deviations from those along opposite ones"
-    gyroscope = Gyroscope(about[axes], camera, info.frame_shape, frames_s, noise, motion[:3], std_bias, std_offset_s)
+    gyroscope = Gyroscope(
+        rates=about[axes],
+        camera=camera,
+        frame_shape=info.frame_shape,
+        frames_s=frames_s,
+        noise=noise,
+        bias_rad_s=motion[:3],
+        std_bias_rad_s=std_bias,
+        std_offset_s=std_offset_s,
+    )
     return gyroscope, Decision(GYROSCOPE, text, reason)
 
 

@@ -239,7 +239,7 @@ class NamedLocator:
     component: Locator
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Level:
     """The components of one level, built: see `photonpano.contracts.attribution`."""
 
@@ -284,7 +284,7 @@ class Level:
         return replace(motion, homography=homography, information=information, residual_px=residual_px, patches=patches)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class VirtualExposures:
     """The virtual exposures of a level, planned. May be used from several threads."""
 

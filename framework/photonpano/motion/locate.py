@@ -43,7 +43,7 @@ class LoopSetting:
     gyroscope: Gyroscope | None = None  # ties exposures, and knows how they tremble
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LocatedLevel:
     """The exposures of a level, located."""
 
@@ -120,7 +120,7 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
         f"level-{level.number}", groups, pairs, known, exposures.timeline, camera, decisions=decisions
     )
     with context.pool() as pool:
-        registrar = Registrar(exposures, log, context, pool, start, excluded)
+        registrar = Registrar(exposures, log, context, pool=pool, start=start, excluded=excluded)
         title = f"level {level.number}: merge and locate"
         with context.progress.stage(title, len(groups), "exposures") as advance:
             edges = tuple(registrar.edges(pairs, advance))
@@ -135,7 +135,9 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
                 "a failure is NotLocated"
             )
         with exposures.clock("locate"), solving(level.number):
-            edges = _checked_fallbacks(edges, level.locators[0].name, groups, shape, registrar.to_plane, model)
+            edges = _checked_fallbacks(
+                edges, level.locators[0].name, groups, frame_shape=shape, start=registrar.to_plane, model=model
+            )
         if by_hand:
             starts = [_started(each, registrar.to_plane) for each in by_hand]
             kept = context.checkpoints.log(
@@ -148,12 +150,21 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
         with exposures.clock("locate"), solving(level.number):
             labels = components(len(groups), edges)
             foreseen = np.array([exposures.is_foreseen(index) for index in range(len(groups))])
-            tied = level.number, groups, edges, labels, registrar.contrasts, graph.disconnected, exposures.merged, foreseen
-            require_tied(*tied, frame_shape=shape)
+            require_tied(
+                level.number,
+                groups,
+                edges,
+                parts=labels,
+                contrasts=registrar.contrasts,
+                disconnected=graph.disconnected,
+                merged=exposures.merged,
+                foreseen=foreseen,
+                frame_shape=shape,
+            )
             largest = np.flatnonzero(labels == 0)
             anchor = int(largest[len(largest) // 2])
             to_plane = registrar.to_plane
-            solution = solve(groups, edges, anchor, shape, to_plane, model)
+            solution = solve(groups, edges, anchor, frame_shape=shape, start=to_plane, model=model)
             rivals = solution.compare()
             candidates = [pair for pair in closure_candidates(groups, solution, shape, graph) if pair not in excluded]
             between = [inverse(solution.homographies[fixed]) @ solution.homographies[moving] for moving, fixed in candidates]
@@ -168,20 +179,20 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
     with exposures.clock("locate"), solving(level.number):
         if closures:
             alone, model = solution, solution.model
-            solution = solve(groups, edges + closures, anchor, shape, to_plane, model)
+            solution = solve(groups, edges + closures, anchor, frame_shape=shape, start=to_plane, model=model)
             fair = _not_outvoting(closures, edges, alone, solution)
             if fair != closures:
-                closures, solution = fair, solve(groups, edges + fair, anchor, shape, to_plane, model)
+                closures, solution = fair, solve(groups, edges + fair, anchor, frame_shape=shape, start=to_plane, model=model)
         assessed = solution.assess()
     return LocatedLevel(
-        groups,
-        edges + closures,
-        closures,
-        solution,
-        assessed,
-        shape,
-        rivals,
-        _ambiguity(level.number, registrar.alternatives_px, edges, shape),
+        groups=groups,
+        edges=edges + closures,
+        closures=closures,
+        solution=solution,
+        assessed=assessed,
+        frame_shape=shape,
+        rivals=rivals,
+        ambiguity=_ambiguity(level.number, registrar.alternatives_px, edges, shape),
     )
 
 
@@ -210,6 +221,7 @@ def _checked_fallbacks(
     edges: Sequence[Edge],
     first_locator: str,
     groups: Sequence[Group],
+    *,
     frame_shape: tuple[int, int],
     start: FloatArray | None,
     model: MotionModel,
@@ -229,7 +241,7 @@ def _checked_fallbacks(
     for part in {int(parts[moving]) for moving, _ in tied}:
         of_part = [edge for edge in firsts if parts[edge.moving] == part]
         anchor = of_part[len(of_part) // 2].moving
-        homographies = solve(groups, of_part, anchor, frame_shape, start, model).homographies
+        homographies = solve(groups, of_part, anchor, frame_shape=frame_shape, start=start, model=model).homographies
         for edge in others:
             if (edge.moving, edge.fixed) in tied and parts[edge.moving] == part and isinstance(edge.motion, Located):
                 between = inverse(homographies[edge.fixed]) @ homographies[edge.moving]

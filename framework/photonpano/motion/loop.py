@@ -37,7 +37,7 @@ _SHRINKS = 0.75  # change of the motion by a level, over that by the level befor
 TOO_NARROW = 3.0  # expected errors by which homographies that are likelier differ from what a model of the motion can hold
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LevelResult:
     """The motion after one level."""
 
@@ -122,13 +122,32 @@ def estimate_motion(
             with clock("locate"):
                 start = context.checkpoints.once("level-1-start", partial(starting_motion, seen, groups, context), groups)
             start = start and replace(start, timeline=timeline)
-        exposures = VirtualExposures(turning, seen, groups, previous, clock, timeline, start, known)
+        exposures = VirtualExposures(
+            level=turning,
+            source=seen,
+            groups=groups,
+            previous=previous,
+            clock=clock,
+            timeline=timeline,
+            start=start,
+            known=known,
+        )
         located = locate(exposures, setting, start)
         interpolated = interpolate(exposures, located, timeline, reference, corrected)
         trajectory = interpolated.trajectory
         require_agreement(ties_of(setting.graph.tie, seen), groups, located.solution.located, trajectory)
         uncertainty = Uncertainty(located, interpolated, previous, timeline)
-        results.append(LevelResult(level, groups, located, trajectory, uncertainty, clock.seconds, exposures))
+        results.append(
+            LevelResult(
+                level=level,
+                groups=groups,
+                located=located,
+                trajectory=trajectory,
+                uncertainty=uncertainty,
+                seconds=clock.seconds,
+                exposures=exposures,
+            )
+        )
         context.progress.note(_summary(results[-1]))
         context.on_level(results[-1])
         previous, known = trajectory, located.covered
@@ -167,12 +186,15 @@ def interpolate(
     """
     measured = Knots.of(located)
     with exposures.clock("interpolate"):
-        knots, trajectory = measured, _through(measured, exposures, located, timeline, reference, refined)
+        knots, trajectory = (
+            measured,
+            _through(measured, exposures, located, timeline=timeline, reference=reference, refined=refined),
+        )
         for _ in range(_CENTRED):
             displaced = exposures.off_centre(trajectory)[located.solution.located]
             smooth = _smooth_share(trajectory, located)
             knots = measured.moved(smooth * displaced + (1 - smooth) * np.eye(3))
-            trajectory = _through(knots, exposures, located, timeline, reference, refined)
+            trajectory = _through(knots, exposures, located, timeline=timeline, reference=reference, refined=refined)
         # No interpolator smooths what all exposures share, such as the error of a focal length.
         std_px, shared_px = located.std_px, std_of(located.assessed.shared_px)
         own_px = located.assessed.errors_px - located.assessed.shared_px
@@ -184,7 +206,9 @@ def interpolate(
         left_px2 = (corner_displacements(aligned, np.eye(3), located.frame_shape) ** 2).mean(axis=-1)
         for errors in np.moveaxis(own_px, -1, 0)[:_DRAWS]:
             moved = knots.moved(moving_corners(errors, located.frame_shape))
-            answer = _through(moved, exposures, located, timeline, reference, refined).at(located.instants)
+            answer = _through(moved, exposures, located, timeline=timeline, reference=reference, refined=refined).at(
+                located.instants
+            )
             answer = inverse(known) @ align_planes(answer, known, located.frame_shape) @ answer
             products += (errors**2).sum(axis=1), ((transform_points(answer, here) - here).reshape(-1, 8) * errors).sum(axis=1)
     # The covariance of what is smoothed with the errors of what it is made of is its variance (a Gaussian smoother), and knots
@@ -211,6 +235,7 @@ def _through(
     knots: Knots,
     exposures: VirtualExposures,
     located: LocatedLevel,
+    *,
     timeline: Timeline,
     reference: int,
     refined: Trajectory | None,

@@ -35,7 +35,7 @@ _DAMPING, _TINY = 1e-6, 1e-12
 ModelName = Literal["auto", "translation", "euclidean", "similarity", "affine", "homography", "rotation"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MotionModel:
     """The model of the motion of a camera."""
 

@@ -105,7 +105,7 @@ def lengths_of(groups: Sequence[Group]) -> FloatArray:
     return np.array([float(len(group.span)) for group in groups])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Ties:
     """Points that show one place in two frames, of which the later one comes first."""
 
@@ -249,7 +249,14 @@ def read_ties(file: Path, info: StreamInfo) -> Ties:
     numbers = np.array(list(rows.values()))
     sides = numbers[:, :6].reshape(-1, 2, 3)
     sides = np.take_along_axis(sides, np.argsort(-sides[..., :1], axis=1), axis=1)
-    return Ties(file, np.array(list(rows)), sides[..., 0], sides[..., 1:], numbers[:, 6], info.frame_shape)
+    return Ties(
+        file=file,
+        lines=np.array(list(rows)),
+        frames=sides[..., 0],
+        points=sides[..., 1:],
+        std_px=numbers[:, 6],
+        frame_shape=info.frame_shape,
+    )
 
 
 def _row(row: dict[str, str], where: str, info: StreamInfo) -> list[float]:

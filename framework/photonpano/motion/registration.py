@@ -403,6 +403,7 @@ class Registrar:
         exposures: VirtualExposures,
         log: Log,
         context: Context,
+        *,
         pool: Executor,
         start: StartingMotion | None = None,
         excluded: Set[tuple[int, int]] = frozenset(),

@@ -50,7 +50,7 @@ _POWERS = np.array([2, 4, 1, 1])  # of the focal length, with which k1, k2, p1 a
 _STEP_RAD = np.deg2rad(30)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LensShift:
     """What undistorting pixels with the wrong lens does to pairs: it changes their homographies, and bends their patches."""
 
@@ -87,7 +87,14 @@ class LensShift:
         weighted = np.swapaxes(weighted.reshape(by_points.shape), -1, -2)
         normal = weighted @ by_points
         normal += _DAMPING * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(8)
-        found = cls(points, shifts, roots, by_points, np.linalg.solve(normal, weighted), slopes_at(corners(frame_shape)))
+        found = cls(
+            points=points,
+            shifts=shifts,
+            roots=roots,
+            of_homography=by_points,
+            fitted=np.linalg.solve(normal, weighted),
+            to_corners=slopes_at(corners(frame_shape)),
+        )
         noise = robust_std(found.unexplained()[roots.any(axis=(2, 3)).repeat(2)])
         return replace(found, roots=roots / max(noise, 1.0))
 

@@ -115,7 +115,7 @@ class Hypotheses:
         return float(differences[differences > 0].min(initial=np.inf))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StartingMotion:
     """A motion without rotation, from the velocity of the image in windows of the length of a group."""
 
@@ -184,7 +184,13 @@ def starting_motion(source: Source, groups: Sequence[Group], context: Context) -
     velocities, alternatives, rivals = _continuous([each for _, each in known])
     instants, px_per_frame = np.array([instant for instant, _ in known]), max(each.px_per_frame for _, each in known)
     steady = _steady(velocities, px_per_frame)
-    return StartingMotion(instants[steady], velocities[steady], alternatives[steady], rivals[steady], 1.5 * length)
+    return StartingMotion(
+        instants=instants[steady],
+        velocities=velocities[steady],
+        alternatives=alternatives[steady],
+        rivals=rivals[steady],
+        reach=1.5 * length,
+    )
 
 
 def _hypotheses(source: Source, length: int, start: int, offered: Sequence[FloatArray] = ()) -> Hypotheses | None:

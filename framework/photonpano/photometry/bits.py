@@ -48,7 +48,7 @@ def sum_bits(packed: NDArray[np.uint8], n_frames: int, little: bool, counts: NDA
 
 
 @compiled
-def _sum_bits(
+def _sum_bits(  # noqa: PLR0917
     packed: NDArray[np.uint8], n_frames: int, frame_bytes: int, start: int, size: int, stages: NDArray[np.uint64]
 ) -> None:
     """Sum some bytes of all frames; the counters are rows 8 to 10 of each stage."""

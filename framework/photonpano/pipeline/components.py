@@ -134,14 +134,16 @@ def build_levels(plan: Plan, source: Source, decisions: Journal, shortened: int 
 
     return tuple(
         Level(
-            number,
-            scale_of(plan, number, source.info.frame_shape),
-            of_level(level.resample, number),
-            of_level(level.merge, number),
-            tuple(NamedLocator(name, of_level(each, number)) for name, each in _named((level.locate, *level.fallbacks))),
-            of_level(level.interpolate, number),
-            recorder,
-            isinstance(level.merge.contribution, MergerContribution) and level.merge.contribution.handles_movers,
+            number=number,
+            scale=scale_of(plan, number, source.info.frame_shape),
+            resampler=of_level(level.resample, number),
+            merger=of_level(level.merge, number),
+            locators=tuple(
+                NamedLocator(name, of_level(each, number)) for name, each in _named((level.locate, *level.fallbacks))
+            ),
+            interpolator=of_level(level.interpolate, number),
+            recorder=recorder,
+            handles_movers=isinstance(level.merge.contribution, MergerContribution) and level.merge.contribution.handles_movers,
         )
         for number, level in enumerate(plan.levels, start=1)
     )

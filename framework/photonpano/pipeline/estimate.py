@@ -50,10 +50,10 @@ def _in_attempts(plan: Plan, source: Source, attempts: list[Journal], context: C
 
     `attempts` receives the decisions of each attempt.
     """
-    in_shots = partial(_in_shots, timeline_of(source, context), plan, source, attempts, context)
+    in_shots = partial(_in_shots, timeline_of(source, context), plan, source, attempts=attempts, context=context)
     started = plan.motion.start != "none"
     try:
-        return in_shots(started, 1)
+        return in_shots(started=started, shortened=1)
     except LocationError as unlocated:
         error = unlocated
     others: list[tuple[str, bool, int]] = []
@@ -64,19 +64,19 @@ def _in_attempts(plan: Plan, source: Source, attempts: list[Journal], context: C
         others += [(f"1/{times} of the group size", started, times) for times in _SHORTENED]
     for what, start, shortened in others:
         try:
-            return in_shots(start, shortened)
+            return in_shots(started=start, shortened=shortened)
         except (LocationError, InputError) as failure:
             tell_attempt(error, what, failure)
     raise error
 
 
 def _in_shots(
-    timeline: Timeline, plan: Plan, source: Source, attempts: list[Journal], context: Context, started: bool, shortened: int
+    timeline: Timeline, plan: Plan, source: Source, *, attempts: list[Journal], context: Context, started: bool, shortened: int
 ) -> State:
     """Estimate the motion of a capture as one, or in shots if its exposures fall into such."""
     while True:
         try:
-            return _along(timeline, plan, source, attempts, context, started, shortened)
+            return _along(timeline, plan, source, attempts=attempts, context=context, started=started, shortened=shortened)
         except ApartError as apart:
             shots = apart.shots
         except UntiedError as unlocated:
@@ -92,7 +92,7 @@ def _in_shots(
 
 
 def _along(
-    timeline: Timeline, plan: Plan, source: Source, attempts: list[Journal], context: Context, started: bool, shortened: int
+    timeline: Timeline, plan: Plan, source: Source, *, attempts: list[Journal], context: Context, started: bool, shortened: int
 ) -> State:
     """Estimate the motion of the frames that a timeline shows, from a constant velocity if it is `started`."""
     attempts.append([])
@@ -105,7 +105,17 @@ def _along(
     findings = Findings(standing_share=capture_of(source).still.share, start=velocity, gyroscope=fitted)
     attempts[-1] += findings.started
     state = State(
-        plan, source, context, reference, levels, timeline, model_of(plan), start, gyroscope, shortened, findings=findings
+        plan=plan,
+        source=source,
+        context=context,
+        reference=reference,
+        levels=levels,
+        timeline=timeline,
+        model=model_of(plan),
+        start=start,
+        gyroscope=gyroscope,
+        shortened=shortened,
+        findings=findings,
     )
     state = state.located(levels[:1], start)
     located = state.results[-1].located
@@ -183,7 +193,16 @@ def _gyroscope(
     if (prior := plan.motion.prior) is None:
         return None, None
     camera, noise = model_of(plan).camera(source.info.frame_shape), float(np.radians(prior.noise_deg_s_sqrt_hz))
-    return fit_rates(source, prior.imu, camera, timeline, context, noise=noise, axes=prior.axes, offset_s=prior.time_offset_s)
+    return fit_rates(
+        source,
+        prior.imu,
+        camera,
+        timeline=timeline,
+        context=context,
+        noise=noise,
+        axes=prior.axes,
+        offset_s=prior.time_offset_s,
+    )
 
 
 def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decision]:

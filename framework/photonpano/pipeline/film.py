@@ -28,7 +28,7 @@ _LINES_PER_PX = 1 / 300  # width of the outline, as a fraction of the longer sid
 _THINNEST_PX, _MARGIN_PX = 2, 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Film:
     """What the pictures of a video show."""
 
@@ -65,7 +65,7 @@ class Film:
         if self.smooth_frames is not None:
             to_view = np.linalg.inv(smooth_view(self.motion, span.centre, self.smooth_frames))
             canvas = replace(canvas, transform=canvas.transform @ to_view)
-        return merged(self.source, self.motion, span, canvas, self.tolerance_px, 1)
+        return merged(self.source, self.motion, span, canvas=canvas, tolerance_px=self.tolerance_px, threads=1)
 
     def _picture(self, span: FrameSpan, around: FluxImage | None) -> FluxImage:
         """Return levels from 0 to 1, with those of the panorama around the frame."""
@@ -90,10 +90,10 @@ class Film:
 
 
 def merged(
-    source: Source, motion: FrameMotion, span: FrameSpan, canvas: Canvas, tolerance_px: float, threads: int
+    source: Source, motion: FrameMotion, span: FrameSpan, *, canvas: Canvas, tolerance_px: float, threads: int
 ) -> FluxImage:
     """Merge frames on a canvas along a motion; of a filter array, the colours: (H, W) or (H, W, 3)."""
-    return composed(render(source, motion.trajectory, span, canvas, tolerance_px, Context(threads)), source).flux
+    return composed(render(source, motion.trajectory, span, canvas, tolerance_px, Context(threads=threads)), source).flux
 
 
 def outline_on(canvas: Canvas, motion: FrameMotion, camera: Camera | None, instant: float) -> FluxImage:

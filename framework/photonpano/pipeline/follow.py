@@ -67,7 +67,7 @@ def followed(
         page = _Page(folder, directory.name)
         progress.note(f"following the capture; {folder / PAGE} shows the panorama so far")
         try:
-            _follow(plan, run, look, page, progress, spool, end_after)
+            _follow(plan, run, look, page=page, progress=progress, spool=spool, end_after=end_after)
             page.write(state="finishing", message="")
             yield plan
             page.write(state="finished")
@@ -88,6 +88,7 @@ def _follow(
     plan: Plan,
     run: Callable[[Plan], object],
     look: Callable[[Any], Arrived],
+    *,
     page: _Page,
     progress: Progress,
     spool: Spool | None,

@@ -70,7 +70,15 @@ def forecast(plan: Plan, source: Source) -> Forecast:
     memory = int(plan.run.memory)
     canvas = plan_canvas(trajectory, part.info.span, part.info.frame_shape, scale, memory, bytes_per_pixel, view=view)
     with one_thread_inside():
-        render(part, trajectory, part.info.span, canvas, plan.render.tolerance_px, Context(threads), renderer)
+        render(
+            part,
+            trajectory,
+            part.info.span,
+            canvas,
+            tolerance_px=plan.render.tolerance_px,
+            context=Context(threads=threads),
+            renderer=renderer,
+        )
     seconds["panorama"] = (time.perf_counter() - start) * more
     height, width = _expected_shape(plan, part.info.frame_shape, canvas, more)
     rendering = min(bytes_per_pixel * height * width, memory)
@@ -94,7 +102,15 @@ def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: Canvas, mor
 
 def _tried(plan: Plan, part: Source, threads: int) -> tuple[LevelResult, ...]:
     levels, n_frames = build_levels(plan, part, []), part.info.n_frames
-    state = State(plan, part, Context(threads), n_frames // 2, levels, Timeline.regular(n_frames), model_of(plan))
+    state = State(
+        plan=plan,
+        source=part,
+        context=Context(threads=threads),
+        reference=n_frames // 2,
+        levels=levels,
+        timeline=Timeline.regular(n_frames),
+        model=model_of(plan),
+    )
     with one_thread_inside():
         return state.located(levels, None).results
 

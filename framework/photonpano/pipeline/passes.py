@@ -65,7 +65,7 @@ _NOT_RELOCATED = "the motion of the last level along the refined one is not used
 _BLURRED_PX = 1.0  # mean correction by which the exposures were blurred so that it pays to locate them again
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Proposal:
     """A change of the state."""
 
@@ -125,7 +125,7 @@ def through_found_lens(state: State) -> Proposal | None:
     seen = camera_of(result.exposures.source) or Camera(found.matrix)
     if lenses_apart_px(found, seen, state.source.info.frame_shape) < SAME_LENS_PX:
         return None
-    return Proposal(lambda: state.located([result.level], state.trajectory), worse=None)
+    return Proposal(make=lambda: state.located([result.level], state.trajectory), worse=None)
 
 
 def without_shading(state: State) -> Proposal | None:
@@ -150,7 +150,7 @@ def without_shading(state: State) -> Proposal | None:
         again = vignette_of(plan, with_background(source, background), state.trajectory)
         return first if again is None else divided(again)
 
-    return Proposal(make, worse=None)
+    return Proposal(make=make, worse=None)
 
 
 def vignette_of(plan: Plan, source: Source, trajectory: Trajectory) -> Vignette | None:
@@ -200,7 +200,7 @@ def in_changing_light(state: State) -> Proposal | None:
         return replace(lit(corrected), results=proposed.results, outdated=False)
 
     rejection = "the light is taken for steady, since in the light that was found"
-    return Proposal(make, None if mode == "changing" else worse_in_light, settle, rejection)
+    return Proposal(make=make, worse=None if mode == "changing" else worse_in_light, settle=settle, rejection=rejection)
 
 
 def worse_in_light(proposed: MotionFit, before: MotionFit) -> str:
@@ -233,7 +233,7 @@ def later_levels(state: State) -> Proposal:
                 break
         return located
 
-    return Proposal(make, worse=None)
+    return Proposal(make=make, worse=None)
 
 
 def without_movers(state: State) -> Proposal | None:
@@ -255,7 +255,7 @@ def without_movers(state: State) -> Proposal | None:
         found = None
     watched = replace(state if found is None else _with_background(state, found), watched=True)
     # Residuals of what is left out, and not, cannot be compared.
-    return Proposal(lambda: watched, worse=None)
+    return Proposal(make=lambda: watched, worse=None)
 
 
 def without_what_changes(state: State) -> Proposal | None:
@@ -268,7 +268,7 @@ def without_what_changes(state: State) -> Proposal | None:
     if found is None:
         return None
     found = found if known is None else found.without(known)
-    return Proposal(lambda: replace(_with_background(state, found), known_fit=None), worse=None)
+    return Proposal(make=lambda: replace(_with_background(state, found), known_fit=None), worse=None)
 
 
 def _with_background(state: State, found: Background) -> State:
@@ -286,7 +286,7 @@ def again_without_movers(state: State) -> Proposal | None:
     """Run the last level again, if what hides the background was looked for since, in the light of lamps on what is left."""
     if not state.outdated or capture_of(state.source).background is None:
         return None
-    return Proposal(lambda: _in_lamps(state).located([state.results[-1].level], state.trajectory), worse=None)
+    return Proposal(make=lambda: _in_lamps(state).located([state.results[-1].level], state.trajectory), worse=None)
 
 
 def _in_lamps(state: State) -> State:
@@ -336,7 +336,7 @@ def cut_at_jumps(state: State) -> Proposal | None:
         return replace(state, findings=replace(state.findings, uncut_jump=found))
 
     worse = (lambda *_: "") if dark else MotionFit.worse_than
-    return Proposal(make, worse, refused=refused, rejection=rejection, severity=logging.WARNING)
+    return Proposal(make=make, worse=worse, refused=refused, rejection=rejection, severity=logging.WARNING)
 
 
 def _located_anew(state: State) -> State:
@@ -384,7 +384,7 @@ def refine(state: State, refiners: Sequence[NamedRefiner], decisions: Journal | 
             rounds.append(summary)
             state.context.progress.note(f"{refiner.name}: {summary}")
             if len(rounds) == 1 and _change_px(before, state.motion) > _BLURRED_PX:
-                state = tried(state, lambda known: Proposal(known.relocated, rejection=_NOT_RELOCATED)).state
+                state = tried(state, lambda known: Proposal(make=known.relocated, rejection=_NOT_RELOCATED)).state
         refinements.append(Refinement(refiner.name, tuple(rounds), _change_px(before, state.motion), kept_out))
     state = tried(state, without_what_changes).state
     return state, state.fit().explained(refinements)
@@ -403,10 +403,10 @@ def _corrected(state: State, refiner: NamedRefiner, place: int, number: int, dec
     motion = replace(state.motion, trajectory=trajectory, homographies=homographies, std_px=std_px, remaining_px=remaining_px)
     if number > 1 and _change_px(state.motion, motion) < _LINEAR_PX:
         return Proposal(
-            lambda: replace(state, refined=motion, known_fit=state.fit().moved(motion)), None, summary=found.summary
+            make=lambda: replace(state, refined=motion, known_fit=state.fit().moved(motion)), worse=None, summary=found.summary
         )
     rejection = f"a correction of {label_of(refiner.component)} is not used"
-    return Proposal(lambda: replace(state, refined=motion, known_fit=None), rejection=rejection, summary=found.summary)
+    return Proposal(make=lambda: replace(state, refined=motion, known_fit=None), rejection=rejection, summary=found.summary)
 
 
 def _refined(refiner: NamedRefiner, state: State) -> Refined | None:

@@ -43,7 +43,7 @@ logger = logging.getLogger(__name__)
 
 
 def render_into(
-    folder: RunFolder, plan: Plan, source: Source, vignette: Vignette | None, motion: FrameMotion, context: Context
+    folder: RunFolder, plan: Plan, source: Source, *, vignette: Vignette | None, motion: FrameMotion, context: Context
 ) -> tuple[RenderedPanorama, Journal]:
     """Render the panorama, and write it, its motion, and what its capture was divided by. For errors, see `run`.
 
@@ -54,7 +54,7 @@ def render_into(
     renderer = build_renderer(plan, source, decisions, context.in_order)
     exporters = build_exporters(plan, source, decisions)
     with naming_key_of_canvas(plan):
-        panorama = _rendered(folder, plan, source, motion, context, renderer)
+        panorama = _rendered(folder, plan, source, motion=motion, context=context, renderer=renderer)
     renderer.require_seen(panorama.coverage_share)
     folder.write_results(panorama, motion)
     for exporter in exporters:
@@ -70,7 +70,7 @@ def render_into(
 
 
 def _rendered(
-    folder: RunFolder, plan: Plan, source: Source, motion: FrameMotion, context: Context, renderer: ChosenRenderer
+    folder: RunFolder, plan: Plan, source: Source, *, motion: FrameMotion, context: Context, renderer: ChosenRenderer
 ) -> RenderedPanorama:
     """Render the frames of a motion, in tiles if the panorama exceeds the memory, and write these."""
     start, settings, memory = time.perf_counter(), plan.render, int(plan.run.memory)
@@ -80,8 +80,10 @@ def _rendered(
     canvas = plan_canvas(*shown, settings.scale, memory, bytes_per_pixel, settings.extent, view)
     tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
     noise = CanvasNoise.of(source, motion.trajectory, motion.span, canvas, motion.std_px)
-    gathered, dynamic_range = Thumbnail(canvas, reduction), DynamicRange(noise)
-    rendered = render_tiles(renderer, source, motion.trajectory, motion.span, tiles, settings.tolerance_px, context)
+    gathered, dynamic_range = Thumbnail(canvas, reduction), DynamicRange(noise=noise)
+    rendered = render_tiles(
+        renderer, source, motion.trajectory, motion.span, tiles=tiles, tolerance_px=settings.tolerance_px, context=context
+    )
     for tile, images in zip(tiles, rendered, strict=True):
         part = composed(images, source)
         std = np.empty_like(part.flux)
@@ -99,7 +101,17 @@ def _rendered(
     picture = picture_of(lit_picture, white_flux, settings.tone, settings.exposure_stops)
     seconds = time.perf_counter() - start
     share, white_flux = gathered.coverage_share, white_flux / 2**settings.exposure_stops
-    return RenderedPanorama(canvas, thumbnail, reduction, picture, white_flux, share, seconds, gathered.std, dynamic_range)
+    return RenderedPanorama(
+        canvas=canvas,
+        thumbnail=thumbnail,
+        reduction=reduction,
+        picture=picture,
+        white_flux=white_flux,
+        coverage_share=share,
+        seconds=seconds,
+        std=gathered.std,
+        dynamic_range=dynamic_range,
+    )
 
 
 @contextmanager
@@ -120,7 +132,7 @@ class ChosenRenderer:
     bytes_per_pixel: int
     any_canvas: bool = True
 
-    def render(
+    def render(  # noqa: PLR0917
         self,
         source: Source,
         trajectory: Trajectory,
@@ -173,7 +185,7 @@ def build_renderer(plan: Plan, source: Source, decisions: Journal, in_order: InO
     return ChosenRenderer(built(choice, context, "the panorama"), contribution.bytes_per_pixel, any_canvas)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StoredPanorama:
     """The files of a rendered panorama: a `FinishedPanorama`."""
 
@@ -190,7 +202,15 @@ class StoredPanorama:
         """Open the maps of a panorama in a folder."""
         flux, weight, std = (tifffile.memmap(folder / name, mode="r") for name in MAPS)
         canvas, noise = panorama.canvas, panorama.dynamic_range.noise
-        return cls(flux, weight, std, canvas.transform, panorama.white_flux, noise, canvas.projection)
+        return cls(
+            flux=flux,
+            weight=weight,
+            std=std,
+            canvas=canvas.transform,
+            white_flux=panorama.white_flux,
+            noise=noise,
+            projection=canvas.projection,
+        )
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -150,14 +150,23 @@ def make_panorama(run: BegunRun) -> None:
         explained, findings = beside_alternatives(state, explained)
         journal += _last_decisions(state, findings)
         source, context = state.view
-        panorama, chosen = render_into(folder, plan, source, state.vignette, explained.motion, context)
+        panorama, chosen = render_into(folder, plan, source, vignette=state.vignette, motion=explained.motion, context=context)
         findings = replace(findings, never_seen_share=panorama.never_seen_share)
         verdict = judge(explained, state.results, findings)
         run.observers.rendered(panorama.canvas, panorama.seconds)
         if plan.output.keep == "exposures":
             with folder.writing():
                 write_exposures(folder.staging, state.results, panorama.white_flux, context)
-    record = record_of(run.started_record(), plan, state.results, explained, verdict, panorama, chosen, findings)
+    record = record_of(
+        run.started_record(),
+        plan,
+        state.results,
+        explained=explained,
+        verdict=verdict,
+        panorama=panorama,
+        rendered=chosen,
+        findings=findings,
+    )
     light, capture = light_of(source), OpenCapture(source, state.results)
     run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)
 
@@ -173,7 +182,7 @@ def _last_decisions(state: State, findings: Findings) -> Iterator[Decision]:
         yield Decision("rival_motion", rival.px, rival.where)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class BegunRun:
     """A run that has begun."""
 
@@ -238,7 +247,9 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
         run_folder(plan.output.directory, overwrite=overwrite, inputs=read) as folder,
         one_thread_inside(),
     ):
-        run = BegunRun(plan, source, folder, observers, progress, time.perf_counter())
+        run = BegunRun(
+            plan=plan, source=source, folder=folder, observers=observers, progress=progress, start=time.perf_counter()
+        )
         _require_photons(plan, source)
         if how.resume and (done := finished_run(plan, run.capture)) is not None:
             run.record, run.was_finished = done, True

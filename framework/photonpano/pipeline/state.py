@@ -33,7 +33,7 @@ class View(NamedTuple):
     context: Context
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class State:
     """A capture as corrected so far, and its motion as known so far. It is frozen: passes return new states."""
 
@@ -140,7 +140,9 @@ def model_of(plan: Plan) -> MotionModel:
     """Return the motions that a spec allows the camera."""
     camera, distortion = plan.camera, plan.camera.distortion
     k1, k2, p1, p2 = (_given(each) for each in (distortion.k1, distortion.k2, distortion.p1, distortion.p2))
-    return MotionModel(plan.motion.model, _given(camera.focal_px), camera.centre_px, (k1, k2, p1, p2))
+    return MotionModel(
+        kind=plan.motion.model, focal_px=_given(camera.focal_px), centre_px=camera.centre_px, distortion=(k1, k2, p1, p2)
+    )
 
 
 def _given(number: float | Literal["find"]) -> float | None:

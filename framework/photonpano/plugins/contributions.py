@@ -143,7 +143,7 @@ class ExecutorContext:
     threads: int  # the number of threads of the run
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
     """One kind of component. Hooks, the reader of specs, the JSON Schema and the conformance kit go by this row."""
 
@@ -220,7 +220,7 @@ class Contribution:
         super().__init_subclass__()
         if kind:
             cls.kind = kind
-            KINDS[kind] = Kind(kind, contribution=cls, **row)
+            KINDS[kind] = Kind(name=kind, contribution=cls, **row)
 
     def __post_init__(self) -> None:
         if not _KEBAB.fullmatch(self.name):

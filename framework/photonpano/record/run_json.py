@@ -73,6 +73,7 @@ def record_of(
     started: RunRecord,
     plan: Plan,
     levels: Sequence[LevelResult],
+    *,
     explained: Explained,
     verdict: Verdict,
     panorama: RenderedPanorama,

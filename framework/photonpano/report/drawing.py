@@ -97,6 +97,7 @@ def add_axes(
     figure: Figure,
     margins: Margins,
     rows: Sequence[float] = (1,),
+    *,
     columns: int = 1,
     gap_in: float = 0.25,
     share_x: bool = False,

@@ -108,8 +108,8 @@ def panorama_maps(panorama: RenderedPanorama) -> list[dict[str, Any]]:
     seen = weight > 0
     percent = np.where(seen & np.isfinite(relative), relative, np.nan)
     return [
-        _map("Coverage", np.where(seen, weight, np.nan), "frames", box, "viridis", low=0.0),
-        _map("Uncertainty", percent, "% of the flux", box, "magma"),
+        _map("Coverage", np.where(seen, weight, np.nan), "frames", box=box, colours="viridis", low=0.0),
+        _map("Uncertainty", percent, "% of the flux", box=box, colours="magma"),
     ]
 
 
@@ -118,11 +118,11 @@ def _chi2_map(explained: Explained, canvas: Canvas) -> list[dict[str, Any]]:
         return []
     reduced_chi2, (left, top, right, bottom) = chi2_cells(explained.residuals, explained.canvas, canvas.transform)
     box = [round(float(side) + 0.5, 2) for side in (left, top, right, bottom)]
-    return [_map("Reduced chi-square", reduced_chi2.filled(np.nan), "(1 is photon noise)", box, "inferno")]
+    return [_map("Reduced chi-square", reduced_chi2.filled(np.nan), "(1 is photon noise)", box=box, colours="inferno")]
 
 
 def _map(
-    name: str, values: FloatArray | FluxImage, unit: str, box: Sequence[float], colours: str, low: float | None = None
+    name: str, values: FloatArray | FluxImage, unit: str, *, box: Sequence[float], colours: str, low: float | None = None
 ) -> dict[str, Any]:
     """Return a map as a picture in colours, transparent where it is NaN, with its legend."""
     from matplotlib import colormaps

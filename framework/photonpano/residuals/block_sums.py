@@ -25,7 +25,7 @@ def n_blocks(shape: tuple[int, ...]) -> tuple[int, int]:
 
 
 @compiled
-def add_block_sums(
+def add_block_sums(  # noqa: PLR0917
     counts: NDArray[np.float32] | NDArray[np.uint8],
     dark: NDArray[np.float32],
     n_frames: float,
@@ -97,7 +97,7 @@ def add_block_sums(
 
 
 @compiled
-def _terms(
+def _terms(  # noqa: PLR0917
     mean: np.float32,
     across: np.float32,
     along: np.float32,
@@ -118,7 +118,7 @@ def _terms(
 
 
 @compiled
-def add_pixel_sums(
+def add_pixel_sums(  # noqa: PLR0917
     counts: NDArray[np.float32] | NDArray[np.uint8],
     n_frames: float,
     mean: NDArray[np.float32],
@@ -168,7 +168,7 @@ class Totals(NamedTuple):
 
 
 @compiled
-def fold(
+def fold(  # noqa: PLR0917
     sums: NDArray[np.float32],
     lever: NDArray[np.float64],
     middle: NDArray[np.float64],

@@ -317,7 +317,7 @@ def _located(source: Source, between: FrameSpan, template: FluxImage, path: _Pat
     return None if sigmas < _SURE or short > jump or cut.size_px < SMALLEST_PX else cut
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Path:
     """A path of the image with a jump: the motion that was found, a cubic polynomial of time beyond that, and a step."""
 
@@ -339,7 +339,9 @@ class _Path:
         # The template shows what the middle of the path sees.
         followed = track.followed - track.followed[round(middle) - track.first]
         solution = np.linalg.lstsq(equations, track.beyond[numbers] - track.beyond[outlier.before])[0]
-        return cls(track.first, followed, middle, scale, solution[:-1], solution[-1])
+        return cls(
+            first=track.first, followed=followed, middle=middle, scale=scale, coefficients=solution[:-1], jump=solution[-1]
+        )
 
     def at(self, frame: int, share: float) -> FloatArray:
         """Return where the image is in a frame after a share of the jump: (2,) in binned px."""

@@ -127,7 +127,10 @@ def halves_of(source: Source, motion: FrameMotion, canvas: Canvas, context: Cont
         return Halves.none()
     starts = np.linspace(span.start, span.stop, number + 1).round().astype(int).tolist()
     with context.progress.stage("halves", len(span) * channels_of(source), "frames") as advance:
-        blocks = [_block(source, motion, FrameSpan(*ends), canvas, context, advance) for ends in pairwise(starts)]
+        blocks = [
+            _block(source, motion, FrameSpan(*ends), canvas=canvas, context=context, advance=advance)
+            for ends in pairwise(starts)
+        ]
     scale = canvas.transform[0, 0] / (1 if canvas.camera_matrix is None else canvas.camera_matrix[0, 0])
     widest_px = max(motion.frame_shape) / 2 * scale
     # Of the two parts of the first half, and of the second: flux times weight, and weight.
@@ -155,7 +158,7 @@ def _reduced(canvas: Canvas) -> Canvas:
 
 
 def _block(
-    source: Source, motion: FrameMotion, block: FrameSpan, canvas: Canvas, context: Context, advance: Callable[[int], None]
+    source: Source, motion: FrameMotion, block: FrameSpan, *, canvas: Canvas, context: Context, advance: Callable[[int], None]
 ) -> _Block:
     """Merge the frames of a block on the part of the canvas that they cover."""
     along = motion.trajectory.at(np.linspace(block.start, block.stop - 1, _SAMPLED).round())

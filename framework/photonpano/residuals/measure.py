@@ -54,7 +54,7 @@ _PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
 _SHRUNK = 0.5  # share of what is known of the shift of a single frame that comes from it, from which on the photons say nothing
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Residuals:
     """Observed minus predicted photons, summed in four ways."""
 
@@ -141,22 +141,22 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
     with np.errstate(divide="ignore", invalid="ignore"):
         pixel_gain = np.where(total.pixel_mean > 0, 1 + total.pixel_residual / total.pixel_mean, np.float32(np.nan))
         return Residuals(
-            spans,
-            np.array([each.centre for each in spans]),
-            normal,
-            gradient,
-            reduced_chi2,
-            total.blocks,
-            total.block_chi2 / total.block_count,
-            np.asarray(pixel_gain, np.float32),
-            total.pixel_mean,
-            total.cell_chi2 / total.cell_count,
-            total.cell_count,
-            total.cell_noise / total.cell_count,
-            predictions.frames_seen,
-            predictions.first.frame_shape,
-            light,
-            shaking,
+            spans=spans,
+            instants=np.array([each.centre for each in spans]),
+            normal=normal,
+            gradient=gradient,
+            reduced_chi2=reduced_chi2,
+            blocks=total.blocks,
+            block_chi2=total.block_chi2 / total.block_count,
+            pixel_gain=np.asarray(pixel_gain, np.float32),
+            pixel_mean=total.pixel_mean,
+            cell_chi2=total.cell_chi2 / total.cell_count,
+            cell_count=total.cell_count,
+            cell_noise=total.cell_noise / total.cell_count,
+            frames_seen=predictions.frames_seen,
+            frame_shape=predictions.first.frame_shape,
+            light=light,
+            shaking=shaking,
         )
 
 
@@ -251,7 +251,7 @@ def _shift_noise_px(predictions: Predictions, homographies: FloatArray) -> float
     return float(np.median(noises))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Colour:
     """Counts and prediction in one colour of the capture."""
 
@@ -273,7 +273,15 @@ class _Colour:
         dark = np.zeros(shape, np.float32) if corrected is None else -corrected(zeros, 1)
         slope = corrected(zeros + 1, 1) + dark if corrected is not None and capture.info.kind == "binary" else None
         masked = None if capture.valid.all() else np.where(capture.valid, np.float32(0), np.float32(np.nan))
-        return cls(capture, prediction, masked, corrected, dark, np.maximum(dark, 0), slope)
+        return cls(
+            capture=capture,
+            prediction=prediction,
+            masked=masked,
+            corrected=corrected,
+            dark=dark,
+            extra=np.maximum(dark, 0),
+            slope=slope,
+        )
 
     def counted(self, raw: Counts, span: FrameSpan) -> NDArray[np.float32] | NDArray[np.uint8]:
         """Return the counts of a span, corrected, NaN where masked or where something hides the background: (H, W)."""

@@ -23,7 +23,7 @@ _NODES_ERROR_PX = 0.005  # error of places that are interpolated between exact o
 _MARGIN = 4  # columns with which a full turn is continued on each side: more than the smoothing reaches
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Prediction:
     """The panorama, in one colour, as the camera would see it from any instant: a `PanoramaView`.
 
@@ -53,6 +53,7 @@ class Prediction:
         panorama: Panorama,
         canvas: Canvas,
         response: Response,
+        *,
         trajectory: Trajectory,
         frame_shape: tuple[int, int],
         light: Light | None = None,
@@ -82,7 +83,18 @@ class Prediction:
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
         texture = Texture.of(np.where(inside, mean, np.float32(0)))
         lens = camera if camera is not None and camera.distorts else None
-        return cls(canvas, texture, variance, trajectory, frame_shape, frames_seen, response, light, lens, margin)
+        return cls(
+            canvas=canvas,
+            mean=texture,
+            variance=variance,
+            trajectory=trajectory,
+            frame_shape=frame_shape,
+            frames_seen=frames_seen,
+            response=response,
+            light=light,
+            camera=lens,
+            margin=margin,
+        )
 
     def view(self, homography: Homography, into: NDArray[np.float32], span: FrameSpan | None = None) -> None:
         """Sample mean and variance at the pixels of a frame into (2, H, W) float32; the variance is 0 where they are not known.
@@ -172,8 +184,15 @@ class Predictions:
         capture = capture_of(source)
 
         def prediction(each: Capture, single: Panorama) -> Prediction:
-            seen = trajectory, frame_shape, capture.light, capture.camera
-            return Prediction.of(single, canvas, each.response, *seen)
+            return Prediction.of(
+                single,
+                canvas,
+                each.response,
+                trajectory=trajectory,
+                frame_shape=frame_shape,
+                light=capture.light,
+                camera=capture.camera,
+            )
 
         if capture.colour is None:
             return cls(((capture, prediction(capture, panorama)),))

@@ -143,7 +143,7 @@ class Refinement:
     kept_out: str = ""  # why its last motion was not used; empty if it was
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Explained:
     """The refined motion, and the residuals of the photons from a panorama along it."""
 
@@ -218,7 +218,14 @@ class MotionFit:
         halves = self._context.checkpoints.once("halves", compared, self.motion.homographies, self.motion.span)
         # Two frames know no more of each other than the weakest cut between them lets through.
         motion = replace(self.motion, std_px=np.maximum(std_px, halves.tied_px(located)))
-        return Explained(motion, self.canvas, residuals, self.ratio, halves, tuple(refinements))
+        return Explained(
+            motion=motion,
+            canvas=self.canvas,
+            residuals=residuals,
+            ratio=self.ratio,
+            halves=halves,
+            refinements=tuple(refinements),
+        )
 
     def moved(self, motion: FrameMotion) -> MotionFit:
         """Return the fit of a motion that differs by a small fraction of a pixel, to first order, from the same panorama.

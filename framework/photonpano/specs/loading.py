@@ -56,7 +56,7 @@ def load_spec(
             raise
         asked = f"photonpano info {quote(str(path))}"
         message = f"this is a capture, not a spec; `{asked}` reads it and prints a spec to start from"
-        raise SpecError([Problem("", message, path)]) from None
+        raise SpecError([Problem(where="", message=message, file=path)]) from None
 
 
 def parse_spec(
@@ -131,24 +131,24 @@ def capture_plan(
 def read_spec(path: Path) -> str:
     """Return the text of a spec file; `SpecError` if it cannot be read, or is too long for a spec."""
     if reason := refusal(path):
-        raise SpecError([Problem("", reason.removeprefix(f"{path} "), path)])
+        raise SpecError([Problem(where="", message=reason.removeprefix(f"{path} "), file=path)])
     try:
         with path.open("rb") as file:
             data = file.read(MAX_LENGTH + 1)
         if len(data) <= MAX_LENGTH:
             return data.decode("utf-8-sig")
-        problem = Problem("", f"not a spec: longer than {MAX_LENGTH} bytes", path)
+        problem = Problem(where="", message=f"not a spec: longer than {MAX_LENGTH} bytes", file=path)
     except FileNotFoundError:
-        problem = Problem("", "there is no such file", path)
+        problem = Problem(where="", message="there is no such file", file=path)
     except IsADirectoryError:
-        problem = Problem("", "this is a folder, expected a spec in YAML", path)
+        problem = Problem(where="", message="this is a folder, expected a spec in YAML", file=path)
     except OSError as error:
-        problem = Problem("", f"cannot be read: {error.strerror}", path)
+        problem = Problem(where="", message=f"cannot be read: {error.strerror}", file=path)
     except UnicodeDecodeError as error:
         start = data.rfind(b"\n", 0, error.start) + 1
         line = data.count(b"\n", 0, error.start) + 1
         message = f"not UTF-8 text, got the byte {data[error.start]:#04x}; save the file as UTF-8"
-        problem = Problem("", message, path, line, error.start - start + 1)
+        problem = Problem(where="", message=message, file=path, line=line, column=error.start - start + 1)
     raise SpecError([problem])
 
 
@@ -174,7 +174,7 @@ def _overridden(root: Written, text: str, problems: list[Problem]) -> Written:
         problems.append(Place(override=text).problem("expected KEY=VALUE, such as run.seed=1"))
         return root
     n_problems = len(problems)
-    value = read_yaml(yaml, Place(path.strip(), override=text), problems)
+    value = read_yaml(yaml, Place(where=path.strip(), override=text), problems)
     if len(problems) > n_problems:
         return root
     try:
@@ -189,7 +189,7 @@ def _changed(node: Written, keys: list[str], value: Written) -> Written:
     if not keys:
         return value
     key, *rest = keys
-    place = Place(joined(node.place.where, key), override=value.place.override)
+    place = Place(where=joined(node.place.where, key), override=value.place.override)
     if isinstance(node.data, list) and key.isdecimal() and int(key) < len(node.data):
         items = list(node.data)
         items[int(key)] = _changed(items[int(key)], rest, value)
@@ -208,5 +208,5 @@ def _with_output(root: Written, chosen: Path | None, default: Path) -> Written:
         return root
     if chosen is None and "directory" in (section.data or {}):
         return root
-    directory = Written(str(chosen or default), Place("output.directory", root.place.file))
+    directory = Written(str(chosen or default), Place(where="output.directory", file=root.place.file))
     return root.having({"output": section.having({"directory": directory})})

@@ -22,7 +22,7 @@ KNOWN = ("map", "seq", "null", "bool", "int", "float", "str", "timestamp", "valu
 WHOLE = re.compile(r"[-+]?\d+[eE]\+?\d{1,2}")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
     """Where a value of a spec was written, or would be."""
 
@@ -38,7 +38,9 @@ class Place:
 
     def problem(self, message: str) -> Problem:
         """Return a problem with the key, or with the value that has none."""
-        return Problem(self.where, message, self.file, self.line, self.column, self.override)
+        return Problem(
+            where=self.where, message=message, file=self.file, line=self.line, column=self.column, override=self.override
+        )
 
     def below(self, key: str | int) -> Place:
         """Return the place of a key or an item that is not written."""

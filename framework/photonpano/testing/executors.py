@@ -65,7 +65,7 @@ class ExecutorConformance(Conformance):
 
     def test_results_come_in_order(self, executor: Executor) -> None:
         """Tasks have the results of their own items, alone and many at once."""
-        context = Context(max(1, getattr(executor, "under_way", 2)), executor=executor)
+        context = Context(threads=max(1, getattr(executor, "under_way", 2)), executor=executor)
         for number in (20, 1000):
             assert list(context.in_order(partial(operator.add, 3), range(number))) == list(range(3, number + 3))
 

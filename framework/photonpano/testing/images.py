@@ -372,7 +372,14 @@ def panorama(in_colour: bool = False, nothing_seen: bool = False) -> StoredPanor
     if nothing_seen:
         flux[:], weight[:] = np.nan, 0
     response = BinaryResponse()
-    return StoredPanorama(flux, weight, flux_std(flux, weight, response), np.eye(3), 1.0, CanvasNoise(response))
+    return StoredPanorama(
+        flux=flux,
+        weight=weight,
+        std=flux_std(flux, weight, response),
+        canvas=np.eye(3),
+        white_flux=1.0,
+        noise=CanvasNoise(response=response),
+    )
 
 
 class ExporterConformance(StageConformance):

@@ -181,7 +181,7 @@ class SeenScene:
         return read_only(mean.astype(np.float32)), read_only((mean * (1 - mean)).astype(np.float32))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Case:
     """A capture, the motion that a refiner is given, and what the photons show beyond it."""
 
@@ -216,7 +216,7 @@ def case(tremor_px: float) -> Case:
     variances = np.diagonal(np.linalg.inv(residuals.information), axis1=1, axis2=2)
     noise_px = float(np.sqrt(variances[:, :2].sum(axis=1)).mean())  # that photons cause in the shift of a span
     std_px[LOCATED.start : LOCATED.stop] = SHARE_OF_NOISE * noise_px
-    return Case(source, motion, pan, read_only(std_px), residuals, view)
+    return Case(source=source, true_motion=motion, trajectory=pan, std_px=read_only(std_px), residuals=residuals, view=view)
 
 
 def measured(source: Source, view: SeenScene, spans: tuple[FrameSpan, ...]) -> SpanResiduals:

@@ -292,7 +292,7 @@ def _unpack_12_bits(packed: NDArray[np.uint8], levels: NDArray[np.uint16]) -> No
         levels[2 * pair + 1] = (np.uint16(middle) & 15) << 8 | np.uint16(last)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Header:
     """The header of a recording."""
 
@@ -379,4 +379,11 @@ def _header(path: Path, value_of: Callable[[str], str | None]) -> Header:
     # Levels of more than a byte keep two bytes, even if at most 8 bits are effective.
     low = Encoding(max(effective, min(bits, 9)), 0.0, white)
     encoding = low if side == "lower" else Encoding(bits, 0.0, white << (bits - effective))
-    return Header(count("frames"), height, width, bits, encoding, rate_hz / max(every, 1) or None)
+    return Header(
+        n_frames=count("frames"),
+        height=height,
+        width=width,
+        bits=bits,
+        encoding=encoding,
+        frame_rate_hz=rate_hz / max(every, 1) or None,
+    )

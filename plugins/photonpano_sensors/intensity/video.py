@@ -204,7 +204,7 @@ _DAMAGED = "is damaged: FFmpeg finds contradictions in it; export or copy it aga
 _JPEG_RANGE = 2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class VideoIndex:
     """The frames of a video, from its packets."""
 
@@ -260,14 +260,14 @@ def index_of(path: Path) -> VideoIndex:
             encoding = Encoding.full(bits)
         rate = stream.average_rate
         return VideoIndex(
-            path,
-            times[order].astype(np.int64),
-            keys,
-            context.height,
-            context.width,
-            pixel_format,
-            encoding,
-            float(rate) if rate else None,
+            path=path,
+            times=times[order].astype(np.int64),
+            keys=keys,
+            height=context.height,
+            width=context.width,
+            pixel_format=pixel_format,
+            encoding=encoding,
+            frame_rate_hz=float(rate) if rate else None,
         )
 
 

@@ -134,11 +134,11 @@ def _scored(
                 picture.flux,
                 picture.weight,
                 truth,
-                picture.canvas,
-                picture.alignment,
-                truth.ideal_homographies,
-                through_lens,
-                path,
+                canvas=picture.canvas,
+                alignment=picture.alignment,
+                true_homographies=truth.ideal_homographies,
+                render=through_lens,
+                origin=path,
             )
             note = "a panorama only, registered with the scene" + ", mirrored" * picture.mirrored
             if picture.correlation < _POOR:
@@ -213,7 +213,7 @@ def _rendered(
     plan = parse_spec(spec)
     with build_source(plan) as opened:
         source = opened if lens is None else seen_through(opened, lens)
-        context = Context(thread_count(plan.run.threads), Quiet())
+        context = Context(threads=thread_count(plan.run.threads), progress=Quiet())
         images = render(source, trajectory, span or source.info.span, canvas, plan.render.tolerance_px, context)
         return composed(images, source)
 

@@ -85,7 +85,15 @@ def pieces(monkeypatch: pytest.MonkeyPatch) -> None:
         for pose in poses[list(images)]:
             seen = (points @ pose[:, :3].T + pose[:, 3]) @ MATRIX.T
             observed.append((np.arange(len(points)), seen[:, :2] / seen[:, 2:]))
-        return Piece(np.array(images), poses[list(images)], points, tuple(observed), FOCAL_PX, readings, Halves(0, 0))
+        return Piece(
+            images=np.array(images),
+            poses=poses[list(images)],
+            points=points,
+            observed=tuple(observed),
+            focal_px=FOCAL_PX,
+            readings=readings,
+            halves=Halves(0, 0),
+        )
 
     found = Reconstruction((piece(range(8)), piece(range(9, 15))), np.full(16, 300), np.full(16, 40))
     monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)

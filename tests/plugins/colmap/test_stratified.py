@@ -94,7 +94,9 @@ def test_noise_of_located_groups_does_not_move_the_path() -> None:
     views, numbers = (each.ravel() for each in np.meshgrid(np.arange(20), np.arange(150), indexing="ij"))
     pixels = projected(poses[views], points[numbers], MATRIX) + rng.normal(0, 0.3, (3000, 2))
     observations = Observations(numbers, views, pixels, np.tile(0.3**2 * np.eye(2), (3000, 1, 1)))
-    level = interpolate(groups, Merged(merged.exposures, TRUE, None), points, observations, CAMERA, finds_focal=False)
+    level = interpolate(
+        groups, Merged(merged.exposures, TRUE, None), points, observations=observations, camera=CAMERA, finds_focal=False
+    )
     located = _after_similarity(positions_of(level.adjusted.poses), positions_of(poses))
     path = _after_similarity(positions_of(level.path.at([group.reference for group in groups])), positions_of(poses))
     assert np.sqrt(np.mean(path**2)) < 0.7 * np.sqrt(np.mean(located**2)), (path, located)

@@ -50,7 +50,15 @@ def truth() -> Callable[..., TravelTruth]:
         rng = np.random.default_rng(0)
         textures = tuple(rng.random((40, 50)).astype(np.float16) for _ in range(len(scene)))
         n, camera = len(poses), Camera(K, np.array(distortion))
-        return TravelTruth(np.stack(poses), camera, SHAPE, np.arange(n), np.ones(n), Scene(scene, textures), 0.5)
+        return TravelTruth(
+            camera_from_world=np.stack(poses),
+            camera=camera,
+            frame_shape=SHAPE,
+            taken=np.arange(n),
+            light=np.ones(n),
+            scene=Scene(scene, textures),
+            flux=0.5,
+        )
 
     return make
 

@@ -92,7 +92,7 @@ def repeated(folder: Path, frames: np.ndarray) -> list[int]:
     np.packbits(frames, axis=2).tofile(folder / "cube.bin")
     file, layout = FrameFile(folder / "cube.bin", len(frames)), FrameLayout((40, 64), (40, 8), "big")
     with PackedFileSource([file], layout) as source:
-        return (np.flatnonzero(np.diff(timeline_of(source, Context(2)).taken) == 0) + 1).tolist()
+        return (np.flatnonzero(np.diff(timeline_of(source, Context(threads=2)).taken) == 0) + 1).tolist()
 
 
 def taken(n_frames: int, share: float = 0.2) -> np.ndarray:

@@ -34,7 +34,7 @@ def corrections(tmp_path: Path) -> Callable[..., tuple[Correction, ...]]:
     """Make corrections of what a spec would say: `corrections("rot90", {"crop": {"rows": [2, None]}})`."""
 
     def corrections(*written: Any) -> tuple[Correction, ...]:
-        spec = Spec(from_python(list(written), Place("corrections"), []), directory=tmp_path)
+        spec = Spec(from_python(list(written), Place(where="corrections"), []), directory=tmp_path)
         found = resolved_corrections(spec.root, spec)
         assert spec.problems == []
         return found

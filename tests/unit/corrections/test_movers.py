@@ -60,7 +60,7 @@ def shares(found: object, frames: range, side: int = 32, speed: float = 0.06) ->
 
 @pytest.mark.parametrize("light", [0.0, 0.4], ids=["steady", "flickering"])
 def test_what_walks_before_the_background_is_hidden_whatever_the_light(light: float) -> None:
-    found = find_background(panned(with_mover=True, light=light), MOTION, None, ALL, Context(1))
+    found = find_background(panned(with_mover=True, light=light), MOTION, None, ALL, Context(threads=1))
     assert found is not None
     hit, false = shares(found, range(100, 1500, 100))
     assert hit > 0.97
@@ -72,14 +72,14 @@ def test_what_walks_before_the_background_is_hidden_whatever_the_light(light: fl
 @pytest.mark.parametrize("exact", [False, True])
 def test_nothing_is_hidden_where_nothing_moves(light: float, tremor_px: float, *, exact: bool) -> None:
     source = panned(with_mover=False, light=light, tremor_px=tremor_px)
-    assert find_background(source, MOTION, None, ALL, Context(1), exact=exact) is None
+    assert find_background(source, MOTION, None, ALL, Context(threads=1), exact=exact) is None
 
 
 def test_what_is_small_is_hidden_along_an_exact_motion_alone() -> None:
     """A square of 16 px covers 2 % of the frame, as much as the errors of a first motion may."""
     source = panned(with_mover=True, side=16)
-    assert find_background(source, MOTION, None, ALL, Context(1)) is None
-    found = find_background(source, MOTION, None, ALL, Context(1), exact=True)
+    assert find_background(source, MOTION, None, ALL, Context(threads=1)) is None
+    found = find_background(source, MOTION, None, ALL, Context(threads=1), exact=True)
     assert found is not None
     hit, false = shares(found, range(100, 1500, 100), side=16)
     assert hit > 0.9
@@ -99,7 +99,7 @@ def test_what_stands_near_and_shifts_all_the_time_is_hidden_along_an_exact_motio
         view[square] = near.view(motion @ translation(first / 80, 0), SHAPE)[square]
         standing[first : first + 8][:, *square] = True
         frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-view)
-    found = find_background(MemorySource(frames), MOTION, None, ALL, Context(1), exact=True)
+    found = find_background(MemorySource(frames), MOTION, None, ALL, Context(threads=1), exact=True)
     assert found is not None
     hidden = [found.pixels(FrameSpan(frame, frame + 1)) == 0 for frame in range(100, 1500, 100)]
     assert np.mean([each[there].mean() for each, there in zip(hidden, standing[100:1500:100], strict=True)]) > 0.7
@@ -107,7 +107,7 @@ def test_what_stands_near_and_shifts_all_the_time_is_hidden_along_an_exact_motio
 
 
 def test_the_merged_background_is_that_without_the_walker() -> None:
-    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
+    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(threads=1))
     assert found is not None
     onto, shape = translation(0, 0), (112, 192)
     chunks = chunks_of(ALL, MOTION, SHAPE, 1.0)
@@ -126,14 +126,14 @@ def test_the_merged_background_is_that_without_the_walker() -> None:
 
 @pytest.mark.parametrize("merger", ["photon-mle", "splat"])
 def test_exposures_of_mergers_show_the_background_alone(merger: str) -> None:
-    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(1))
+    found = find_background(panned(with_mover=True), MOTION, None, ALL, Context(threads=1))
     assert found is not None
     group = Group(FrameSpan(700, 860), 779.5)
 
     def flux(source: Source) -> np.ndarray:
         spec = {"version": 1, "source": {"use": "simulator"}, "levels": [{"merge": {"use": merger}}]}
         (level,) = build_levels(parse_spec(spec), source, [])
-        return VirtualExposures(level, source, [group], MOTION, Stopwatch()).merged(0).flux
+        return VirtualExposures(level=level, source=source, groups=[group], previous=MOTION, clock=Stopwatch()).merged(0).flux
 
     ghost, clean, background = map(
         flux,

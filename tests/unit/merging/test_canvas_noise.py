@@ -24,7 +24,7 @@ STILL = KnownMotion(lambda _: np.eye(3))
 
 
 def factor(motion: KnownMotion, canvas: Canvas, n_frames: int = 400) -> np.ndarray:
-    return Averaging.of(motion, FrameSpan(0, n_frames), SHAPE, canvas).over(canvas.shape).std_factor
+    return Averaging.of(motion, FrameSpan(0, n_frames), SHAPE, canvas=canvas).over(canvas.shape).std_factor
 
 
 def test_averaging_is_that_of_merged_photons() -> None:
@@ -81,7 +81,7 @@ def test_dynamic_range_is_that_of_flux_above_its_noise(colours: int) -> None:
     flux[0, 1] = 1e-5  # far below the flux of one photon
     flux[0, 2] = 0.005
     flux[0, 3] = np.log(20_001)  # lit in every frame
-    found = DynamicRange(CanvasNoise(BinaryResponse()))
+    found = DynamicRange(noise=CanvasNoise(response=BinaryResponse()))
     found.add(flux, weight, found.noise.std(flux, weight))
     assert found.decibels == pytest.approx(20 * np.log10(np.log(20_001) / 0.005), abs=0.01)
     assert found.saturated_share == pytest.approx(1 / 19)

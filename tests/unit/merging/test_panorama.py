@@ -130,7 +130,7 @@ def test_render_tiles_equals_render(panning: Any, known_motion: type, motion: tu
     assert len(tiles) > 2
     flux, weight = np.zeros(canvas.shape), np.zeros(canvas.shape)
     shown = Thumbnail(canvas, reduction)
-    two = Context(2)
+    two = Context(threads=2)
     parts = render_tiles(MergeRenderer(two.in_order), panning, turning, ALL, tiles, 0.25, two)
     for tile, part in zip(tiles, parts, strict=True):
         box = np.s_[tile.top : tile.top + tile.canvas.height, tile.left : tile.left + tile.canvas.width]

@@ -42,7 +42,7 @@ def require(
     edges = [Edge(later, later - 1, failed if {later, later - 1} & set(lost) else found) for later in range(1, N)]
     tied = np.array([0 if index not in lost else 1 + index for index in range(N)])
     contrasts = {index: contrast if index in lost else CLEAR for index in range(N)}
-    require_tied(2, GROUPS, edges, tied, contrasts, disconnected, foreseen=np.arange(N) < foreseen)
+    require_tied(2, GROUPS, edges, parts=tied, contrasts=contrasts, disconnected=disconnected, foreseen=np.arange(N) < foreseen)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_require_tied_accepts_two_lost_exposures_in_a_row_or_the_largest_part(
     lost: tuple[int, ...], disconnected: Literal["error", "largest"]
 ) -> None:
     require(lost, disconnected=disconnected)
-    require_tied(1, GROUPS[:1], [], np.array([0]), {0: CLEAR}, "error")
+    require_tied(1, GROUPS[:1], [], parts=np.array([0]), contrasts={0: CLEAR}, disconnected="error")
 
 
 def refusal(*args: Any, **kwargs: Any) -> str:
@@ -123,7 +123,13 @@ def test_exposures_beyond_the_horizon_are_named() -> None:
     homographies = np.array([np.eye(3)] * 6)
     homographies[3:5, 2, 0] = -0.1
     homographies[0] = np.nan
-    solution = GraphSolution(homographies, np.arange(6) > 0, (), 0.0, lambda: (np.empty(0), np.empty(0)))
+    solution = GraphSolution(
+        homographies=homographies,
+        located=np.arange(6) > 0,
+        outliers=(),
+        residual_px=0.0,
+        assess=lambda: (np.empty(0), np.empty(0)),
+    )
     with pytest.raises(LocationError) as caught:
         require_in_front(2, groups, solution, (40, 60), ValueError("no root"))
     assert str(caught.value) == (

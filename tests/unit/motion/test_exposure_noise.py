@@ -59,7 +59,10 @@ def drawn(groups: Sequence[Group], skips: Sequence[int], n_draws: int) -> tuple[
     true, ends, rng = true_motion(len(groups)), pairs(len(groups), skips), np.random.default_rng(0)
     motions = [edge(true, *pair).motion for pair in ends]
     instants, spans = np.array([group.reference for group in groups]), [group.span for group in groups]
-    adjustment = PlanarAdjustment(Problem(np.array(ends), 0, motions, SHAPE, instants, spans), "homography")
+    adjustment = PlanarAdjustment(
+        Problem(pairs=np.array(ends), anchor=0, motions=motions, frame_shape=SHAPE, instants=instants, spans=spans),
+        "homography",
+    )
     expected = adjustment._noise.errors(*adjustment._body_slopes(Plane(true)), n_draws, rng)
     exact, found = adjustment.mapped_corners(Plane(true)), []
     for _ in range(n_draws):

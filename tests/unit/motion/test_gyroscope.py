@@ -74,7 +74,16 @@ def gyroscope_of(rad_s: np.ndarray, noise: float = 0.0, std_bias: float = 0.0) -
     times_s = np.arange(0, 1.001, 0.001)
     rates = Rates(Path("imu.csv"), times_s, np.broadcast_to(rad_s, (len(times_s), 3)))
     camera, frames_s = Camera.of(FOCAL_PX, SHAPE), np.arange(1000) / 1000
-    return Gyroscope(rates, camera, SHAPE, frames_s, noise, np.zeros(3), np.full(3, std_bias), 0.0)
+    return Gyroscope(
+        rates=rates,
+        camera=camera,
+        frame_shape=SHAPE,
+        frames_s=frames_s,
+        noise=noise,
+        bias_rad_s=np.zeros(3),
+        std_bias_rad_s=np.full(3, std_bias),
+        std_offset_s=0.0,
+    )
 
 
 def test_pairs_of_a_still_camera_scatter_as_expected() -> None:
@@ -100,8 +109,8 @@ def test_pairs_of_a_still_camera_scatter_as_expected() -> None:
 def test_a_graph_of_the_gyroscope_alone_drifts_by_its_expected_error() -> None:
     """By 0.3 px for each pair, as of a random walk."""
     gyroscope = gyroscope_of(np.array([0.1, 0.6, -0.2]), np.deg2rad(0.01), np.deg2rad(0.3))
-    edges, model = gyroscope.edges(GROUPS), MotionModel("rotation", FOCAL_PX)
-    std_px = solve(GROUPS, edges, len(GROUPS) // 2, SHAPE, None, model).assess().std_px
+    edges, model = gyroscope.edges(GROUPS), MotionModel(kind="rotation", focal_px=FOCAL_PX)
+    std_px = solve(GROUPS, edges, len(GROUPS) // 2, frame_shape=SHAPE, start=None, model=model).assess().std_px
     assert isinstance(edges[0].motion, Located)
     of_pair = edges[0].motion.evidence["std_px"]
     # From the mean of 20 places of a walk, its ends are sqrt(20 / 3) steps away.
@@ -110,7 +119,9 @@ def test_a_graph_of_the_gyroscope_alone_drifts_by_its_expected_error() -> None:
 
 def test_rates_that_contradict_the_images_are_refused() -> None:
     seen, other = gyroscope_of(np.array([0.1, 0.6, 0.0])), gyroscope_of(np.array([0.3, -0.4, 0.0]), np.deg2rad(0.01))
-    located = solve(GROUPS, seen.edges(GROUPS), 0, SHAPE, None, MotionModel("rotation", FOCAL_PX))
+    located = solve(
+        GROUPS, seen.edges(GROUPS), 0, frame_shape=SHAPE, start=None, model=MotionModel(kind="rotation", focal_px=FOCAL_PX)
+    )
     assert all(isinstance(edge.motion, Located) for edge in other.edges(GROUPS))
     with pytest.raises(
         InputError, match=r"imu.csv: the rates contradict the images by \d\.?\d* px from one exposure to the next"

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 N_NODES = 24
 GROUPS = groups_of(N_NODES)
-AUTO = MotionModel("auto")
+AUTO = MotionModel(kind="auto")
 # Standard deviation of the small motions between exposures: shifts by tenths of a frame, others by hundredths of it.
 STEP = np.array([0.02, 0.02, 0.02, 0.02, 0.1, 0.05, 0.01, 0.01])
 # The walks in the order of the columns of `basis_of`, after shift and roll.
@@ -66,7 +66,7 @@ def test_learnt_walks_are_as_accurate_as_the_model_that_moved_and_as_sure(model:
         true = path(model, seed)
         edges = measured_with(true, seed, 0.3)
         for name in errors:
-            solution = solve(GROUPS, edges, N_NODES // 2, SHAPE, model=MotionModel(name))
+            solution = solve(GROUPS, edges, N_NODES // 2, frame_shape=SHAPE, model=MotionModel(kind=name))
             errors[name].append(rms_px(solution.homographies, true))
             squares[name].append(float((solution.assess().std_px ** 2).mean()))
             assert solution.outliers == ()
@@ -86,7 +86,7 @@ def test_zoom_out_and_back_is_no_outlier() -> None:
     pan = np.array([translation(200 * each, 20 * each) for each in way])
     true = pan @ scaled(1 + 0.25 * np.cos(2 * np.pi * way))
     for seed in range(2):
-        solution = solve(GROUPS, measured_with(true, seed, NOISE_PX), N_NODES // 2, SHAPE, model=AUTO)
+        solution = solve(GROUPS, measured_with(true, seed, NOISE_PX), N_NODES // 2, frame_shape=SHAPE, model=AUTO)
         assert solution.model.kind == "homography"
         assert solution.outliers == ()
         assert rms_px(solution.homographies, true) < 2 * NOISE_PX
@@ -98,7 +98,10 @@ def test_what_only_shifts_and_rolls_has_three_unknowns_an_exposure() -> None:
     """Walks that are not worth their place are left out, and with them their noise."""
     for seed in range(2):
         edges = measured_with(path("euclidean", seed), seed, NOISE_PX)
-        found, told = (solve(GROUPS, edges, N_NODES // 2, SHAPE, model=MotionModel(name)) for name in ("auto", "euclidean"))
+        found, told = (
+            solve(GROUPS, edges, N_NODES // 2, frame_shape=SHAPE, model=MotionModel(kind=name))
+            for name in ("auto", "euclidean")
+        )
         assert found.walks_px == {}
         assert found.compare()["homography"].unknowns == 3 * (N_NODES - 1)
         assert rms_px(found.homographies, path("euclidean", seed)) < 1.05 * rms_px(told.homographies, path("euclidean", seed))
@@ -106,7 +109,7 @@ def test_what_only_shifts_and_rolls_has_three_unknowns_an_exposure() -> None:
 
 @pytest.mark.parametrize("zoom", [0.02, 0.1])
 def test_a_turn_with_a_zoom_is_no_rotation(zoom: float) -> None:
-    solution = solve(GROUPS, measured_with(turned(zoom), 0, NOISE_PX), N_NODES // 2, SHAPE, model=AUTO)
+    solution = solve(GROUPS, measured_with(turned(zoom), 0, NOISE_PX), N_NODES // 2, frame_shape=SHAPE, model=AUTO)
     assert solution.model.kind == "homography"
     assert solution.outliers == ()
     assert rms_px(solution.homographies, turned(zoom)) < 1.5 * NOISE_PX
@@ -117,7 +120,9 @@ def test_a_turn_with_a_zoom_is_no_rotation(zoom: float) -> None:
 @pytest.mark.parametrize(("true", "likelier"), [(turned(), "rotation"), (turned(0.02), "homography")], ids=["turn", "zoom"])
 def test_the_model_that_moved_has_the_lower_deviance(true: np.ndarray, likelier: str) -> None:
     """Both are compared also where rotations are asked for."""
-    rivals = solve(GROUPS, measured_with(true, 1, NOISE_PX), N_NODES // 2, SHAPE, model=MotionModel("rotation")).compare()
+    rivals = solve(
+        GROUPS, measured_with(true, 1, NOISE_PX), N_NODES // 2, frame_shape=SHAPE, model=MotionModel(kind="rotation")
+    ).compare()
     assert set(rivals) == {"rotation", "homography"}
     assert min(rivals, key=lambda name: rivals[name].deviance) == likelier
     assert rivals[likelier].deviance == 0

@@ -41,7 +41,7 @@ def source(memory_source: type) -> Any:
 @pytest.fixture
 def run(source: Any) -> Callable[..., list]:
     def run(*levels: Level, reference: int = 60, notes: Any = None, timeline: Timeline | None = None, **options: Any) -> list:
-        context = Context(2) if notes is None else Context(2, notes)
+        context = Context(threads=2) if notes is None else Context(threads=2, progress=notes)
         setting = LoopSetting(
             source=source,
             graph=GraphSettings(),

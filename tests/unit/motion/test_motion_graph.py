@@ -41,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_solve_follows_pairs_that_are_known_exactly(skips: tuple[int, ...], anchor: int) -> None:
     """Pairs of a ten thousandth of a pixel leave the prior nothing to say; the path is 600 px long."""
     true = true_motion(30)
-    solution = solve(groups_of(30), confident(measured(true, skips), 1000), anchor, SHAPE)
+    solution = solve(groups_of(30), confident(measured(true, skips), 1000), anchor, frame_shape=SHAPE)
     assert error_px(solution.homographies, true, anchor) < 1e-6
     np.testing.assert_array_equal(solution.homographies[anchor], np.eye(3))
     np.testing.assert_array_equal(solution.homographies[:, 2, 2], 1)
@@ -56,7 +56,7 @@ def test_solve_weights_edges_by_information_or_residual(weighted_by: str) -> Non
     true, rng = true_motion(40), np.random.default_rng(0)
     good = apart(true, (1, 2), rng)
     noisy = [edge(true, each.moving, each.fixed, own=(rng, 20 * NOISE_PX)) for each in good]
-    best = error_px(solve(groups_of(40), good, 20, SHAPE).homographies, true, 20)
+    best = error_px(solve(groups_of(40), good, 20, frame_shape=SHAPE).homographies, true, 20)
     edges = good + noisy
     if weighted_by == "residual_px":
         stds = np.repeat([NOISE_PX, 20 * NOISE_PX], len(good))
@@ -64,8 +64,8 @@ def test_solve_weights_edges_by_information_or_residual(weighted_by: str) -> Non
             Edge(each.moving, each.fixed, replace(each.motion, residual_px=std_px))
             for each, std_px in zip(without_information(edges), stds, strict=True)
         ]
-    weighted = error_px(solve(groups_of(40), edges, 20, SHAPE).homographies, true, 20)
-    unweighted = error_px(solve(groups_of(40), without_information(good + noisy), 20, SHAPE).homographies, true, 20)
+    weighted = error_px(solve(groups_of(40), edges, 20, frame_shape=SHAPE).homographies, true, 20)
+    unweighted = error_px(solve(groups_of(40), without_information(good + noisy), 20, frame_shape=SHAPE).homographies, true, 20)
     # Bad pairs count as much as good ones in the number of pairs of an exposure, which their weights are divided by.
     assert weighted < 1.6 * best
     assert unweighted > 3 * weighted
@@ -77,7 +77,7 @@ def test_solve_error_falls_with_more_edges_than_a_chain() -> None:
     for seed in range(2):
         true, rng = true_motion(120, seed), np.random.default_rng(seed)
         for skips, found in errors.items():
-            found.append(error_px(solve(groups_of(120), apart(true, skips, rng), 60, SHAPE).homographies, true, 60))
+            found.append(error_px(solve(groups_of(120), apart(true, skips, rng), 60, frame_shape=SHAPE).homographies, true, 60))
     chain, neighbours, closures = (float(np.mean(found)) for found in errors.values())
     assert chain > 0.5
     assert neighbours < 0.35 * chain
@@ -86,10 +86,10 @@ def test_solve_error_falls_with_more_edges_than_a_chain() -> None:
 
 def test_solve_drops_one_gross_outlier_at_any_edge() -> None:
     true, edges = graph(9)
-    clean = error_px(solve(groups_of(9), edges, 4, SHAPE).homographies, true, 4)
+    clean = error_px(solve(groups_of(9), edges, 4, frame_shape=SHAPE).homographies, true, 4)
     for index in range(0, len(edges), 4):
         each = edges[index]
-        solution = solve(groups_of(9), [*edges[:index], moved(each, 40, -30), *edges[index + 1 :]], 4, SHAPE)
+        solution = solve(groups_of(9), [*edges[:index], moved(each, 40, -30), *edges[index + 1 :]], 4, frame_shape=SHAPE)
         assert solution.outliers == (index,)
         assert error_px(solution.homographies, true, 4) < 1.5 * clean
 
@@ -99,7 +99,7 @@ def test_solve_keeps_outliers_if_graph_disconnects_without_them(informed: bool) 
     """The last exposure has two pairs that are 40 px apart, either of which may be right."""
     still = np.broadcast_to(np.eye(3), (21, 3, 3))
     edges = [*measured(still[:20], (1, 2)), moved(edge(still, 20, 19), 20, 0), moved(edge(still, 20, 19), -20, 0)]
-    solution = solve(groups_of(21), edges if informed else without_information(edges), 10, SHAPE)
+    solution = solve(groups_of(21), edges if informed else without_information(edges), 10, frame_shape=SHAPE)
     assert solution.located.all()
     assert solution.outliers == ()
     assert error_px(solution.homographies[:20], still[:20], 10) < 1e-6
@@ -109,7 +109,7 @@ def test_solve_keeps_outliers_if_graph_disconnects_without_them(informed: bool) 
 def test_expected_error_includes_both_of_two_places_that_pairs_show() -> None:
     still = np.broadcast_to(np.eye(3), (21, 3, 3))
     edges = [*measured(still[:20], (1, 2)), moved(edge(still, 20, 19), 20, 0), moved(edge(still, 20, 19), -20, 0)]
-    std_px = solve(groups_of(21), edges, 10, SHAPE).assess().std_px
+    std_px = solve(groups_of(21), edges, 10, frame_shape=SHAPE).assess().std_px
     assert std_px[:20].max() < 1 < 3 < std_px[20] < 40
 
 
@@ -118,7 +118,7 @@ def test_solve_of_a_long_capture_does_not_depend_on_its_start(skips: tuple[int, 
     """Errors of 8 px a pair, as of blurred exposures: along skips of 8, paths to neighbours drift apart by far more."""
     true = true_motion(n)
     edges = apart(true, skips, np.random.default_rng(0), 8.0)
-    found, expected = (solve(groups_of(n), edges, n // 2, SHAPE, start) for start in (None, true))
+    found, expected = (solve(groups_of(n), edges, n // 2, frame_shape=SHAPE, start=start) for start in (None, true))
     assert found.residual_px == pytest.approx(expected.residual_px, rel=0.01)
     neighbours = inverse(found.homographies[:-1]) @ found.homographies[1:]
     assert corner_displacements(neighbours, inverse(true[:-1]) @ true[1:], SHAPE).mean() < 8
@@ -157,7 +157,7 @@ def test_solve_of_a_large_graph_takes_few_steps_with_sparse_factors(
         for early, late in ends
         if late - early > 4
     ]
-    solve(groups_of(300), edges, 150, SHAPE)
+    solve(groups_of(300), edges, 150, frame_shape=SHAPE)
     assert sum(size > max(filled) / 2 for size in filled) <= 31  # thirty, and one to compare
     assert len(filled) <= 40
     assert max(filled) < 300 * 8**2 * most
@@ -184,7 +184,7 @@ def test_solve_is_finite_for_any_information() -> None:
     """Nearly singular systems are damped: nothing raises, and what is not determined is uncertain."""
     for seed in range(6):
         n_nodes, edges = any_edges(seed)
-        solution = solve(groups_of(n_nodes), edges, 0, SHAPE)
+        solution = solve(groups_of(n_nodes), edges, 0, frame_shape=SHAPE)
         assessed = solution.assess()
         for each in (solution.homographies[solution.located], assessed.information, assessed.std_px):
             assert np.isfinite(each).all(), f"seed {seed}"

@@ -20,7 +20,9 @@ def exposures(memory_source: type, make_level: Callable) -> Callable[..., Virtua
     def exposures(references: list[float], **known: Trajectory | None) -> VirtualExposures:
         groups = [Group(span, reference) for span, reference in zip(SPANS, references, strict=True)]
         source = memory_source(np.zeros((160, 40, 60)))
-        return VirtualExposures(make_level(), source, groups, known.pop("previous", None), Stopwatch(), **known)
+        return VirtualExposures(
+            level=make_level(), source=source, groups=groups, previous=known.pop("previous", None), clock=Stopwatch(), **known
+        )
 
     return exposures
 

@@ -160,7 +160,13 @@ def candidates(
     skips: tuple[float, ...] = (1.0, 2.0),
     min_overlap: float | None = 0.5,
 ) -> list[tuple[int, int]]:
-    solution = GraphSolution(homographies, located, (), 0.0, lambda: (np.empty((0, 8, 8)), np.empty(0)))
+    solution = GraphSolution(
+        homographies=homographies,
+        located=located,
+        outliers=(),
+        residual_px=0.0,
+        assess=lambda: (np.empty((0, 8, 8)), np.empty(0)),
+    )
     graph = GraphSettings(skips=skips, closure_overlap=min_overlap)
     return closure_candidates(spread, solution, FIELD, graph)
 

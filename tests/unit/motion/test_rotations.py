@@ -67,7 +67,9 @@ def error_deg(solution: GraphSolution, rotations: FloatArray) -> FloatArray:
 @pytest.mark.parametrize("degrees", [40.0, 400.0])
 def test_rotations_and_focal_length_are_found_at_any_angle(degrees: float) -> None:
     rotations = turn(60, degrees)
-    solution = solve(groups_of(60), edges_of(rotations, np.random.default_rng(0)), 30, SHAPE, model=MotionModel("rotation"))
+    solution = solve(
+        groups_of(60), edges_of(rotations, np.random.default_rng(0)), 30, frame_shape=SHAPE, model=MotionModel(kind="rotation")
+    )
     assert solution.rotations is not None
     error_focal = solution.rotations.camera.focal_px / FOCAL_PX - 1
     std_focal = solution.assess().std_camera[0] / FOCAL_PX
@@ -81,7 +83,11 @@ def test_expected_errors_of_rotations_hold() -> None:
     errors, stds, focals, focal_stds = [], [], [], []
     for seed in range(12):
         solution = solve(
-            groups_of(20), edges_of(rotations, np.random.default_rng(seed)), 10, SHAPE, model=MotionModel("rotation")
+            groups_of(20),
+            edges_of(rotations, np.random.default_rng(seed)),
+            10,
+            frame_shape=SHAPE,
+            model=MotionModel(kind="rotation"),
         )
         assessed = solution.assess()
         assert solution.rotations is not None
@@ -97,7 +103,9 @@ def test_expected_errors_of_rotations_hold() -> None:
 
 
 def test_auto_takes_rotations_of_a_camera_that_turns() -> None:
-    solution = solve(groups_of(20), edges_of(turn(20, 60.0), np.random.default_rng(0)), 10, SHAPE, model=MotionModel("auto"))
+    solution = solve(
+        groups_of(20), edges_of(turn(20, 60.0), np.random.default_rng(0)), 10, frame_shape=SHAPE, model=MotionModel(kind="auto")
+    )
     assert solution.rotations is not None
     assert solution.model.kind == "rotation"
     rivals = solution.compare()
@@ -107,8 +115,8 @@ def test_auto_takes_rotations_of_a_camera_that_turns() -> None:
 def test_auto_takes_homographies_where_no_rotation_explains_the_pairs() -> None:
     """Each exposure is stretched by a thousandth more than the one before: 0.25 px at the ends of a frame."""
     edges = edges_of(turn(20, 60.0), np.random.default_rng(0), further=0.004)
-    plain = solve(groups_of(20), edges, 10, SHAPE)
-    solution = solve(groups_of(20), edges, 10, SHAPE, model=MotionModel("auto"))
+    plain = solve(groups_of(20), edges, 10, frame_shape=SHAPE)
+    solution = solve(groups_of(20), edges, 10, frame_shape=SHAPE, model=MotionModel(kind="auto"))
     assert solution.rotations is None
     assert solution.compare()["homography"].deviance == 0
     np.testing.assert_array_equal(solution.homographies, plain.homographies)
@@ -143,8 +151,8 @@ def bent(rotations: FloatArray, camera: Camera, seen_by: Camera) -> list[Edge]:
 )
 def test_patches_of_pairs_show_the_lens_that_their_homographies_follow(focal_px: float, seen_by: tuple[float, ...]) -> None:
     camera, assumed = Camera.of(focal_px, SHAPE, (-0.11, 0.03, 0, 0)), Camera.of(seen_by[0], SHAPE, seen_by[1:])
-    model = MotionModel("auto").knowing(assumed) if assumed.distorts else MotionModel("auto")
-    solution = solve(groups_of(20), bent(turn(20, 2e4 / focal_px), camera, assumed), 10, SHAPE, model=model)
+    model = MotionModel(kind="auto").knowing(assumed) if assumed.distorts else MotionModel(kind="auto")
+    solution = solve(groups_of(20), bent(turn(20, 2e4 / focal_px), camera, assumed), 10, frame_shape=SHAPE, model=model)
     assert solution.model.name == "rotation with a lens"
     assert solution.rotations is not None
     found, std = solution.rotations.camera.numbers, solution.assess().std_camera
@@ -160,8 +168,8 @@ def test_pairs_contradict_a_focal_length_or_a_lens_that_is_wrong(given: tuple[fl
     """A wrong lens does not pass for a wrong focal length, with which the best one with that lens is many px too large."""
     focal_px, k1 = given
     true, seen_by = Camera.of(330.0, SHAPE, LENS), Camera.of(focal_px, SHAPE, (k1, 0, 0, 0))
-    model = MotionModel("rotation", focal_px, distortion=(k1, 0.0, 0.0, 0.0))
-    solution = solve(groups_of(20), bent(turn(20, 60.0), true, seen_by), 10, SHAPE, model=model)
+    model = MotionModel(kind="rotation", focal_px=focal_px, distortion=(k1, 0.0, 0.0, 0.0))
+    solution = solve(groups_of(20), bent(turn(20, 60.0), true, seen_by), 10, frame_shape=SHAPE, model=model)
     assert solution.rotations is not None
     np.testing.assert_array_equal(solution.rotations.camera.numbers[:2], given)
     freed = solution.freed()
@@ -195,14 +203,16 @@ def behind_things_that_are_near(rotations: FloatArray, camera: Camera) -> list[E
 def test_pairs_follow_the_background_behind_things_that_are_near(kind: ModelName) -> None:
     camera, rotations = Camera.of(430.0, SHAPE), turn(16, 30.0)
     edges = behind_things_that_are_near(rotations, camera)
-    solution = solve(groups_of(16), edges, 8, SHAPE, model=MotionModel(kind))
+    solution = solve(groups_of(16), edges, 8, frame_shape=SHAPE, model=MotionModel(kind=kind))
     true = camera.homographies(rotations[8].T @ rotations)
     away = corner_displacements(np.linalg.inv(true) @ solution.homographies, np.eye(3), SHAPE)
     assert away.mean() < 0.15
     assert solution.model.name == "rotation"
     assert solution.parallax == pytest.approx(15 * 0.8 / 430, rel=0.2)
     without = [replace(each, motion=replace(each.motion, patches=None)) for each in edges]
-    pulled = solve(groups_of(16), without, 8, SHAPE, model=MotionModel("rotation", focal_px=430.0)).homographies
+    pulled = solve(
+        groups_of(16), without, 8, frame_shape=SHAPE, model=MotionModel(kind="rotation", focal_px=430.0)
+    ).homographies
     assert corner_displacements(np.linalg.inv(true) @ pulled, np.eye(3), SHAPE).mean() > 1
 
 
@@ -277,9 +287,9 @@ class _Turning:
 def test_locators_get_the_camera_in_px_of_exposures_once_its_focal_length_is_known(make_level: Callable) -> None:
     shape, known = (128, 160), Camera.of(400.0, (128, 160))
     level = make_level(motion=None, locator=_Turning(), fallbacks={"plain": object()}, scale=0.5)
-    for model in (MotionModel("rotation", known=known), MotionModel("auto", known=known)):
+    for model in (MotionModel(kind="rotation", known=known), MotionModel(kind="auto", known=known)):
         found = level.turning(model.turning_camera(shape))
         np.testing.assert_allclose(found.locators[0].component.matrix, [[200, 0, 39.5], [0, 200, 31.5], [0, 0, 1]])
         assert found.locators[1] is level.locators[1]
-    for unknown in (MotionModel("rotation"), MotionModel("homography", focal_px=400.0)):
+    for unknown in (MotionModel(kind="rotation"), MotionModel(kind="homography", focal_px=400.0)):
         assert level.turning(unknown.turning_camera(shape)) is level

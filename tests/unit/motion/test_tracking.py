@@ -170,7 +170,16 @@ FRAME = (96, 128)
 def motion_of(homographies: np.ndarray, camera: Camera | None = None) -> FrameMotion:
     n_frames = len(homographies)
     located, std_px = np.ones(n_frames, bool), np.zeros(n_frames)
-    return FrameMotion(FrameTrajectory(homographies), FrameSpan(0, n_frames), homographies, located, std_px, 0, FRAME, camera)
+    return FrameMotion(
+        trajectory=FrameTrajectory(homographies),
+        span=FrameSpan(0, n_frames),
+        homographies=homographies,
+        located=located,
+        std_px=std_px,
+        reference=0,
+        frame_shape=FRAME,
+        camera=camera,
+    )
 
 
 def pan(tremor_px: float = 0.0, n_frames: int = 1200) -> np.ndarray:

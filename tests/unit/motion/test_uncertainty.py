@@ -68,7 +68,7 @@ def test_expected_error_matches_actual_error_of_every_exposure(name: str) -> Non
             edge(true, *pair, noise, std_px, (rng, own_px) if own_px and pair[0] - pair[1] > 1 else None)
             for pair in pairs(10, skips)
         ]
-        solutions.append(solve(groups, edges, 5, SHAPE))
+        solutions.append(solve(groups, edges, 5, frame_shape=SHAPE))
     squares, expected = errors_and_expected(solutions, true)
     assert 0.8 < np.sqrt(squares.mean() / expected.mean()) < 1.25
     ratios = np.sqrt(squares / expected)
@@ -84,7 +84,7 @@ def test_expected_error_holds_where_pairs_see_parts_of_their_exposures(step_px: 
         np.stack([0 * steps] * 4 + [step_px * steps, *rng.normal(size=(1, 16)) * 5, 0 * steps, 0 * steps], axis=-1)
     )
     edges = [seen_by_points(true, skips, np.random.default_rng(seed), 0.5) for seed in range(SEEDS)]
-    solutions = [solve(groups_of(16), each, 8, SHAPE, model=MotionModel("euclidean")) for each in edges]
+    solutions = [solve(groups_of(16), each, 8, frame_shape=SHAPE, model=MotionModel(kind="euclidean")) for each in edges]
     squares, expected = errors_and_expected(solutions, true)
     assert 0.8 < np.sqrt(squares.mean() / expected.mean()) < 1.25
 
@@ -93,7 +93,7 @@ def test_expected_error_holds_where_pairs_see_parts_of_their_exposures(step_px: 
 def test_expected_error_of_a_chain_is_the_noise_of_its_exposures_however_long_it_is(n_nodes: int) -> None:
     """The camera stands still: three of eight numbers are free, and the best alignment of planes takes out their mean."""
     still = np.broadcast_to(np.eye(3), (n_nodes, 3, 3))
-    solution = solve(groups_of(n_nodes), measured(still, (1,)), 0, SHAPE)
+    solution = solve(groups_of(n_nodes), measured(still, (1,)), 0, frame_shape=SHAPE)
     assert solution.walks_px == {}
     np.testing.assert_allclose(solution.assess().std_px, NOISE_PX * np.sqrt(3 / 8 * (1 - 1 / n_nodes)), rtol=0.25)
 
@@ -102,7 +102,7 @@ def test_expected_error_of_a_chain_is_the_noise_of_its_exposures_however_long_it
 def test_expected_error_corrects_overconfident_edges_only_with_loops(skips: tuple[int, ...]) -> None:
     _, edges = graph(40, skips)
     honest, overconfident, modest = (
-        solve(groups_of(40), confident(edges, times), 20, SHAPE).assess().std_px.mean() for times in (1, 5, 0.2)
+        solve(groups_of(40), confident(edges, times), 20, frame_shape=SHAPE).assess().std_px.mean() for times in (1, 5, 0.2)
     )
     assert overconfident == pytest.approx(honest if skips == (1, 2) else honest / 5, rel=0.2)
     # With less to tell, walks are narrower.

@@ -29,7 +29,16 @@ def motion_of(homographies: np.ndarray, camera: Camera | None = None) -> FrameMo
     n_frames = len(homographies)
     located, std_px = np.ones(n_frames, bool), np.zeros(n_frames)
     trajectory = FrameTrajectory(homographies)
-    return FrameMotion(trajectory, FrameSpan(0, n_frames), homographies, located, std_px, 0, SHAPE, camera)
+    return FrameMotion(
+        trajectory=trajectory,
+        span=FrameSpan(0, n_frames),
+        homographies=homographies,
+        located=located,
+        std_px=std_px,
+        reference=0,
+        frame_shape=SHAPE,
+        camera=camera,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +48,15 @@ def still() -> Film:
     at = rng.integers(-3, 4, (2000, 2)).repeat(2, axis=0)[:2000]
     motion = motion_of(np.array([translation(*each) for each in at.astype(float)]))
     frames = detected(np.full((2000, *SHAPE), 0.3), rng)
-    return Film(MemorySource(frames), motion, canvas_of_box((4, 4, 28, 20), 1.0), 0.25, None, 0.6, "none")
+    return Film(
+        source=MemorySource(frames),
+        motion=motion,
+        canvas=canvas_of_box((4, 4, 28, 20), 1.0),
+        tolerance_px=0.25,
+        smooth_frames=None,
+        white_flux=0.6,
+        white_balance="none",
+    )
 
 
 def test_noise_of_stabilised_pictures_is_that_of_photons(still: Film) -> None:

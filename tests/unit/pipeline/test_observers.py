@@ -72,7 +72,7 @@ def test_observers_receive_four_stages_of_each_level(
 ) -> None:
     source = memory_source(np.zeros((120, 40, 60)))
     levels = [make_level(), make_level(number=2)]
-    context = Context(2, on_level=watching(log).level_finished)
+    context = Context(threads=2, on_level=watching(log).level_finished)
     setting = LoopSetting(source=source, graph=GraphSettings(), context=context, reference=60, timeline=Timeline.regular(120))
     results = estimate_motion(setting, levels)
     assert [(level, stage) for level, stage, _, _ in told] == [

@@ -54,18 +54,26 @@ def run(source: ReadOnlySource) -> Callable[..., Explained]:
         if camera is not None:
             homographies = camera.homographies(likely_rotations(camera, homographies, SHAPE))
         motion = FrameMotion(
-            FrameTrajectory(homographies),
-            FrameSpan(0, FRAMES),
-            homographies,
-            np.ones(FRAMES, np.bool_),
-            np.full(FRAMES, 0.05),
-            FRAMES // 2,
-            SHAPE,
-            camera,
+            trajectory=FrameTrajectory(homographies),
+            span=FrameSpan(0, FRAMES),
+            homographies=homographies,
+            located=np.ones(FRAMES, np.bool_),
+            std_px=np.full(FRAMES, 0.05),
+            reference=FRAMES // 2,
+            frame_shape=SHAPE,
+            camera=camera,
         )
         component = answer if isinstance(answer, Answering) else Answering(answer)
         named = NamedRefiner("odd", attributed(component, "refiner 'odd' of toys 1.0", "the refinement"))
-        state = State(PLAN, source, Context(), FRAMES // 2, (), Timeline.regular(FRAMES), refined=motion)
+        state = State(
+            plan=PLAN,
+            source=source,
+            context=Context(),
+            reference=FRAMES // 2,
+            levels=(),
+            timeline=Timeline.regular(FRAMES),
+            refined=motion,
+        )
         return refine(state, [named])[1]
 
     return run

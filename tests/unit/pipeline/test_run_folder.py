@@ -37,16 +37,26 @@ CANVAS = Canvas(60, 90, PANORAMA.canvas)
 PICTURE = np.arange(60 * 90, dtype=np.uint8).reshape(60, 90)
 FILES = {"panorama.tiff", "panorama-std.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"}
 MOTION = FrameMotion(
-    KnownMotion(lambda _: np.eye(3)),
-    FrameSpan(0, 500),
-    np.random.default_rng(0).random((500, 3, 3)),
-    np.ones(500, bool),
-    np.ones(500),
-    250,
-    (48, 64),
+    trajectory=KnownMotion(lambda _: np.eye(3)),
+    span=FrameSpan(0, 500),
+    homographies=np.random.default_rng(0).random((500, 3, 3)),
+    located=np.ones(500, bool),
+    std_px=np.ones(500),
+    reference=250,
+    frame_shape=(48, 64),
 )
-RANGE = DynamicRange(CanvasNoise(BinaryResponse()))
-RENDERED = RenderedPanorama(CANVAS, PANORAMA, 1, PICTURE, 1.0, 0.9, 2.0, STD, RANGE)
+RANGE = DynamicRange(noise=CanvasNoise(response=BinaryResponse()))
+RENDERED = RenderedPanorama(
+    canvas=CANVAS,
+    thumbnail=PANORAMA,
+    reduction=1,
+    picture=PICTURE,
+    white_flux=1.0,
+    coverage_share=0.9,
+    seconds=2.0,
+    std=STD,
+    dynamic_range=RANGE,
+)
 RECORD: Any = {"photonpano": "0", "spec": {}, "warnings": ["a line"] * 2000}
 
 WRITERS: Mapping[str, Callable[[RunFolder], object]] = {
@@ -65,7 +75,7 @@ def write_all(folder: RunFolder) -> None:
     """Write a run as `run` does: the results, and then the report."""
     write_images(folder)
     record = folder.commit(RECORD)
-    folder.add_report("<html>µ</html>" * 2000)
+    folder.add_report("<html>µ</html>" * 2000)  # noqa: RUF001
     folder.update(record)
 
 
@@ -112,7 +122,7 @@ def test_run_folder_holds_the_written_files(tmp_path: Path) -> None:
         "sha256": hashlib.sha256((directory / "panorama.png").read_bytes()).hexdigest(),
     }
     assert changed_files(directory) == []
-    assert (directory / "report.html").read_text(encoding="utf-8").startswith("<html>µ</html>")
+    assert (directory / "report.html").read_text(encoding="utf-8").startswith("<html>µ</html>")  # noqa: RUF001
     assert list((tmp_path / "runs").iterdir()) == [directory]
 
 

@@ -26,6 +26,14 @@ def test_many_copies_are_a_warning(every: int, n_copies: str | None) -> None:
 )
 def test_error_that_is_not_known_is_a_warning(px: float, begins: str) -> None:
     homographies = np.array([translation(px * frame, 0) for frame in range(100)])
-    known = np.ones(100, np.bool_), np.full(100, np.inf), 50, (64, 96)
-    [warning] = motion_warnings(FrameMotion(FrameTrajectory(homographies), FrameSpan(0, 100), homographies, *known))
+    motion = FrameMotion(
+        trajectory=FrameTrajectory(homographies),
+        span=FrameSpan(0, 100),
+        homographies=homographies,
+        located=np.ones(100, np.bool_),
+        std_px=np.full(100, np.inf),
+        reference=50,
+        frame_shape=(64, 96),
+    )
+    [warning] = motion_warnings(motion)
     assert warning.startswith(begins)

@@ -22,7 +22,7 @@ from photonpano.testing import KnownMotion
 
 FRAME_SHAPE = (254, 496)
 N_FRAMES = 10_000
-RANGE = DynamicRange(CanvasNoise(BinaryResponse()))
+RANGE = DynamicRange(noise=CanvasNoise(response=BinaryResponse()))
 
 
 def make_results(n_frames: int = N_FRAMES) -> tuple[FrameMotion, RenderedPanorama]:
@@ -52,11 +52,29 @@ def make_results(n_frames: int = N_FRAMES) -> tuple[FrameMotion, RenderedPanoram
     known = np.flatnonzero(located)
     span = FrameSpan(int(known[0]), int(known[-1]) + 1)
     trajectory = KnownMotion(lambda frame: homographies[round(frame)])
-    motion = FrameMotion(trajectory, span, homographies, located, std_px, reference, FRAME_SHAPE)
+    motion = FrameMotion(
+        trajectory=trajectory,
+        span=span,
+        homographies=homographies,
+        located=located,
+        std_px=std_px,
+        reference=reference,
+        frame_shape=FRAME_SHAPE,
+    )
     preview, weight = np.clip(picture, 0, 255).astype(np.uint8), coverage.astype(np.float32)
     thumbnail = Panorama(weight, weight, canvas.transform)
     share, std = float((weight > 0).mean()), 0.1 * weight
-    return motion, RenderedPanorama(canvas, thumbnail, 1, preview, 1.8342, share, 4.18, std, RANGE)
+    return motion, RenderedPanorama(
+        canvas=canvas,
+        thumbnail=thumbnail,
+        reduction=1,
+        picture=preview,
+        white_flux=1.8342,
+        coverage_share=share,
+        seconds=4.18,
+        std=std,
+        dynamic_range=RANGE,
+    )
 
 
 def make_residuals(n_frames: int = N_FRAMES, tremor_px: float = 0.0, period: float = 100.0) -> Residuals:
@@ -150,7 +168,7 @@ def explained(motion: FrameMotion, panorama: RenderedPanorama, residuals: Residu
     agreeing, std_px = np.full(len(cuts), 0.999), np.full((len(cuts), 2), (0.01, 0.02))
     found = Agreements(cuts, agreeing, 0.002 * agreeing, std_px, 90 * agreeing)
     halves = Halves(found, found)
-    return Explained(motion, panorama.canvas, residuals, 1.0123, halves, ())
+    return Explained(motion=motion, canvas=panorama.canvas, residuals=residuals, ratio=1.0123, halves=halves, refinements=())
 
 
 @pytest.fixture

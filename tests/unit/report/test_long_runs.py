@@ -40,7 +40,14 @@ class End:
 
     @property
     def explained(self) -> Explained:
-        return Explained(self.motion, self.panorama.canvas, self.residuals, 1.0, Halves.none(), ())
+        return Explained(
+            motion=self.motion,
+            canvas=self.panorama.canvas,
+            residuals=self.residuals,
+            ratio=1.0,
+            halves=Halves.none(),
+            refinements=(),
+        )
 
     def refined(self) -> Refined | None:
         refiner = ShortSpansRefiner(ShortSpansConfig(), self.motion.frame_shape, 96_800.0)

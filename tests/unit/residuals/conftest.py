@@ -53,12 +53,14 @@ def explained(noise: Residuals) -> Explained:
     """A run whose motion is right."""
     homographies = np.repeat(np.eye(3)[None], N_FRAMES, axis=0)
     motion = FrameMotion(
-        FrameTrajectory(homographies),
-        FrameSpan(0, N_FRAMES),
-        homographies,
-        np.ones(N_FRAMES, np.bool_),
-        np.full(N_FRAMES, 0.05),
-        N_FRAMES // 2,
-        SHAPE,
+        trajectory=FrameTrajectory(homographies),
+        span=FrameSpan(0, N_FRAMES),
+        homographies=homographies,
+        located=np.ones(N_FRAMES, np.bool_),
+        std_px=np.full(N_FRAMES, 0.05),
+        reference=N_FRAMES // 2,
+        frame_shape=SHAPE,
     )
-    return Explained(motion, Canvas(*SHAPE, np.eye(3)), noise, 1.05, Halves.none(), ())
+    return Explained(
+        motion=motion, canvas=Canvas(*SHAPE, np.eye(3)), residuals=noise, ratio=1.05, halves=Halves.none(), refinements=()
+    )

@@ -39,8 +39,16 @@ def cuts_of(street: np.ndarray) -> Callable[..., tuple[Cut, ...]]:
         homographies = np.array([translation(x, 0) for x in found_px])
         everywhere, std_px = np.ones(N_FRAMES, dtype=bool), np.full(N_FRAMES, 0.05)
         trajectory, span = FrameTrajectory(homographies), FrameSpan(0, N_FRAMES)
-        motion = FrameMotion(trajectory, span, homographies, everywhere, std_px, N_FRAMES // 2, SHAPE)
-        return find_cuts(source, MotionFit(source, motion, 2**30, Context()), context or Context(2))
+        motion = FrameMotion(
+            trajectory=trajectory,
+            span=span,
+            homographies=homographies,
+            located=everywhere,
+            std_px=std_px,
+            reference=N_FRAMES // 2,
+            frame_shape=SHAPE,
+        )
+        return find_cuts(source, MotionFit(source, motion, 2**30, Context()), context or Context(threads=2))
 
     return cuts_of
 
@@ -100,7 +108,7 @@ class Stages:
 def test_only_frames_around_a_sudden_change_are_searched(cuts_of: Callable[..., tuple[Cut, ...]]) -> None:
     """All spans stand out from the noise where the loop has missed a tremor."""
     tremor_px, stages = 1.5 * np.sin(2 * np.pi * FRAMES / 160), Stages()
-    assert cuts_of(PAN_PX + tremor_px, PAN_PX, context=Context(1, stages)) == ()
+    assert cuts_of(PAN_PX + tremor_px, PAN_PX, context=Context(threads=1, progress=stages)) == ()
     assert stages.total == 0
-    assert cuts_of(PAN_PX + 5 * AFTER, smoothed(PAN_PX + 5 * AFTER), context=Context(1, stages))
+    assert cuts_of(PAN_PX + 5 * AFTER, smoothed(PAN_PX + 5 * AFTER), context=Context(threads=1, progress=stages))
     assert 0 < stages.total < N_FRAMES / 2

@@ -26,7 +26,15 @@ def halves(memory_source: type) -> Callable[..., Halves]:
         homographies = np.linalg.inv(true[N_FRAMES // 2]) @ (true if found is None else found)
         everywhere, std_px = np.ones(N_FRAMES, dtype=bool), np.full(N_FRAMES, 0.05)
         trajectory, span = FrameTrajectory(homographies), FrameSpan(0, N_FRAMES)
-        motion = FrameMotion(trajectory, span, homographies, everywhere, std_px, N_FRAMES // 2, SHAPE)
+        motion = FrameMotion(
+            trajectory=trajectory,
+            span=span,
+            homographies=homographies,
+            located=everywhere,
+            std_px=std_px,
+            reference=N_FRAMES // 2,
+            frame_shape=SHAPE,
+        )
         return halves_of(source, motion, canvas_of(homographies, SHAPE, 1.0), Context())
 
     return halves

@@ -42,7 +42,7 @@ def residuals_of(tremor_px: float = 0.0, threads: int = 1, period: float = PERIO
     trajectory = FrameTrajectory(np.array([shaken(frame, 0) for frame in range(FRAMES)]))
     canvas = plan_canvas(trajectory, span, SHAPE, 1.0, 2**30)
     panorama = render(source, trajectory, span, canvas, 0.25, Context())
-    return measure(span, Predictions.of(source, panorama, canvas, trajectory, SHAPE), Context(threads))
+    return measure(span, Predictions.of(source, panorama, canvas, trajectory, SHAPE), Context(threads=threads))
 
 
 def test_measure_finds_photon_noise_along_true_motion() -> None:

@@ -227,7 +227,7 @@ def level_with(
         "rotations": rotations,
         "walks_px": {"zoom": 1.0},
         "outliers": (),
-        "model": MotionModel("rotation"),
+        "model": MotionModel(kind="rotation"),
         "freed": lambda: None,
         "parallax": 0.0,
     }
@@ -247,12 +247,12 @@ def test_model_that_holds_less_than_the_motion_is_doubtful(
 ) -> None:
     """Homographies are likelier, and farther away than the motion is expected to err."""
     rivals = {"homography": Rival(1.0, 232, 0.0, times * float(np.hypot(1, SAME_LENS_PX))), "affine": Rival(1.0, 88, deviance)}
-    reasons = judge(explained, [level_with(None, rivals, model=MotionModel("affine"))]).reasons
+    reasons = judge(explained, [level_with(None, rivals, model=MotionModel(kind="affine"))]).reasons
     assert [(reason.what, pytest.approx(reason.figure)) for reason in reasons] == [(NARROW, times)] * doubtful
     assert all("affine" in reason.where for reason in reasons)
     # More light would not help: the distance to homographies is in the expected error.
     unsure = replace(explained, motion=replace(explained.motion, std_px=explained.motion.std_px + 3))
-    [reason] = judge(unsure, [level_with(None, rivals, model=MotionModel("affine"))]).reasons
+    [reason] = judge(unsure, [level_with(None, rivals, model=MotionModel(kind="affine"))]).reasons
     assert (reason.what == NARROW) == doubtful
 
 

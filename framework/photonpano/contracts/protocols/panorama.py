@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class Renderer(Protocol):
     """Renders the panorama: flux and weight on a canvas, from the frames and their motion."""
 
-    def render(
+    def render(  # noqa: PLR0917
         self,
         source: Source,
         trajectory: Trajectory,

@@ -41,17 +41,17 @@ def panned(
 
 @pytest.mark.parametrize("seed", range(2))
 def test_pan_over_bright_scene_is_no_change_of_light(seed: int) -> None:
-    assert find_light(panned(STEADY, seed=seed), MOTION, Context(1)) is None
+    assert find_light(panned(STEADY, seed=seed), MOTION, Context(threads=1)) is None
 
 
 def test_tremor_that_the_motion_lacks_is_no_flicker() -> None:
     tremor = 1.5 * np.sin(2 * np.pi * np.arange(N) / 90.5)
-    assert find_light(panned(STEADY, tremor_px=tremor), MOTION, Context(1)) is None
+    assert find_light(panned(STEADY, tremor_px=tremor), MOTION, Context(threads=1)) is None
 
 
 @pytest.mark.parametrize(("light", "period"), [(DRIFT, None), (FLICKER, 90.5)], ids=["drift", "flicker"])
 def test_gain_of_each_frame_is_measured(light: np.ndarray, period: float | None) -> None:
-    found = find_light(panned(light), MOTION, Context(1))
+    found = find_light(panned(light), MOTION, Context(threads=1))
     assert found is not None
     error = found.gain - light / light.mean()
     assert float(np.sqrt(np.mean(error**2))) < 0.02
@@ -76,7 +76,7 @@ def test_lamps_of_two_phases_are_told_apart() -> None:
         phase = np.where(x < 60, 0, 2 * np.pi / 3)
         gain = 1 + 0.6 * np.cos(turns[first : first + 4, None] + phase)
         frames[first : first + 4] = rng.random((4, *shape)) < -np.expm1(-scene.view(at, shape) * gain[:, None, :])
-    light = find_light(MemorySource(frames), motion, Context(1))
+    light = find_light(MemorySource(frames), motion, Context(threads=1))
     assert light is not None
     assert light.has_lamps
     assert light.frequency == pytest.approx(1 / 64, rel=5e-3)
@@ -166,6 +166,6 @@ def test_lamps_over_parts_of_the_scene_are_told_from_light_that_is_the_same_ever
     light = 1 + 0.5 * (share * np.cos(turns) + (1 - share) * np.cos(turns + phases[1]))
     exposure = np.full(len(times), 400.0)
     photons = rng.poisson(exposure * light * rng.uniform(0.5, 1, (14, 34))[rows, columns]).astype(float)
-    seen = SeenCells(spans, rows * 34 + columns, times, photons, exposure, canvas)
+    seen = SeenCells(spans=spans, cells=rows * 34 + columns, times=times, photons=photons, exposure=exposure, canvas=canvas)
     found = local_flicker(solve_gains(seen))
     assert (None if found is None else found.frequency) == (pytest.approx(frequency, rel=0.03) if phases[1] else None)

@@ -36,9 +36,11 @@ def run(source: Any) -> Callable[..., LocatedLevel]:
         known: FrameSpan | None = None,
     ) -> LocatedLevel:
         groups = level.resampler.groups(N_FRAMES, level.number)
-        exposures = VirtualExposures(level, source, groups, previous, Stopwatch(), known=known)
+        exposures = VirtualExposures(
+            level=level, source=source, groups=groups, previous=previous, clock=Stopwatch(), known=known
+        )
         setting = LoopSetting(
-            source=source, graph=graph, context=Context(threads), reference=0, timeline=Timeline.regular(N_FRAMES)
+            source=source, graph=graph, context=Context(threads=threads), reference=0, timeline=Timeline.regular(N_FRAMES)
         )
         return locate(exposures, setting)
 

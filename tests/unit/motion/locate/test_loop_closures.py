@@ -75,9 +75,9 @@ def run() -> Callable[..., LocatedLevel]:
     def run(level: Level, closure_overlap: float | None = 0.5, threads: int = 2) -> LocatedLevel:
         groups = level.resampler.groups(10 * N, level.number)
         graph = GraphSettings(skips=(1.0, 2.0), closure_overlap=closure_overlap)
-        exposures = VirtualExposures(level, source, groups, None, Stopwatch())
+        exposures = VirtualExposures(level=level, source=source, groups=groups, previous=None, clock=Stopwatch())
         setting = LoopSetting(
-            source=source, graph=graph, context=Context(threads), reference=0, timeline=Timeline.regular(10 * N)
+            source=source, graph=graph, context=Context(threads=threads), reference=0, timeline=Timeline.regular(10 * N)
         )
         return locate(exposures, setting)
 
