@@ -329,7 +329,9 @@ def _products_of(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float3
     for frames in samples:
         n_sums = len(frames) // _LENGTHS[0]
         bits = np.unpackbits(frames[: n_sums * _LENGTHS[0]], axis=2)
-        pixels = bits.reshape(n_sums, _LENGTHS[0], -1, 2).sum(axis=1, dtype=np.uint8).sum(axis=2, dtype=np.float32)
+        pixels = (
+            bits.reshape(n_sums, _LENGTHS[0], 4 * frames[0].size, 2).sum(axis=1, dtype=np.uint8).sum(axis=2, dtype=np.float32)
+        )
         sums = pixels.reshape(n_sums, *frames.shape[1:], 4)  # four pairs of pixels in a byte
         for length in _LENGTHS:
             step = length // _LENGTHS[0]

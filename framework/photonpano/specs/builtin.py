@@ -154,15 +154,18 @@ class AutoConfig(Config):
     )
 
 
+RECOGNISED = "auto"  # stands for the source that recognises a capture
+
+
 def _unbuilt(*_: object) -> NoReturn:
-    raise PluginError("this name stands for other components, which a spec that uses it is resolved to; build those")
+    raise PluginError("this name stands for another source, to which a spec that uses it is resolved; build that")
 
 
 @hookimpl
 def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer the name for the source that recognises a capture."""
     yield SourceContribution(
-        name="auto", summary="The source that recognises the file or folder", config=AutoConfig, build=_unbuilt
+        name=RECOGNISED, summary="The source that recognises the file or folder", config=AutoConfig, build=_unbuilt
     )
 
 
@@ -239,7 +242,7 @@ def _near_misses(spec: Spec, keys: Written, path: Location) -> list[tuple[str, s
     endings = {path.suffix.lower(), *(each.suffix.lower() for each in files)}
     for entry in spec.catalog.rows:
         contribution = entry.contribution
-        if not isinstance(contribution, SourceContribution) or entry.name == "auto":
+        if not isinstance(contribution, SourceContribution) or entry.name == RECOGNISED:
             continue
         if contribution.suffixes and not endings & {*contribution.suffixes}:
             continue

@@ -12,7 +12,7 @@ from photonpano.errors import PluginError, described
 from photonpano.plugins.contributions import KINDS, ExporterContribution, Kind
 from photonpano.plugins.registry import Entry
 from photonpano.reading import missing_file
-from photonpano.specs.builtin import recognised_source
+from photonpano.specs.builtin import RECOGNISED, recognised_source
 from photonpano.specs.plan import Choice, Spec, validate
 from photonpano.specs.settings import CHOICE
 from photonpano.specs.yaml_reader import Written, given
@@ -22,8 +22,6 @@ from photonpano.text import listed, suggestion
 DEFAULT_FALLBACK = "opencv-sift"
 _AGAIN = "would lose the same pairs again"
 AUTO = "auto"  # the default: the run masks what stands still, and divides by a vignette
-
-
 CHAIN = "chain-of-backends"  # another spelling of a locator with fallbacks
 
 
@@ -83,9 +81,8 @@ class ComponentResolver:
         below = ("backends",) if is_locator and use == CHAIN else self.catalog.keys_of(kind.name, use)
         spec.check_keys(content, (*CHOICE, "fallback") if is_locator else CHOICE, below)
         if not is_locator:
-            is_auto = kind is KINDS["source"] and section.at("use").data == AUTO
-            return recognised_source(section, spec) if is_auto else section
-        if section.at("use").data == CHAIN:
+            return recognised_source(section, spec) if kind is KINDS["source"] and use == RECOGNISED else section
+        if use == CHAIN:
             return self.chain(section)
         fallback = section.at("fallback")
         items = self.items(kind, fallback, None if "use" in content.data else DEFAULT_FALLBACK)
@@ -156,7 +153,7 @@ class ComponentResolver:
         return self.component(kind, section) if self.is_item(kind, section) else None
 
     def is_item(self, kind: Kind, section: Written) -> bool:
-        """Return whether a section is a mapping, and report what it must not have in a list."""
+        """Return whether a section is a mapping; report that it is none, and what it must not have in a list."""
         spec = self.spec
         if not isinstance(section.data, dict):
             article = "an" if kind.name[0] in "aeiou" else "a"
