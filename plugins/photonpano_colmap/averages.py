@@ -57,7 +57,7 @@ class AveragesEstimator:
         self._context = context
 
     def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
-        """Estimate the poses of a capture: see `photonpano.PoseEstimator`."""
+        """Estimate the poses of a capture: see `photonpano_poses.PoseEstimator`."""
         return with_focal_judged(self.averaged(source, camera, progress), self._context)
 
     def averaged(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:

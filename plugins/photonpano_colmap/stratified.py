@@ -48,7 +48,7 @@ class StratifiedEstimator:
         self._context = context
 
     def estimate(self, source: Source, guess: CameraGuess, progress: Progress) -> PoseEstimate:
-        """Estimate the poses of a capture: see `photonpano.PoseEstimator`."""
+        """Estimate the poses of a capture: see `photonpano_poses.PoseEstimator`."""
         first = AveragesEstimator(self._config, self._context).averaged(source, guess, progress)
         camera = Camera(first.camera_matrix, first.distortion)
         instants = np.array([view.instant for view in first.views])
