@@ -364,4 +364,9 @@ def _add_up(template: Layer, buffers: Buffers, sums: FloatArray) -> None:
                     part[8] += 1
                     total += w
                     count += 1
-    sums[:, :, 5:8] *= count / max(total, 1e-20)
+    # A product with a slice would compile the messages of arrays that do not fit, for two seconds.
+    factor = count / max(total, 1e-20)
+    for row in range(rows):
+        for column in range(columns):
+            for k in range(5, 8):
+                sums[row, column, k] *= factor

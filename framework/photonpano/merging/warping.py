@@ -228,9 +228,9 @@ class Texture(NamedTuple):
 def _fill(texels: NDArray[np.uint64], image: NDArray[np.float32], levels: float, zero: float) -> None:
     """Fill the texels of an image; `levels` is their number in 1."""
     height, width = image.shape
-    row = np.full(width + 2, np.uint32(zero))
-    above = np.full(width + 1, np.uint32(zero) | (np.uint32(zero) << np.uint32(16)))
-    pairs = above.copy()
+    row, above, pairs = np.empty(width + 2, np.uint32), np.empty(width + 1, np.uint32), np.empty(width + 1, np.uint32)
+    row[:] = np.uint32(zero)
+    above[:] = np.uint32(zero) | (np.uint32(zero) << np.uint32(16))
     factor, rounded, most = np.float32(levels), np.float32(zero + 0.5), np.float32(_LEVELS)
     for y in range(height + 1):
         pixels, inner = image[min(y, height - 1)], row[1 : width + 1]
