@@ -4,6 +4,7 @@ from .api.copies import DarkMeasurement as DarkMeasurement
 from .api.copies import WrittenCapture as WrittenCapture
 from .api.copies import convert as convert
 from .api.copies import dark as dark
+from .api.from_python import panorama as panorama
 from .api.judging import Comparison as Comparison
 from .api.judging import RunCheck as RunCheck
 from .api.judging import check_run as check_run

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
@@ -192,20 +192,20 @@ class RegistratorLocator:
             (down, right), *_ = correlated(other.image, one.image, reference_mask=other.seen, moving_mask=one.seen)
             start = rescaled(translation(float(right), float(down)), one.pixel)
         evaluations: list[int] = []
-        found, failure = coarse_to_fine(moving, fixed, start, partial(self._aligned, len(moving), evaluations))
+        n_layers = len(moving)
+
+        def align(one: View, other: View, start: Homography, depth: int) -> Homography | NotLocated:
+            descent = _Descent(one, other, free_parameters(depth, n_layers), self._device)
+            with one_thread():
+                found = descent.from_start(start, self._config, coarse=depth > 0)
+            evaluations.append(descent.evaluations)
+            return found
+
+        found, failure = coarse_to_fine(moving, fixed, start, align)
         if failure is not None:
             return failure
         evidence = {"evaluations": float(sum(evaluations))}
         return motion_from_images(moving[0], fixed[0], found[-1], self._config, evidence=evidence)
-
-    def _aligned(
-        self, layers: int, evaluations: list[int], moving: View, *, fixed: View, start: Homography, depth: int
-    ) -> Homography | NotLocated:
-        descent = _Descent(moving, fixed, free_parameters(depth, layers), self._device)
-        with one_thread():
-            found = descent.from_start(start, self._config, coarse=depth > 0)
-        evaluations.append(descent.evaluations)
-        return found
 
 
 class _Descent:

@@ -9,12 +9,13 @@ from pathlib import Path
 import typer
 
 from photonpano.api.command import CHANGES, SPEC, WrongArgumentError, command, logger, require_trust, verdict_lines, warn
+from photonpano.corrections.lighting import LIGHT_FILE
 from photonpano.execution.context import Progress
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
 from photonpano.record.run_json import findings_of
-from photonpano.record.schema import PanoramaRecord
+from photonpano.record.schema import PanoramaRecord, RunRecord
 from photonpano.specs import load_spec
-from photonpano.text import byte_size, counted, duration
+from photonpano.text import byte_size, counted, duration, share
 
 
 def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
@@ -37,6 +38,8 @@ def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
     for refinement in record["refinements"]:
         if refinement["rounds"]:  # the first of them is the largest
             yield f"refined   {refinement['change_px']:.2g} px on average by {refinement['use']}: {refinement['rounds'][0]}"
+    if record.get("levels"):
+        yield f"found     {_found(record)}"
     if line := _range(record.get("panorama")):
         yield f"range     {line}"
     yield from (f"{name:<9} {text}" for name, text in result.rows)
@@ -82,7 +85,7 @@ def _run(  # noqa: PLR0913
     A spec with the section of another kind of run, which a plugin offers, finds that instead.
 
     Args:
-        spec: a YAML file.
+        spec: a YAML file; or a capture, for a run with all defaults.
         output: the run folder, instead of the spec's output.directory.
         changes: overrides of values of the spec, such as run.seed=1.
         overwrite: write beside other files, which stay, or replace a run of another capture.
@@ -116,6 +119,21 @@ def _run(  # noqa: PLR0913
         follow=follow,
         end_after=END_AFTER_S if end_after is None else end_after,
     )
+
+
+def _found(record: RunRecord) -> str:
+    """Describe what a run has chosen and left out by itself: model, groups, lens, light, and what hides the background."""
+    last, hidden = record["levels"][-1], findings_of(record).hidden_share
+    written = {"translation": "shifts", "homography": "homographies", "rotation": "rotations"}
+    model = "rotations" if last["camera"] else written.get(record["spec"]["motion"]["model"], "homographies")
+    parts = [f"{model}, from groups of {counted(last['group_frames'], 'frame')}"]
+    if last["camera"] and any(last["camera"]["distortion"]):
+        parts.append(f"a lens with k1 {last['camera']['distortion'][0]:.3f}")
+    if LIGHT_FILE in record["files"]:
+        parts.append("light that changes")
+    if hidden:
+        parts.append(f"{share(hidden)} of the frames left out, as what moves or is near")
+    return "; ".join(parts)
 
 
 def _range(panorama: PanoramaRecord | None) -> str:

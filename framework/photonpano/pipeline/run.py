@@ -5,17 +5,19 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 from photonpano.capture import capture_of
 from photonpano.compiling import notify_on_first_compile
 from photonpano.contracts.protocols import Source, light_of
 from photonpano.corrections.movers import decision_of
 from photonpano.errors import CanvasTooLargeError, InputError, LocationError, OutputError, PhotonpanoError, PluginError
+from photonpano.evaluation import RunTrajectory, load_panorama, load_run_trajectory
 from photonpano.execution.context import Context, Progress, Quiet, TimeLimit, usual
 from photonpano.execution.threads import one_thread_inside
 from photonpano.files.folders import atomic_path
@@ -41,9 +43,10 @@ from photonpano.report import OpenCapture, render_failure, render_report
 from photonpano.report.notebook import ShownReport, run_html
 from photonpano.residuals.findings import Findings
 from photonpano.residuals.verdict import judge
+from photonpano.specs import load_spec, parse_spec
 from photonpano.specs.plan import Plan
 from photonpano.text import listed
-from photonpano.values import Decision, Journal, Verdict
+from photonpano.values import Decision, Journal, Panorama, Verdict
 
 END_AFTER_S = 5.0  # default time without a new frame after which a followed capture is complete
 logger = logging.getLogger(__name__)
@@ -51,7 +54,7 @@ logger = logging.getLogger(__name__)
 COMPILING = "compiling for this machine, once; `photonpano warm-up` does it beforehand"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, weakref_slot=True)
 class RunResult:
     """A finished run.
 
@@ -72,6 +75,16 @@ class RunResult:
     kind: RunKindContribution | None = field(default=None, repr=False)
 
     @property
+    def trajectory(self) -> RunTrajectory:
+        """The motion of each frame with its expected error, read from the run folder."""
+        return load_run_trajectory(self.directory)
+
+    @property
+    def panorama(self) -> Panorama:
+        """The panorama, read from the run folder: flux, weight and canvas."""
+        return Panorama(*load_panorama(self.directory), self.trajectory.canvas)
+
+    @property
     def rows(self) -> Sequence[tuple[str, str]]:
         """What a kind of run shows of its results, with names; nothing for a panorama."""
         return () if self.kind is None else self.kind.runs.rows(self.record)
@@ -90,7 +103,7 @@ class RunResult:
 
 
 def run(
-    plan: Plan,
+    plan: Plan | str | Path | Mapping[str, Any],
     progress: Progress | None = None,
     *,
     overwrite: bool = False,
@@ -106,7 +119,7 @@ def run(
     own: `runs/scan.panorama-2` beside `runs/scan`, and so on, longer ones first. One that fails is a warning.
 
     Args:
-        plan: from `load_spec` or `parse_spec`.
+        plan: from `load_spec` or `parse_spec`; or what these take, the path of a spec, or a spec as plain data.
         progress: receives stages and messages; by default, bars in a notebook and nothing elsewhere.
         overwrite: whether the run folder may hold files that no run has written, which stay, or a run of another capture.
         resume: go on with a run of the same spec, capture and versions that was interrupted. If it was finished, its results
@@ -126,6 +139,8 @@ def run(
         PluginError: a component failed in its own way, or broke its contract.
         OutputError: the run folder cannot be written, or another process writes it; it is as it was.
     """
+    if not isinstance(plan, Plan):
+        plan = parse_spec(plan) if isinstance(plan, Mapping) else load_spec(plan)
     if follow:
         if resume or from_level is not None:
             raise InputError("a run that follows a capture begins anew: without resume and from_level")

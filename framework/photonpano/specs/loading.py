@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 from photonpano.errors import Problem, SpecError
@@ -26,7 +25,7 @@ def load_spec(
     catalog: Catalog | None = None,
     arriving: bool = False,
 ) -> Plan:
-    """Load a spec file and resolve it.
+    """Load a spec file and resolve it. A capture in its place is that of a spec with all defaults.
 
     Args:
         path: the file; relative paths in it count from its folder.
@@ -54,9 +53,16 @@ def load_spec(
     except SpecError:
         if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not ask_sources(catalog, path)[0]:
             raise
-        asked = f"photonpano info {quote(str(path))}"
-        message = f"this is a capture, not a spec; `{asked}` reads it and prints a spec to start from"
-        raise SpecError([Problem(where="", message=message, file=path)]) from None
+    source = {"use": "auto", "with": {"path": path.name}}
+    return parse_spec(
+        {"version": 1, "source": source},
+        directory=path.parent,
+        name=path.stem,
+        overrides=overrides,
+        output=output,
+        catalog=catalog,
+        arriving=arriving,
+    )
 
 
 def parse_spec(

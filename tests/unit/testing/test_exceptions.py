@@ -129,12 +129,6 @@ def test_check_that_returns_no_sentences_is_a_problem_of_the_spec(
     assert outcome.code == 2
 
 
-def test_check_with_sentences_without_end_is_cut(outcome_of: Callable[..., Outcome]) -> None:
-    outcome = outcome_of({"source": {"use": "strange"}}, strange(SourceContribution, check=lambda _: map(str, count())))
-    assert outcome.code == 2
-    assert outcome.printed.endswith("source: 99\nerror: the spec has 100 problems\n")
-
-
 @pytest.mark.parametrize("error", ERRORS, ids=ERRORS)
 def test_config_that_raises_is_a_problem_of_the_spec(outcome_of: Callable[..., Outcome], error: str) -> None:
     raised, words = ERRORS[error]
