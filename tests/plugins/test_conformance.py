@@ -24,7 +24,6 @@ from photonpano.testing.conformance import Conformance
 from photonpano_poses.testing import PoseEstimatorConformance
 
 (AUTO,) = builtin.photonpano_sources()
-(CHAIN,) = builtin.photonpano_locators()
 CATALOG = discover()
 OURS = [(entry.kind, entry.name) for entry in CATALOG.rows if entry.origin.plugin == "photonpano"]
 
@@ -105,13 +104,6 @@ TestStratifiedPose = of(
 
 TestThreads = of(ExecutorConformance, "threads")
 TestDask = pytest.mark.filterwarnings("default")(of(ExecutorConformance, "dask", config={"workers": 1}))
-
-
-class TestChainOfBackends(Conformance):
-    """It stands for other locators, which a spec that names it builds in its place: only what holds without building holds."""
-
-    kind = "locator"
-    contribution = CHAIN
 
 
 class TestPoses(Conformance):
