@@ -11,13 +11,9 @@ from pathlib import Path
 
 
 class PhotonpanoError(Exception):
-    """Base of all errors with a message made for users.
+    """Base of all errors with a message made for users."""
 
-    Attributes:
-        report: a page about the run that failed; None where there is none.
-    """
-
-    report: Path | None = None
+    report: Path | None = None  # a page about the run that failed; None where there is none
 
 
 class InputError(PhotonpanoError):

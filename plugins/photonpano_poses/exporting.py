@@ -149,17 +149,11 @@ def _read(path: Path) -> Picture:
 
 @dataclass(frozen=True, slots=True)
 class ExportedPoses:
-    """Poses that were written.
+    """Poses that were written."""
 
-    Attributes:
-        files: their paths.
-        n_frames: frames, or pictures, with a pose.
-        pictures: the folder of the pictures; None without them.
-    """
-
-    files: tuple[Path, ...]
-    n_frames: int
-    pictures: Path | None = None
+    files: tuple[Path, ...]  # their paths
+    n_frames: int  # frames, or pictures, with a pose
+    pictures: Path | None = None  # the folder of the pictures; None without them
 
 
 def _lines(found: ExportedPoses) -> Iterator[str]:

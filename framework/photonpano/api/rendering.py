@@ -52,15 +52,10 @@ _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 @dataclass(frozen=True, slots=True)
 class RenderResult:
-    """A run that was rendered again.
+    """A run that was rendered again."""
 
-    Attributes:
-        directory: the new run folder.
-        record: the content of its `run.json`.
-    """
-
-    directory: Path
-    record: RunRecord = field(repr=False)
+    directory: Path  # the new run folder
+    record: RunRecord = field(repr=False)  # the content of its `run.json`
 
     def _repr_html_(self) -> str:
         return run_html(self.directory, self.record)
@@ -181,23 +176,14 @@ def _record(opened: OpenedRun, panorama: RenderedPanorama, chosen: Sequence[Deci
 
 @dataclass(frozen=True, slots=True)
 class Video:
-    """A video, written by `video`.
+    """A video, written by `video`."""
 
-    Attributes:
-        path: the file, or the folder of pictures.
-        n_pictures: how many pictures it holds.
-        shape: (height, width) of a picture.
-        exposure: frames that a picture merges.
-        step: frames from one picture to the next.
-        speed: seconds of the capture that pass in a second of the video; None if the capture has no frame rate.
-    """
-
-    path: Path
-    n_pictures: int
-    shape: tuple[int, int]
-    exposure: int
-    step: float
-    speed: float | None
+    path: Path  # the file, or the folder of pictures
+    n_pictures: int  # how many pictures it holds
+    shape: tuple[int, int]  # (height, width) of a picture
+    exposure: int  # frames that a picture merges
+    step: float  # frames from one picture to the next
+    speed: float | None  # seconds of the capture that pass in a second of the video; None if the capture has no frame rate
 
 
 def _lines(made: Video) -> Iterator[str]:

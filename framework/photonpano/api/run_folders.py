@@ -214,21 +214,13 @@ def load_xarray(run_folder: Path | str) -> xarray.Dataset:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What `verify` found.
+    """What `verify` found."""
 
-    Attributes:
-        n_files: number of files that were compared.
-        n_bytes: their size.
-        problems: what is not as the run left it, a clause each.
-        capture: what became of the capture, if that is no problem: a clause.
-        folder: the run folder.
-    """
-
-    n_files: int
-    n_bytes: int
-    problems: tuple[str, ...]
-    capture: str
-    folder: Path = Path()
+    n_files: int  # number of files that were compared
+    n_bytes: int  # their size
+    problems: tuple[str, ...]  # what is not as the run left it, a clause each
+    capture: str  # what became of the capture, if that is no problem: a clause
+    folder: Path = Path()  # the run folder
 
 
 def _lines_of_verification(found: Verification) -> Iterator[str]:

@@ -89,17 +89,12 @@ def copied(value: T, what: str) -> T:
 
 @pytest.mark.usefixtures("photonpano_one_thread_inside")
 class Conformance:
-    """Checks of the config. Subclasses for each kind add checks of its components.
-
-    Attributes:
-        contribution: the contribution under test; set it in a subclass.
-        config: the keys under `with`. Set it on `self` in a fixture with `autouse=True` if it needs files.
-    """
+    """Checks of the config. Subclasses for each kind add checks of its components."""
 
     kind: ClassVar[str]
 
-    contribution: Contribution
-    config: Mapping[str, Any] = {}
+    contribution: Contribution  # the contribution under test; set it in a subclass
+    config: Mapping[str, Any] = {}  # the keys under `with`. Set it on `self` in a fixture with `autouse=True` if it needs files
 
     def settings(self) -> Any:
         """Return the config under test."""

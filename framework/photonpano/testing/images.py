@@ -55,22 +55,15 @@ PANORAMA_SHAPE = (37, 53)
 
 
 class MergerConformance(AnswerConformance):
-    """Checks of a merger on binary frames of 40x56 px.
-
-    Attributes:
-        tolerance_px: largest displacement of the image when frames are merged along a known motion.
-        scales: supported scales, pixels of an exposure per pixel of a frame.
-        compensates: whether it uses the motion; a naive average does not.
-        excess_variance: largest ratio of the variance to that of photon noise; more for one that drops photons.
-    """
+    """Checks of a merger on binary frames of 40x56 px."""
 
     kind: ClassVar[str] = "merger"
 
     contribution: MergerContribution
-    tolerance_px: float = 0.1
-    scales: tuple[float, ...] = (0.5, 1.0, 2.0)
-    compensates: bool = True
-    excess_variance: float = 1.25
+    tolerance_px: float = 0.1  # largest displacement of the image when frames are merged along a known motion
+    scales: tuple[float, ...] = (0.5, 1.0, 2.0)  # supported scales, pixels of an exposure per pixel of a frame
+    compensates: bool = True  # whether it uses the motion; a naive average does not
+    excess_variance: float = 1.25  # largest ratio of the variance to that of photon noise; more for one that drops photons
 
     def merged(
         self,
@@ -185,20 +178,14 @@ class MergerConformance(AnswerConformance):
 
 
 class RendererConformance(AnswerConformance):
-    """Checks of a renderer on binary frames of 40x56 px of a camera that pans and rolls, of which 200 are rendered.
-
-    Attributes:
-        tolerance_px: largest displacement of the panorama.
-        scales: supported scales, pixels of the canvas per pixel of a frame.
-        tile_tolerance: largest difference of 19 of 20 pixels of a tile from the same ones of the canvas, as a share of the mean
-            flux.
-    """
+    """Checks of a renderer on binary frames of 40x56 px of a camera that pans and rolls, of which 200 are rendered."""
 
     kind: ClassVar[str] = "renderer"
 
     contribution: RendererContribution
-    tolerance_px: float = 0.1
-    scales: tuple[float, ...] = (0.5, 1.0, 2.0)
+    tolerance_px: float = 0.1  # largest displacement of the panorama
+    scales: tuple[float, ...] = (0.5, 1.0, 2.0)  # supported scales, pixels of the canvas per pixel of a frame
+    # largest difference of 19 of 20 pixels of a tile from the same ones of the canvas, as a share of the mean flux
     tile_tolerance: float = 1e-3
 
     def rendered(self, source: Source, canvas: Canvas | None = None, threads: int = 1) -> Panorama:

@@ -45,26 +45,20 @@ MOTIONS: Mapping[str, Homography] = {
 
 
 class LocatorConformance(AnswerConformance):
-    """Checks of a locator on pairs of exposures of 1,000 frames each.
-
-    Attributes:
-        tolerance_px: largest error of a motion, as the mean over the corners of the image.
-        motions: those of "sub-pixel shift", "shift", "rotation" and "homography" that it estimates; none for an untrained
-            network.
-        free: indices, from 0, of the parameters p1..p8 that it estimates; the information is compared with their errors.
-        shape: (height, width) of the exposures. The motions suit 144x192 px; use less for a slow locator without motions.
-        needs_start: whether it only refines a start that is at most a few px off.
-        information_factor: largest ratio of the errors predicted by the information to the actual ones, or the inverse.
-    """
+    """Checks of a locator on pairs of exposures of 1,000 frames each."""
 
     kind: ClassVar[str] = "locator"
 
     contribution: LocatorContribution
-    tolerance_px: float = 0.5
+    tolerance_px: float = 0.5  # largest error of a motion, as the mean over the corners of the image
+    # those of "sub-pixel shift", "shift", "rotation" and "homography" that it estimates; none for an untrained network
     motions: tuple[str, ...] = tuple(MOTIONS)
+    # indices, from 0, of the parameters p1..p8 that it estimates; the information is compared with their errors
     free: tuple[int, ...] = tuple(range(8))
+    # (height, width) of the exposures. The motions suit 144x192 px; use less for a slow locator without motions
     shape: tuple[int, int] = SHAPE
-    needs_start: bool = False
+    needs_start: bool = False  # whether it only refines a start that is at most a few px off
+    # largest ratio of the errors predicted by the information to the actual ones, or the inverse
     information_factor: float = 3.0
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:

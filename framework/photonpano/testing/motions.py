@@ -93,19 +93,15 @@ def shaken_knots() -> FloatArray:
 
 
 class InterpolatorConformance(AnswerConformance):
-    """Checks of an interpolator.
-
-    Attributes:
-        tolerance_px: largest distance of the trajectory from its knots, at the corners of a frame of 254x496 px; more for one
-            that smooths. The knots have a tremor of 1 px.
-        keeps_velocity: whether a constant velocity is kept between knots.
-    """
+    """Checks of an interpolator."""
 
     kind: ClassVar[str] = "interpolator"
 
     contribution: InterpolatorContribution
+    # largest distance of the trajectory from its knots, at the corners of a frame of 254x496 px; more for one that smooths. The
+    # knots have a tremor of 1 px
     tolerance_px: float = 1e-3
-    keeps_velocity: bool = True
+    keeps_velocity: bool = True  # whether a constant velocity is kept between knots
 
     def fitted(self, n_knots: int = len(INSTANTS), information: FloatArray | None = None) -> Trajectory:
         """Fit the first knots, which are read-only: the framework uses them again."""

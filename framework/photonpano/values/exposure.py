@@ -41,37 +41,26 @@ class VirtualExposure:
 
     Convention:
         The grid is that of a frame, rescaled: pixel centres p of the frame lie at `(p + 0.5) * scale - 0.5`.
-
-    Attributes:
-        flux: (H, W) float32, photons per pixel per frame, NaN where nothing was seen.
-        weight: (H, W) float32, number of frames in which each pixel was seen; 0 exactly where flux is NaN.
-        group: the frames and the instant.
-        scale: pixels of the exposure per pixel of a frame.
-        response: the camera's response, from which the noise of the flux follows.
     """
 
-    flux: FluxImage
-    weight: FluxImage
-    group: Group
-    scale: float
-    response: Response
+    flux: FluxImage  # (H, W) float32, photons per pixel per frame, NaN where nothing was seen
+    weight: FluxImage  # (H, W) float32, number of frames in which each pixel was seen; 0 exactly where flux is NaN
+    group: Group  # the frames and the instant
+    scale: float  # pixels of the exposure per pixel of a frame
+    response: Response  # the camera's response, from which the noise of the flux follows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panorama:
-    """Flux and weight on a canvas.
+    """Flux and weight on a canvas."""
 
-    Attributes:
-        flux: (H, W) float32, photons per pixel per frame, NaN where nothing was seen; (H, W, 3) of red, green and blue pixels
-            for a capture in colour.
-        weight: number of frames in which each pixel was seen (the coverage), float32 of the same shape; 0 in a colour that was
-            filled from the others.
-        canvas: (3, 3) float64, pixels of the reference plane to pixels of the panorama.
-    """
-
+    # (H, W) float32, photons per pixel per frame, NaN where nothing was seen; (H, W, 3) of red, green and blue pixels for a
+    # capture in colour
     flux: FluxImage
+    # number of frames in which each pixel was seen (the coverage), float32 of the same shape; 0 in a colour that was filled
+    # from the others
     weight: FluxImage
-    canvas: Homography
+    canvas: Homography  # (3, 3) float64, pixels of the reference plane to pixels of the panorama
 
     def _repr_html_(self) -> str:
         """Show the flux in a notebook."""
@@ -89,16 +78,10 @@ class Panorama:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PanoramaRows:
-    """Some rows of a panorama.
+    """Some rows of a panorama."""
 
-    Attributes:
-        flux: (h, W), or (h, W, 3) of red, green and blue; float32, photons per pixel per frame, NaN where nothing was seen.
-        weight: the same shape, float32, number of frames in which each pixel was seen; 0 where nothing was seen.
-        std: the same shape, float32, standard deviation of the flux; NaN where nothing was seen.
-        saturated: the same shape, bool, pixels that were lit in every frame, whose flux is a lower bound.
-    """
-
+    # (h, W), or (h, W, 3) of red, green and blue; float32, photons per pixel per frame, NaN where nothing was seen
     flux: FluxImage
-    weight: FluxImage
-    std: FluxImage
-    saturated: BoolArray
+    weight: FluxImage  # the same shape, float32, number of frames in which each pixel was seen; 0 where nothing was seen
+    std: FluxImage  # the same shape, float32, standard deviation of the flux; NaN where nothing was seen
+    saturated: BoolArray  # the same shape, bool, pixels that were lit in every frame, whose flux is a lower bound

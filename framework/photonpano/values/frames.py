@@ -66,15 +66,11 @@ def true_spans(flags: BoolArray) -> list[FrameSpan]:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Frames that are merged into one virtual exposure, seen from one instant.
+    """Frames that are merged into one virtual exposure, seen from one instant."""
 
-    Attributes:
-        span: the frames that are merged.
-        reference: the instant that is located, in frames; frame i is the instant i. It may lie between two frames, as the
-            centre of an even number of frames does, but not outside the span.
-    """
-
-    span: FrameSpan
+    span: FrameSpan  # the frames that are merged
+    # the instant that is located, in frames; frame i is the instant i. It may lie between two frames, as the centre of an even
+    # number of frames does, but not outside the span
     reference: float
 
     def __post_init__(self) -> None:
@@ -94,25 +90,17 @@ Bayer: TypeAlias = Literal["rggb", "bggr", "grbg", "gbrg"]
 
 @dataclass(frozen=True, slots=True)
 class StreamInfo:
-    """Properties of a capture that are known before any frame is read.
+    """Properties of a capture that are known before any frame is read."""
 
-    Attributes:
-        n_frames: number of frames.
-        height: rows of a frame.
-        width: columns of a frame.
-        frame_rate_hz: frames per second; None if the capture does not give it.
-        kind: "binary" if a pixel is 0 or 1, "intensity" if it is a grey value or a sum of binary frames.
-        bit_depth: bits of a pixel.
-        bayer: colours of the filters before the first two pixels of the first two rows, if these repeat, such as "rggb"; None
-            for a grey sensor, another filter array, or if the capture does not give it.
-    """
-
-    n_frames: int
-    height: int
-    width: int
-    frame_rate_hz: float | None
+    n_frames: int  # number of frames
+    height: int  # rows of a frame
+    width: int  # columns of a frame
+    frame_rate_hz: float | None  # frames per second; None if the capture does not give it
+    # "binary" if a pixel is 0 or 1, "intensity" if it is a grey value or a sum of binary frames
     kind: Literal["binary", "intensity"] = "binary"
-    bit_depth: int = 1
+    bit_depth: int = 1  # bits of a pixel
+    # colours of the filters before the first two pixels of the first two rows, if these repeat, such as "rggb"; None for a grey
+    # sensor, another filter array, or if the capture does not give it
     bayer: Bayer | None = None
 
     def __str__(self) -> str:
@@ -150,21 +138,14 @@ class StreamInfo:
 
 @dataclass(frozen=True, slots=True)
 class CaptureSummary:
-    """Brightness of a capture and speed of its image, measured before any motion is estimated.
+    """Brightness of a capture and speed of its image, measured before any motion is estimated."""
 
-    Attributes:
-        flux: mean of the sampled frames, photons per pixel per frame.
-        speed_px: upper quantile of the speed of the image, in px per frame; None if it could not be measured.
-        how: a clause that says how the speed was measured, for the reasons of decisions.
-        period_frames: period of light that flickers, in frames; None in steady light, or before the light is known.
-        shortened: groups are to be chosen this many times shorter, since exposures of longer ones could not be located.
-    """
-
-    flux: float
-    speed_px: float | None
-    how: str
+    flux: float  # mean of the sampled frames, photons per pixel per frame
+    speed_px: float | None  # upper quantile of the speed of the image, in px per frame; None if it could not be measured
+    how: str  # a clause that says how the speed was measured, for the reasons of decisions
+    # period of light that flickers, in frames; None in steady light, or before the light is known
     period_frames: float | None = None
-    shortened: int = 1
+    shortened: int = 1  # groups are to be chosen this many times shorter, since exposures of longer ones could not be located
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,23 +220,16 @@ class Light:
 
     The gain of the frame t at a place x of the scene is `gain[t] (1 + sum_k waves[k, t] maps[k](x))`. It is the light there,
     relative to the mean over time.
-
-    Attributes:
-        gain: (T,) float64, not negative: of all of the scene.
-        waves: (K, T) float64, cosine and sine of the lamps, between -1 and 1; (0, T) if all of the scene has one gain.
-        maps: (K, h, w) float32, their amplitude at places of the scene.
-        to_map: (3, 3), pixels of the reference plane to pixels of `maps`; on a sphere (a, b, 1) to pixels, as that of a canvas.
-        frequency: flickers in a frame period; 0 for light that does not flicker.
-        std: (T,) standard deviation of `gain` by photon noise; infinite for frames that are left out, whose gain is 0.
-        camera_matrix: (3, 3) of the reference camera around which `maps` lie on a sphere; None if they lie on its plane.
     """
 
-    gain: FloatArray
-    waves: FloatArray
-    maps: FluxImage
+    gain: FloatArray  # (T,) float64, not negative: of all of the scene
+    waves: FloatArray  # (K, T) float64, cosine and sine of the lamps, between -1 and 1; (0, T) if all of the scene has one gain
+    maps: FluxImage  # (K, h, w) float32, their amplitude at places of the scene
+    # (3, 3), pixels of the reference plane to pixels of `maps`; on a sphere (a, b, 1) to pixels, as that of a canvas
     to_map: Homography
-    frequency: float
-    std: FloatArray
+    frequency: float  # flickers in a frame period; 0 for light that does not flicker
+    std: FloatArray  # (T,) standard deviation of `gain` by photon noise; infinite for frames that are left out, whose gain is 0
+    # (3, 3) of the reference camera around which `maps` lie on a sphere; None if they lie on its plane
     camera_matrix: FloatArray | None = None
 
     @classmethod

@@ -18,16 +18,12 @@ _SINGULAR, _TINY = 1e-9, 1e-200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Where the patches of one image lie in another, beyond the homography between the images: a lens shows itself there.
+    """Where the patches of one image lie in another, beyond the homography between the images: a lens shows itself there."""
 
-    Attributes:
-        shifts: (P, 2) from where the homography maps the middle of a patch to where it lies, x and y in pixels of the fixed
-            image. The middles are those of `photonpano.geometry.patch_centres`.
-        information: (P, 2, 2) their inverse covariances, 0 for a patch that shows nothing.
-    """
-
+    # (P, 2) from where the homography maps the middle of a patch to where it lies, x and y in pixels of the fixed image. The
+    # middles are those of `photonpano.geometry.patch_centres`
     shifts: FloatArray
-    information: FloatArray
+    information: FloatArray  # (P, 2, 2) their inverse covariances, 0 for a patch that shows nothing
 
     def rescaled(self, scale: float) -> Patches:
         """Return them in pixels of images that are rescaled."""
@@ -40,34 +36,25 @@ class Located:
 
     Convention:
         The map takes pixels of the moving image to pixels of the fixed one; points are (x, y), integers are pixel centres.
-
-    Attributes:
-        homography: (3, 3) float64, h33 = 1.
-        information: (8, 8) inverse covariance of the eight parameters p1..p8 of `homography` in the order of the paper
-            (section 4, "Interpolate"), None if the locator has none.
-        residual_px: root mean square of the residuals after the fit, in pixels of the fixed image; None if unknown.
-        evidence: counts of the locator by name (keypoints, matches, inliers, ...), for records and messages.
-        patches: where patches of the moving image lie; None if the locator does not look at them.
     """
 
-    homography: Homography
+    homography: Homography  # (3, 3) float64, h33 = 1
+    # (8, 8) inverse covariance of the eight parameters p1..p8 of `homography` in the order of the paper (section 4,
+    # "Interpolate"), None if the locator has none
     information: FloatArray | None = None
+    # root mean square of the residuals after the fit, in pixels of the fixed image; None if unknown
     residual_px: float | None = None
+    # counts of the locator by name (keypoints, matches, inliers, ...), for records and messages
     evidence: Mapping[str, float] = field(default_factory=dict)
-    patches: Patches | None = None
+    patches: Patches | None = None  # where patches of the moving image lie; None if the locator does not look at them
 
 
 @dataclass(frozen=True, slots=True)
 class NotLocated:
-    """A pairwise motion that was not found.
+    """A pairwise motion that was not found."""
 
-    Attributes:
-        reason: a clause that completes "not located: ...", with the numbers that decided.
-        evidence: counts of the locator by name.
-    """
-
-    reason: str
-    evidence: Mapping[str, float] = field(default_factory=dict)
+    reason: str  # a clause that completes "not located: ...", with the numbers that decided
+    evidence: Mapping[str, float] = field(default_factory=dict)  # counts of the locator by name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,17 +84,14 @@ class SpanResiduals:
         A step moves points of a frame: what the frames of a span show at the point q, the trajectory predicts at `step(q)`. So
         `trajectory.at(frame) @ step` explains the photons better; `photonpano.geometry.step_motions` makes the (3, 3) matrices.
         Points are (x, y), integers are pixel centres.
-
-    Attributes:
-        spans: S spans of frames, in order; together they contain the located frames.
-        steps: (S, 4) float64, one weighted least-squares step of the motion of each span: shift along x and along y, in px of a
-            frame; roll from x towards y, in radians; zoom, as a fraction. Roll and zoom are about the centre of the frame.
-        information: (S, 4, 4) float64, inverse covariance of the steps from photon noise alone; singular where the photons of
-            a span do not determine a step, which is then 0.
     """
 
-    spans: tuple[FrameSpan, ...]
+    spans: tuple[FrameSpan, ...]  # S spans of frames, in order; together they contain the located frames
+    # (S, 4) float64, one weighted least-squares step of the motion of each span: shift along x and along y, in px of a frame;
+    # roll from x towards y, in radians; zoom, as a fraction. Roll and zoom are about the centre of the frame
     steps: FloatArray
+    # (S, 4, 4) float64, inverse covariance of the steps from photon noise alone; singular where the photons of a span do not
+    # determine a step, which is then 0
     information: FloatArray
 
     @property
@@ -128,13 +112,8 @@ class Refined:
 
     Convention:
         Homographies map pixels of a frame to pixels of the reference plane. That of the reference frame stays the identity.
-
-    Attributes:
-        homographies: (T, 3, 3) float64, one for each frame of the capture, h33 = 1.
-        std_px: (T,) expected corner error of each frame, in px of a frame; infinite where it was infinite before.
-        summary: what was corrected, in one line, such as "tremor of 0.9 px at 223 and 590 Hz".
     """
 
-    homographies: FloatArray
-    std_px: FloatArray
-    summary: str
+    homographies: FloatArray  # (T, 3, 3) float64, one for each frame of the capture, h33 = 1
+    std_px: FloatArray  # (T,) expected corner error of each frame, in px of a frame; infinite where it was infinite before
+    summary: str  # what was corrected, in one line, such as "tremor of 0.9 px at 223 and 590 Hz"

@@ -11,21 +11,13 @@ Facts = TypeVar("Facts")
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why a run is doubtful, or what is worth a note.
+    """Why a run is doubtful, or what is worth a note."""
 
-    Attributes:
-        what: what was found, in a clause.
-        figure: the number that decided.
-        threshold: the largest number that is trusted.
-        where: the frames, pixels or places, in a clause; empty if it is everywhere.
-        what_to_do: advice, in a clause.
-    """
-
-    what: str
-    figure: float
-    threshold: float
-    where: str
-    what_to_do: str
+    what: str  # what was found, in a clause
+    figure: float  # the number that decided
+    threshold: float  # the largest number that is trusted
+    where: str  # the frames, pixels or places, in a clause; empty if it is everywhere
+    what_to_do: str  # advice, in a clause
 
     @property
     def finding(self) -> str:
@@ -40,24 +32,17 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether the results of a run explain the photons.
+    """Whether the results of a run explain the photons."""
 
-    Attributes:
-        status: "trusted" or "doubtful".
-        reasons: why it is doubtful, the most telling first.
-        residual_ratio: in units of what noise explains, for a panorama the scatter of the shifts of short spans, and for other
-            kinds of runs residuals of their own; None if it is unknown.
-        untested: which tests could not be made, and why: clauses that begin with "whether".
-        notes: what else was found; it is too small to make the motion or the panorama wrong.
-        reduced_chi2: of the photons against the panorama, on average over the spans, without what a span adds to the panorama
-            itself; 1 if only photon noise is left. None without a panorama.
-    """
-
-    status: Literal["trusted", "doubtful"]
-    reasons: tuple[Reason, ...]
+    status: Literal["trusted", "doubtful"]  # "trusted" or "doubtful"
+    reasons: tuple[Reason, ...]  # why it is doubtful, the most telling first
+    # in units of what noise explains, for a panorama the scatter of the shifts of short spans, and for other kinds of runs
+    # residuals of their own; None if it is unknown
     residual_ratio: float | None
-    untested: tuple[str, ...] = ()
-    notes: tuple[Reason, ...] = ()
+    untested: tuple[str, ...] = ()  # which tests could not be made, and why: clauses that begin with "whether"
+    notes: tuple[Reason, ...] = ()  # what else was found; it is too small to make the motion or the panorama wrong
+    # of the photons against the panorama, on average over the spans, without what a span adds to the panorama itself; 1 if only
+    # photon noise is left. None without a panorama
     reduced_chi2: float | None = None
 
     @classmethod

@@ -60,28 +60,18 @@ class Closing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrived:
-    """What is there of a capture that is still being written.
+    """What is there of a capture that is still being written."""
 
-    Attributes:
-        source: the whole frames that are there; None as long as there is none.
-        promised: frames that the capture will have, if it says so.
-    """
-
-    source: Source | None
-    promised: int | None = None
+    source: Source | None  # the whole frames that are there; None as long as there is none
+    promised: int | None = None  # frames that the capture will have, if it says so
 
 
 @dataclass(frozen=True, slots=True)
 class Piped:
-    """A capture that arrives on standard input. Written to a file as it comes, it is one of the same source.
+    """A capture that arrives on standard input. Written to a file as it comes, it is one of the same source."""
 
-    Attributes:
-        header_bytes: what comes before the first frame.
-        frame_bytes: bytes of a frame.
-    """
-
-    header_bytes: int
-    frame_bytes: int
+    header_bytes: int  # what comes before the first frame
+    frame_bytes: int  # bytes of a frame
 
 
 @runtime_checkable
