@@ -51,6 +51,21 @@ def test_frames_of_few_rows_are_located(tmp_path: Path, outcome_of: Callable[...
     assert within_3 >= WITHIN_3
 
 
+def test_motion_that_returns_within_groups_is_doubted(tmp_path: Path, outcome_of: Callable[..., Any]) -> None:
+    """In groups of whole periods, a dither averages away, and in the dark no span shows where it lies."""
+    frames = np.arange(4000)
+    true = np.tile(np.eye(3), (len(frames), 1, 1))
+    true[:, 0, 2], true[:, 1, 2] = 60 + 4 * np.sin(frames * 2 * np.pi / 200), 60 + 3 * np.cos(frames * 2 * np.pi / 200)
+    scene = textured((220, 260), 0.01, seed=3).astype(np.float32)
+    said = {}
+    for size in (400, 40):
+        resample = {"use": "midpoint", "with": {"group_size": size}}
+        outcome = outcome_of(spec_of(true, scene, SHAPE, tmp_path, resample=resample, levels=2, refine=[]))
+        said[size] = [each["what"] for each in outcome.record["verdict"]["reasons"]]
+    reason = "neighbouring frames have in common what the motion and the panorama do not show"
+    assert (reason in said[400], reason in said[40]) == (True, False), said
+
+
 def test_pan_past_a_wall_with_one_line_is_not_trusted(tmp_path: Path, outcome_of: Callable[..., Any]) -> None:
     """For a while, frames see nothing but a line along which they move: pairs of them err, and claim to know."""
     true = np.tile(np.eye(3), (700, 1, 1))

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,12 +47,22 @@ _BATCH = 64  # spans that a thread measures at a time
 _SINGLE_FRAMES, _SINGLE_SHARE, _WINDOW_FRAMES = 512, 1 / 8, 32
 _PIXEL_STRIDE = 4  # one span in 4 is added to the sums of single pixels, which no other sum needs
 FEWEST_FRAMES = 3  # frames of the shortest span within which single frames show shaking
+# Where photon noise makes spans long: shorter ones, whose neighbours are compared, most pairs of each, and pixels of a square.
+_BRIEF_FRAMES, _BRIEF_PAIRS, _SQUARE_PX = (4, 16), 192, 2
 _DARK = 1e-6  # least weight of a frame in the mean motion of a span
 _PROBES = 8  # instants at which the noise of a shift is predicted
 # Information that keeps the equations of a span regular: a shift is below 10 px, a roll or a zoom below 0.1, and the light
 # changes by less than a factor of 10.
 _PRIOR = np.array([1e-2, 1e-2, 1e2, 1e2, 1e-2])
 _SHRUNK = 0.5  # share of what is known of the shift of a single frame that comes from it, from which on the photons say nothing
+
+
+class Lasting(NamedTuple):
+    """What neighbouring spans have in common beyond the prediction: an image that is sharper, or elsewhere, for a while."""
+
+    share: float  # of the power of the predicted contrast
+    sigmas: float  # in standard deviations by photon noise
+    frames: int  # of each span
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -78,6 +89,8 @@ class Residuals:
     frame_shape: tuple[int, int]  # (height, width) of a frame
     light: FloatArray  # (S,) mean gain of the light of each span, 1 in steady light
     shaking: Shaking  # motion that is faster than a span
+    # of the brief spans that have most in common, where photon noise hides the shift of longer ones; None elsewhere
+    lasting: Lasting | None = None
 
     def steps(self) -> SpanResiduals:
         """Solve for the motion of each span; the gain of the light is solved for, too, and left out."""
@@ -157,7 +170,40 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
             frame_shape=predictions.first.frame_shape,
             light=light,
             shaking=shaking,
+            lasting=_lasting(spans, predictions, context) if size >= 2 * max(_BRIEF_FRAMES) else None,
         )
+
+
+def _lasting(spans: Sequence[FrameSpan], predictions: Predictions, context: Context) -> Lasting:
+    """Compare neighbouring brief spans all over the capture: photon noise has nothing in common in them."""
+    found = []
+    for n_frames in _BRIEF_FRAMES:
+        long = [span for span in spans if len(span) >= 2 * n_frames]
+        taken = np.unique(np.linspace(0, len(long) - 1, min(len(long), _BRIEF_PAIRS)).astype(int)).tolist()
+        pairs = [FrameSpan(long[index].start, long[index].start + 2 * n_frames) for index in taken]
+        common, variance, contrast = np.sum(list(context.in_order(partial(_in_common, predictions), pairs)), axis=0)
+        found.append(Lasting(common / max(contrast, 1e-9), common / max(np.sqrt(variance), 1e-9), n_frames))
+    return max(found, key=lambda each: each.sigmas)
+
+
+def _in_common(predictions: Predictions, span: FrameSpan) -> FloatArray:
+    """Return the product of what both halves of a span have beyond the prediction, its variance, and that of the contrast."""
+    sums, shape = np.zeros(3), predictions.first.frame_shape
+    size, images = (shape[1] // _SQUARE_PX, shape[0] // _SQUARE_PX), np.empty((2, *shape), np.float32)
+    for part in predictions.parts:
+        colour, halves = _Colour.of(*part), []
+        for half in (FrameSpan(span.start, int(span.centre + 0.5)), FrameSpan(int(span.centre + 0.5), span.stop)):
+            colour.prediction.view(colour.prediction.trajectory.at([half.centre])[0], images, half)
+            counts = colour.counted(colour.capture.chunk(half), half)
+            known = (images[1] > 0) & np.isfinite(counts)
+            counts, mean = np.where(known, counts, np.float32(0)), np.where(known, images[0], np.float32(0))
+            mean *= counts.sum(dtype=np.float64) / max(mean.sum(dtype=np.float64), 1e-9)
+            halves.append([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (counts - mean, mean)])
+        (one, expected), (other, expected_there) = halves
+        lit = expected[expected > 0]
+        noise = (expected * expected_there).sum() / _SQUARE_PX**4
+        sums += [(one * other).sum(), noise, ((lit - lit.mean()) ** 2).sum() if len(lit) else 0]
+    return sums
 
 
 def _solved(normal: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -29,6 +29,7 @@ _WITHOUT_LENS = "undistort the frames before, or use their middle only (correcti
 MUCH = 0.25  # share of the panorama that changes, beyond which what is left out may be the scene
 MAX_CONTRAST = 0.05  # up to this share of the light, what the panorama does not explain does not matter
 _UNCERTAIN_PX = 1.0
+_SURE_SIGMAS = 6.0  # from which on what neighbouring frames have in common is no noise
 _ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
 _AMBIGUOUS = 0.05  # share of the pairs of a level that fit at several places; one or two may be by their noise
 _STILL_PX = 1.0  # an image that moves by less over the capture stands still
@@ -269,6 +270,19 @@ def _halves(run: TestedRun) -> Found | None:
         f"least is {cuts.coherence[least]:.3g}, before frame {cuts.firsts[least]:.0f}"
     )
     return Found(run.explained.halves.disagreement, where, what_to_do=run.freer_model)
+
+
+@AGREEMENT.doubtful_above(
+    0.1,
+    "neighbouring frames have in common what the motion and the panorama do not show",
+    "use smaller groups (resample.with.group_size), in which a motion that returns shows; or mask what stands in the frame",
+)
+def _neighbours(run: TestedRun) -> Found | None:
+    lasting = run.explained.residuals.lasting
+    if lasting is None or lasting.sigmas < _SURE_SIGMAS:
+        return None
+    where = f"of the contrast, in spans of {lasting.frames} frames, {lasting.sigmas:.0f} standard deviations"
+    return Found(lasting.share, where)
 
 
 @AGREEMENT.doubtful_above(
