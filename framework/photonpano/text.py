@@ -57,7 +57,7 @@ def counted(number: int, singular: str, plural: str | None = None) -> str:
 
 def duration(seconds: float) -> str:
     """Write a time with the unit that fits, to three digits."""
-    for limit, factor, unit in ((1e-3, 1e6, "µs"), (1, 1e3, "ms")):  # noqa: RUF001
+    for limit, factor, unit in ((1e-3, 1e6, "µs"), (1, 1e3, "ms")):
         if seconds < limit:
             return f"{three_digits(seconds * factor)} {unit}"
     if seconds < 59.95:

@@ -124,8 +124,8 @@ def _run(  # noqa: PLR0913
 def _found(record: RunRecord) -> str:
     """Describe what a run has chosen and left out by itself: model, groups, lens, light, and what hides the background."""
     last, hidden = record["levels"][-1], findings_of(record).hidden_share
-    written = {"translation": "shifts", "homography": "homographies", "rotation": "rotations"}
-    model = "rotations" if last["camera"] else written.get(record["spec"]["motion"]["model"], "homographies")
+    shifts = record["spec"]["motion"]["model"] == "translation"
+    model = "rotations" if last["camera"] else "shifts" if shifts else "homographies"
     parts = [f"{model}, from groups of {counted(last['group_frames'], 'frame')}"]
     if last["camera"] and any(last["camera"]["distortion"]):
         parts.append(f"a lens with k1 {last['camera']['distortion'][0]:.3f}")

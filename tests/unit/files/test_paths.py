@@ -23,8 +23,8 @@ from photonpano.filtering import exceeding_noise
 @pytest.mark.parametrize(
     ("seconds", "text"),
     [
-        (0, "0 µs"),  # noqa: RUF001
-        (0.000_25, "250 µs"),  # noqa: RUF001
+        (0, "0 µs"),
+        (0.000_25, "250 µs"),
         (0.1033, "103 ms"),
         (0.0421, "42.1 ms"),
         (8.25, "8.25 s"),

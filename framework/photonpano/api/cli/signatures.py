@@ -21,8 +21,6 @@ from photonpano.api.cli.verbosity import verbosity_of, with_verbosity
 from photonpano.api.command import CHANGES, COMMANDS, SPEC, Command, WrongArgumentError, component_names
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence  # noqa: F811
-
     from photonpano.errors import Problem
     from photonpano.plugins.registry import Catalog
     from photonpano.specs import Plan

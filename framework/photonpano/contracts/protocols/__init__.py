@@ -14,8 +14,8 @@ from .motion import camera_of_motion as camera_of_motion
 from .panorama import Exporter as Exporter
 from .panorama import FinishedPanorama as FinishedPanorama
 from .panorama import Renderer as Renderer
-from .runs import RunKind as RunKind
-from .runs import Score as Score
+from .panorama import RunKind as RunKind
+from .panorama import Score as Score
 from .sources import Arrived as Arrived
 from .sources import Closing as Closing
 from .sources import ColouredSource as ColouredSource

@@ -1,10 +1,10 @@
-"""The interfaces of the components that render the panorama and write it."""
+"""The interfaces of what a run ends in: components that render the panorama and write it, and other kinds of runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from photonpano.contracts.protocols.motion import Trajectory
 from photonpano.contracts.protocols.sources import Source
@@ -90,3 +90,36 @@ class Exporter(Protocol):
             panorama: what to write.
             path: the file or folder; it does not exist yet.
         """
+
+
+class Score(Protocol):
+    """The score of another kind of run against the truth of its capture. Experimental."""
+
+    def rows(self) -> Sequence[tuple[str, str]]:
+        """Return figures with their names, for people."""
+
+    def data(self) -> Mapping[str, Any]:
+        """Return figures with their names, for programs."""
+
+    def figures(self) -> Mapping[str, Any]:
+        """Return what the summary of a batch shows, by the attributes of `photonpano.BatchRow`."""
+
+
+class RunKind(Protocol):
+    """Does runs of a kind that finds something else than a panorama, and describes them. Experimental."""
+
+    def run(self, run: Any) -> None:
+        """Find it, write its files into `run.folder.staging`, and end the run with `run.end`.
+
+        Args:
+            run: the `photonpano.pipeline.run.BegunRun`; `photonpano.pipeline.components.build_finder` builds the component.
+        """
+
+    def rows(self, record: Mapping[str, Any]) -> Sequence[tuple[str, str]]:
+        """Return what the command line and notebooks show of a finished run, with names, from its `run.json`."""
+
+    def figures(self, record: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return what the summary of a batch shows of a finished run, by the attributes of `photonpano.BatchRow`."""
+
+    def evaluate(self, run_folder: Path, truth: Path) -> Score:
+        """Score a run folder against the truth of its capture; `InputError` if they are not of the same capture."""
