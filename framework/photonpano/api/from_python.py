@@ -47,7 +47,7 @@ def panorama(
         PhotonpanoError: what else `run` raises.
     """
     temporary = Path(tempfile.mkdtemp(prefix="photonpano-")) if output is None else None
-    directory = Path(output or f"{temporary}/run")
+    directory, written = Path(output or f"{temporary}/run"), temporary
     try:
         known = {} if frame_rate_hz is None else {"frame_rate_hz": frame_rate_hz}
         if isinstance(frames, str | Path):
@@ -56,14 +56,15 @@ def panorama(
             path, array = directory.with_name(f"{directory.name}.npy"), np.asarray(frames)
             _require_frames(array)
             require_new(path, overwrite)
-            with atomic_path(path) as written:
-                _pack(array, written)
+            with atomic_path(path) as partial:
+                _pack(array, partial)
+            written = temporary or path
             source = {"use": "packed-npy", "with": {"path": str(path.absolute()), "width": array.shape[2], **known}}
         plan = parse_spec({"version": 1, "source": source, **keys}, output=directory)
         result = run(plan, progress, overwrite=overwrite)
-    except BaseException:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
+    except BaseException:  # a second try finds its place free
+        if written is not None:
+            shutil.rmtree(written, ignore_errors=True) if written.is_dir() else written.unlink()
         raise
     if temporary is not None:
         weakref.finalize(result, shutil.rmtree, temporary, ignore_errors=True)

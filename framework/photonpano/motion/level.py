@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from operator import attrgetter
 from typing import NewType, cast
 
 import numpy as np
@@ -60,7 +62,8 @@ class Timeline:
 
     taken: FloatArray  # (T,) the time of each frame, in frame periods of the camera: it stands still where a frame is repeated
     cuts: tuple[Cut, ...] = ()  # where the image jumps, in order
-    unlit: tuple[FrameSpan, ...] = ()  # frames without light, in order: they count in no sum
+    dark: tuple[FrameSpan, ...] = ()  # frames without light for long, in order: no group holds them, and none is located
+    unlit: tuple[FrameSpan, ...] = ()  # frames without light for so short a time that the motion goes on: they count in no sum
     shots: tuple[FrameSpan, ...] = ()  # parts that no motion ties together, in order; groups are of the longest
 
     @classmethod
@@ -70,13 +73,13 @@ class Timeline:
 
     @classmethod
     def with_repeats(cls, repeated: BoolArray, unlit: tuple[FrameSpan, ...] = ()) -> Timeline:
-        """Return that of a capture without missing frames; (T,) True for frames that are copies of the frame before."""
-        return cls(np.cumsum(~repeated).astype(np.float64) - 1.0, unlit=unlit)
+        """Return that of a capture without missing frames; (T,) True for frames that are copies of the frame before.
 
-    @property
-    def dark(self) -> tuple[FrameSpan, ...]:
-        """Frames without light for so long that the camera may move as it likes: no group holds them, none is located."""
-        return tuple(span for span in self.unlit if len(span) >= SHORTEST_DARK)
+        `unlit` are all spans of frames without light, in order.
+        """
+        dark = tuple(span for span in unlit if len(span) >= SHORTEST_DARK)
+        brief = tuple(span for span in unlit if len(span) < SHORTEST_DARK)
+        return cls(np.cumsum(~repeated).astype(np.float64) - 1.0, dark=dark, unlit=brief)
 
     @property
     def copies(self) -> BoolArray | None:
@@ -89,7 +92,7 @@ class Timeline:
         """(T,) whether each frame shows the scene of the panorama, neither darkness nor another shot."""
         frames = np.arange(len(self.taken))
         shown = (self.shot.start <= frames) & (frames < self.shot.stop)
-        for span in self.unlit:
+        for span in (*self.dark, *self.unlit):
             shown[span.start : span.stop] = False
         return shown
 
@@ -192,7 +195,8 @@ class Timeline:
     def _is_left_out(self, span: FrameSpan) -> bool:
         if span.start < self.shot.start or span.stop > self.shot.stop:
             return True
-        dark = [*self.unlit, *(cut.dark for cut in self.cuts if cut.dark is not None)]
+        before = self.unlit[max(bisect_right(self.unlit, span.start, key=attrgetter("start")) - 1, 0) :][:1]
+        dark = [*self.dark, *before, *(cut.dark for cut in self.cuts if cut.dark is not None)]
         return any(each.start <= span.start and span.stop <= each.stop for each in dark)
 
 

@@ -199,6 +199,8 @@ def _has_shape(capture: Capture, spans: Sequence[FrameSpan]) -> bool:
     for span in spans:
         mean = binned_mean(capture, span)
         valid = np.isfinite(mean)
+        if not valid.any():
+            continue
         # Hot pixels, and a slow change of the dark counts over the sensor, are no scene.
         counts = np.minimum(np.nan_to_num(mean), np.quantile(mean[valid], _COLD, method="lower")).astype(np.float64)
         around = [ndimage.uniform_filter(each, _SHAPE_PX) for each in (counts * valid, valid.astype(np.float64))]

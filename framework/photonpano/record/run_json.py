@@ -451,10 +451,10 @@ def timeline_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
             f"{listed(map(str, timeline.dark))} show no light, as behind a closed shutter: they are not located, and left out "
             "of the panorama. If the shutter was meant to be open, check it, and the gate of the sensor"
         )
-    if timeline is not None and (brief := [span for span in timeline.unlit if span not in timeline.dark]):
-        n_unlit, n_frames = sum(map(len, brief)), len(timeline.taken)
+    if timeline is not None and timeline.unlit:
+        n_unlit, n_frames, first = sum(map(len, timeline.unlit)), len(timeline.taken), timeline.unlit[0].start
         warnings.append(
-            f"{n_unlit:,} of {n_frames:,} frames, the first at {brief[0].start:,}, show no light, as where a lamp flashes: "
+            f"{n_unlit:,} of {n_frames:,} frames, the first at {first:,}, show no light, as where a lamp flashes: "
             "they are left out, and the flux is that of the other frames"
         )
     if timeline is not None and timeline.copies is not None and timeline.copies.mean() > _MANY_COPIES:

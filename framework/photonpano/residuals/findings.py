@@ -59,7 +59,8 @@ class Findings:
     def along(self, timeline: Timeline) -> Findings:
         """Return these findings with those of a timeline."""
         cuts = tuple(Jump(each.frame, each.size_px, each.sigmas, each.dark) for each in timeline.cuts)
-        return replace(self, repeated=timeline.n_repeated, dark=timeline.unlit, shots=timeline.shots, cuts=cuts)
+        dark = tuple(sorted(timeline.dark + timeline.unlit, key=lambda span: span.start))
+        return replace(self, repeated=timeline.n_repeated, dark=dark, shots=timeline.shots, cuts=cuts)
 
     @property
     def started(self) -> list[Decision]:

@@ -89,8 +89,6 @@ class Residuals:
     frame_shape: tuple[int, int]  # (height, width) of a frame
     light: FloatArray  # (S,) mean gain of the light of each span, 1 in steady light
     shaking: Shaking  # motion that is faster than a span
-    # of the brief spans that have most in common, where photon noise hides the shift of longer ones; None elsewhere
-    lasting: Lasting | None = None
 
     def steps(self) -> SpanResiduals:
         """Solve for the motion of each span; the gain of the light is solved for, too, and left out."""
@@ -170,13 +168,17 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
             frame_shape=predictions.first.frame_shape,
             light=light,
             shaking=shaking,
-            lasting=_lasting(spans, predictions, context) if size >= 2 * max(_BRIEF_FRAMES) else None,
         )
 
 
-def _lasting(spans: Sequence[FrameSpan], predictions: Predictions, context: Context) -> Lasting:
+def noise_hides_shifts(residuals: Residuals) -> bool:
+    """Return whether photon noise makes spans so long that a motion within them does not show."""
+    return float(np.median([len(span) for span in residuals.spans])) >= 2 * max(_BRIEF_FRAMES)
+
+
+def lasting_of(residuals: Residuals, predictions: Predictions, context: Context) -> Lasting:
     """Compare neighbouring brief spans all over the capture: photon noise has nothing in common in them."""
-    found = []
+    spans, found = residuals.spans, list[Lasting]()
     for n_frames in _BRIEF_FRAMES:
         long = [span for span in spans if len(span) >= 2 * n_frames]
         taken = np.unique(np.linspace(0, len(long) - 1, min(len(long), _BRIEF_PAIRS)).astype(int)).tolist()

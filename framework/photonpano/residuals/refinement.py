@@ -21,7 +21,7 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.residuals.halves import Halves, halves_of
-from photonpano.residuals.measure import Residuals, measure
+from photonpano.residuals.measure import Lasting, Residuals, lasting_of, measure, noise_hides_shifts
 from photonpano.residuals.prediction import Predictions
 from photonpano.values import FloatArray, Panorama
 
@@ -153,6 +153,7 @@ class Explained:
     ratio: float  # see `residual_ratio`
     halves: Halves  # how well the frames before and after cuts agree
     refinements: tuple[Refinement, ...]  # what each refiner did
+    lasting: Lasting | None = None  # what brief spans have in common, where photon noise hides the shift of longer ones
 
 
 class MotionFit:
@@ -215,7 +216,9 @@ class MotionFit:
         of_reference_px2 = max(float(beyond_px2[self.motion.reference] - np.median(beyond_px2[located])), 0.0)
         std_px = np.sqrt(bounded_std_px(std_px, residuals) ** 2 + beyond_px2 + of_reference_px2)
         compared = partial(halves_of, self._source, self.motion, self.canvas, self._context)
-        halves = self._context.checkpoints.once("halves", compared, self.motion.homographies, self.motion.span)
+        once, of_motion = self._context.checkpoints.once, (self.motion.homographies, self.motion.span)
+        halves = once("halves", compared, *of_motion)
+        lasting = once("lasting", self._lasting, *of_motion) if noise_hides_shifts(residuals) else None
         # Two frames know no more of each other than the weakest cut between them lets through.
         motion = replace(self.motion, std_px=np.maximum(std_px, halves.tied_px(located)))
         return Explained(
@@ -225,6 +228,7 @@ class MotionFit:
             ratio=self.ratio,
             halves=halves,
             refinements=tuple(refinements),
+            lasting=lasting,
         )
 
     def moved(self, motion: FrameMotion) -> MotionFit:
@@ -237,6 +241,9 @@ class MotionFit:
         fit.motion, fit.residuals = motion, self.residuals.moved(steps - steps.mean(axis=0))
         fit.ratio = residual_ratio(fit.residuals)
         return fit
+
+    def _lasting(self) -> Lasting:
+        return lasting_of(self.residuals, self.predictions, self._context)
 
     def _measured(self) -> Residuals:
         return measure(self.motion.span, self.predictions, self._context)

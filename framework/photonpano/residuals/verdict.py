@@ -278,7 +278,7 @@ def _halves(run: TestedRun) -> Found | None:
     "use smaller groups (resample.with.group_size), in which a motion that returns shows; or mask what stands in the frame",
 )
 def _neighbours(run: TestedRun) -> Found | None:
-    lasting = run.explained.residuals.lasting
+    lasting = run.explained.lasting
     if lasting is None or lasting.sigmas < _SURE_SIGMAS:
         return None
     where = f"of the contrast, in spans of {lasting.frames} frames, {lasting.sigmas:.0f} standard deviations"

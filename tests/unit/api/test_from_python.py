@@ -71,4 +71,5 @@ def test_array_without_binary_frames_is_refused(frames: np.ndarray, says: str, t
 
 def test_wrong_key_is_named(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match="motoin: unknown key; did you mean 'motion'"):
-        panorama(np.ones((4, 20, 24), bool), motoin={})
+        panorama(np.ones((4, 20, 24), bool), output=tmp_path / "run", motoin={})
+    assert not list(tmp_path.iterdir())

@@ -190,7 +190,7 @@ def estimated(run: Callable, make_level: Callable, known_motion: type) -> Callab
             [(0, 40), (20, 50), (50, 60), (50, 88), (80, 120)],
         ),
         (REGULAR.cut_at([cut_at(50, FrameSpan(45, 56))]), [(30, 70)], [(30, 45), (56, 70)]),
-        (replace(REGULAR, unlit=(FrameSpan(45, 90),)), [(30, 70), (50, 80)], [(30, 45)]),
+        (replace(REGULAR, dark=(FrameSpan(45, 90),)), [(30, 70), (50, 80)], [(30, 45)]),
         (REGULAR.in_shots([FrameSpan(0, 50), FrameSpan(50, 120)]), [(0, 40), (20, 60), (80, 120)], [(50, 60), (80, 120)]),
         (repeating(*range(31, 90)), [(0, 30), (30, 60), (50, 80), (90, 120)], [(0, 30), (90, 120)]),
     ],
@@ -221,7 +221,7 @@ def test_expected_error_grows_towards_cut_and_covers_jump_in_the_dark(estimated:
 
 
 def test_pieces_end_in_long_darkness_and_other_shots_are_not_shown() -> None:
-    timeline = replace(REGULAR, unlit=(FrameSpan(0, 10), FrameSpan(40, 73))).in_shots([FrameSpan(0, 90), FrameSpan(90, 120)])
+    timeline = replace(REGULAR, dark=(FrameSpan(0, 10), FrameSpan(40, 73))).in_shots([FrameSpan(0, 90), FrameSpan(90, 120)])
     np.testing.assert_array_equal(timeline.piece_of([5, 56, 57, 100]), [0, 1, 1, 1])
     np.testing.assert_array_equal(np.flatnonzero(timeline.shown), [*range(10, 40), *range(73, 90)])
     assert [(each.what, each.value) for each in Findings().along(timeline).of_frames] == [
