@@ -9,7 +9,6 @@ from pathlib import Path
 import typer
 
 from photonpano.api.command import CHANGES, SPEC, WrongArgumentError, command, logger, require_trust, verdict_lines, warn
-from photonpano.corrections.lighting import LIGHT_FILE
 from photonpano.execution.context import Progress
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
 from photonpano.record.run_json import findings_of
@@ -123,16 +122,16 @@ def _run(  # noqa: PLR0913
 
 def _found(record: RunRecord) -> str:
     """Describe what a run has chosen and left out by itself: model, groups, lens, light, and what hides the background."""
-    last, hidden = record["levels"][-1], findings_of(record).hidden_share
+    last, findings = record["levels"][-1], findings_of(record)
     shifts = record["spec"]["motion"]["model"] == "translation"
     model = "rotations" if last["camera"] else "shifts" if shifts else "homographies"
     parts = [f"{model}, from groups of {counted(last['group_frames'], 'frame')}"]
     if last["camera"] and any(last["camera"]["distortion"]):
         parts.append(f"a lens with k1 {last['camera']['distortion'][0]:.3f}")
-    if LIGHT_FILE in record["files"]:
+    if findings.light_changes:
         parts.append("light that changes")
-    if hidden:
-        parts.append(f"{share(hidden)} of the frames left out, as what moves or is near")
+    if findings.hidden_share:
+        parts.append(f"{share(findings.hidden_share)} of the frames left out, as what moves or is near")
     return "; ".join(parts)
 
 

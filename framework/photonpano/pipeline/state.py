@@ -107,7 +107,8 @@ class State:
         """Return the findings so far, with those of the timeline, of the background, and of the time limit."""
         background, left_out = capture_of(self.source).background, tuple(self.context.time_limit.left_out)
         hidden_share = None if background is None else round(background.hidden_share, 4)
-        return replace(self.findings.along(self.timeline), hidden_share=hidden_share, left_out=left_out)
+        found = self.findings.along(self.timeline)
+        return replace(found, light_changes=self.light is not None, hidden_share=hidden_share, left_out=left_out)
 
     @property
     def trajectory(self) -> Trajectory:

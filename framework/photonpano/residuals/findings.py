@@ -52,6 +52,7 @@ class Findings:
     cuts: tuple[Jump, ...] = ()  # where the motion is cut
     uncut_jump: Doubt | None = None  # the largest of the jumps where the photons contradict a cut
     rival_motion: Doubt | None = None  # that of a part of the frame
+    light_changes: bool = False  # so that the gain of each frame is divided out
     hidden_share: float | None = None  # of the frames that do not show the background; None where nothing was found to hide it
     never_seen_share: float = 0.0  # of the panorama whose background no frame showed
     left_out: tuple[str, ...] = ()  # what the time limit of the run left out
