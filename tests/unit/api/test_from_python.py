@@ -41,7 +41,8 @@ def test_panorama_of_frames_is_that_of_their_capture(capture: Path, tmp_path: Pa
 
 def test_frames_are_kept_beside_a_run_folder(capture: Path, tmp_path: Path) -> None:
     frames = np.unpackbits(np.load(capture), axis=2)[:, :, :157]  # no whole bytes
-    panorama(frames.astype(bool), output=tmp_path / "run", **KEYS)
+    made = panorama(frames.astype(bool), output=tmp_path / "run", **KEYS)
+    assert made.trajectory.frame_shape == frames.shape[1:]
     np.testing.assert_array_equal(np.unpackbits(np.load(tmp_path / "run.npy"), axis=2)[:, :, :157], frames)
 
 
