@@ -156,17 +156,16 @@ def solve(
 
 def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[MotionModel, _Fit]:
     """Fit a model; for "auto", homographies, and rotations if perspective follows the shift."""
-    if model.kind != "auto":
+    if model.kind != "auto" and not model.doubts_lens:
         return {model: _fitted(tied, start, model)}
     fits: dict[MotionModel, _Fit] = {}
     # No plane holds all frames of a camera that turns far.
     with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
-        plane = replace(model, kind="homography")
-        free = _planar(tied, start, "homography")
-        if _in_front(free.homographies, tied.frame_shape):
+        if model.kind == "auto" and _in_front((free := _planar(tied, start, "homography")).homographies, tied.frame_shape):
             assert isinstance(free.adjustment, PlanarAdjustment)
             # Where all that is left of homographies is that perspective follows the shift, they are rotations.
             still = free.adjustment.is_coupled and not free.adjustment.walks_px
+            plane = replace(model, kind="homography")
             fits[plane] = _planar(tied, start, "euclidean") if still else _nearer(tied, start, free)
             if not free.adjustment.is_coupled:
                 return fits

@@ -15,6 +15,7 @@ from photonpano.values import BoolArray, FloatArray, Located, Patches
 
 # Initial focal length, in longer sides of a frame.
 _FIRST_FOCAL = 3.0
+_NO_LENS = (0.0, 0.0, 0.0, 0.0)
 _LENS = (None, None, 0.0, 0.0)  # what "auto" finds of a lens: k1 and k2
 SAME_LENS_PX = 0.05  # largest difference of what two lenses do to a frame that does not matter
 _FAR_FOCAL = 1e4  # that of a camera whose turns shift and roll the image
@@ -45,6 +46,7 @@ class MotionModel:
     # k1, k2, p1, p2 of its lens; None for those that are to be found
     distortion: tuple[float | None, float | None, float | None, float | None] = (0.0, 0.0, 0.0, 0.0)
     known: Camera | None = None  # the camera that the level before has found
+    doubts_lens: bool = False  # whether the lens of that camera was found without being asked for
     layered: bool = False  # whether frames are known to show more than a background that follows the camera
 
     @property
@@ -66,11 +68,11 @@ class MotionModel:
 
     @property
     def rotations(self) -> tuple[MotionModel, ...]:
-        """The rotations that "auto" compares with homographies: without a lens, and with one unless that is known."""
+        """The rotations that are compared: without a lens, and with one, unless that is known or asked for."""
         rotation = replace(self, kind="rotation")
-        if any(self.distortion) or self.finds_lens:
+        if not self.doubts_lens and (any(self.distortion) or self.finds_lens):
             return (rotation,)
-        return rotation, replace(rotation, distortion=_LENS)
+        return replace(rotation, distortion=_NO_LENS), replace(rotation, distortion=_LENS)
 
     @property
     def finds_lens(self) -> bool:
@@ -80,7 +82,7 @@ class MotionModel:
     def camera(self, frame_shape: tuple[int, int]) -> Camera:
         """Return what is known of the camera so far; what is not begins at 3 sides of a frame, and without distortion."""
         if self.known is not None:
-            return self.known
+            return Camera(self.known.matrix) if self.doubts_lens and not self.finds_lens else self.known
         middle = (frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2
         matrix = camera_matrix(self.focal_px or _FIRST_FOCAL * max(frame_shape), self.centre_px or middle)
         return Camera(matrix, np.array([number or 0.0 for number in self.distortion]))
@@ -90,7 +92,7 @@ class MotionModel:
         camera = self.camera(frame_shape)
         if self.known is None and self.focal_px is None:
             return Camera(camera.matrix)
-        return camera
+        return self.known or camera
 
     def turning_camera(self, frame_shape: tuple[int, int]) -> Camera | None:
         """Return the camera that locators may use: one that only turns, of a focal length that is given or was found."""
@@ -104,12 +106,15 @@ class MotionModel:
     def knowing(self, camera: Camera | None) -> MotionModel:
         """Return the model after a level that has found the camera, or None.
 
-        Frames are then seen through its lens, if it has one: "auto" keeps to that, and goes on to find it.
+        Frames are then seen through its lens, if it has one: "auto" then compares rotations alone.
         """
         if camera is None:
             return self
         if self.kind == "auto" and camera.distorts:
-            return replace(self, kind="rotation", distortion=self.distortion if self.finds_lens else _LENS, known=camera)
+            doubts = not self.finds_lens and not any(self.distortion)
+            return replace(
+                self, kind="rotation", distortion=_LENS if doubts else self.distortion, known=camera, doubts_lens=doubts
+            )
         return replace(self, known=camera)
 
 

@@ -246,7 +246,9 @@ class RotationAdjustment(Adjustment[Rotations]):
 
         A unit of roll is an angle here, and one of the shift of a corner there.
         """
-        before = float((self._lens.unexplained() ** 2).sum()) if self._finds_lens else 0.0
+        before = float((self._lens.unexplained() ** 2).sum()) if self._finds_lens or self._assumed.distorts else 0.0
+        if self._assumed.distorts and not self._finds_lens:
+            before -= float((self._unexplained(state) ** 2).sum())
         units = 2 * (self._n_nodes - 1) * float(np.log(state.camera.focal_px / self._half))
         found = super().deviance(state, weights) - before + units
         if 1 not in self._unknown:

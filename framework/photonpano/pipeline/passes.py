@@ -115,15 +115,15 @@ def tried(state: State, propose: Pass) -> Trial:
 
 
 def through_found_lens(state: State) -> Proposal | None:
-    """Run the last level again with the lens that it found, if that differs from the one through which it saw the frames.
+    """Run the last level again with the lens that it found, if that matters beside the one through which it saw the frames.
 
     Homographies between frames with a lens are not exact: pairs are off by pixels.
     """
     found, result = camera_of_motion(state.trajectory), state.results[-1]
-    if found is None or not found.distorts:
+    if found is None:
         return None
     seen = camera_of(result.exposures.source) or Camera(found.matrix)
-    if lenses_apart_px(found, seen, state.source.info.frame_shape) < SAME_LENS_PX:
+    if lenses_apart_px(found, seen, state.source.info.frame_shape) < max(SAME_LENS_PX, result.uncertainty.mean_px):
         return None
     return Proposal(make=lambda: state.located([result.level], state.trajectory), worse=None)
 

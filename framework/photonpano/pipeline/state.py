@@ -90,7 +90,9 @@ class State:
         if self.motion.camera is not None:
             motion = RotationTrajectory(motion, self.motion.camera, self.reference)
         result = self.results[-1]
-        again = replace(self, model=result.located.solution.model).located([result.level], motion, motion)
+        again = replace(self, model=replace(result.located.solution.model, doubts_lens=False)).located(
+            [result.level], motion, motion
+        )
         again = replace(again, refined=None, known_fit=None)
         known, before = self.motion.noise_px, replace(self, refined=None).motion.noise_px
         finite = np.isfinite(known) & np.isfinite(before)

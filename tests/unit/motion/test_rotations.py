@@ -160,6 +160,16 @@ def test_patches_of_pairs_show_the_lens_that_their_homographies_follow(focal_px:
     assert std[0] < 0.05 * focal_px
 
 
+def test_auto_gives_up_a_lens_that_the_level_before_took_by_chance() -> None:
+    camera, assumed = Camera.of(2000.0, SHAPE), Camera.of(2020.0, SHAPE, (0.1, 0, 0, 0))
+    model = MotionModel(kind="auto").knowing(assumed)
+    solution = solve(groups_of(20), bent(turn(20, 10.0), camera, assumed), 10, frame_shape=SHAPE, model=model)
+    assert solution.model.name == "rotation"
+    assert solution.rotations is not None
+    assert not solution.rotations.camera.distorts
+    assert abs(solution.rotations.camera.focal_px - 2000) < 4 * solution.assess().std_camera[0]
+
+
 @pytest.mark.parametrize(
     ("given", "contradicted"),
     [((330.0, -0.1), None), ((331.0, -0.1), None), ((337.0, -0.1), 0), ((330.0, -0.08), 1), ((330.0, 0.0), 1)],
