@@ -199,6 +199,10 @@ class Adjustment(ABC, Generic[StateT]):
         self._noise = ExposureNoise.of(problem.pairs, problem.spans, problem.shown)
 
     @abstractmethod
+    def of(self, problem: Problem) -> Adjustment[StateT]:
+        """Return the same for other pairs of the nodes, with what was learnt from these."""
+
+    @abstractmethod
     def homographies(self, state: StateT) -> FloatArray:
         """Return the maps from pixels of each node's frame to those of the anchor's: (N, 3, 3)."""
 

@@ -231,8 +231,10 @@ def _agreed(tied: _Tied, model: MotionModel, fit: _Fit) -> _Agreed | None:
     for tolerance_px in tolerances:
         motions = agreeing(tied.motions, first.beside(fit.state), tolerance_px, tied.frame_shape)
         background = replace(tied, motions=motions)
+        is_last = tolerance_px == tolerances[-1]
         try:
-            fit = background.fit(background.adjustment(model), fit.state)
+            adjustment = background.adjustment(model) if is_last else first.of(background.problem)
+            fit = background.fit(adjustment, fit.state, learns=is_last)
         except (ValueError, np.linalg.LinAlgError):
             return None
     return _Agreed(background, fit, agreed_share(tied.motions, first.beside(fit.state), tolerances[-1]))
@@ -443,10 +445,15 @@ class _Tied:
             maps[node] = scaled_ahead(maps[parent] @ step)
         return maps[self.located]
 
-    def fit(self, adjustment: Adjustment[Any], state: Any) -> _Fit:
-        """Solve from a start; drop outliers, unless the graph would fall apart, and solve again."""
+    def fit(self, adjustment: Adjustment[Any], state: Any, *, learns: bool = True) -> _Fit:
+        """Solve from a start; drop outliers, unless the graph would fall apart, and solve again.
+
+        One that does not learn has the variances of its prior already.
+        """
         kept = np.ones(len(self.motions), dtype=bool)
         found, norms = adjustment.minimise(state, kept)
+        if not learns:
+            return _Fit(adjustment, found, norms, kept)
         adjustment.hold_noise(norms, kept)
         adjustment, found, norms = self._learnt(adjustment, found, norms, kept)
         inliers = adjustment.inliers(norms)

@@ -31,6 +31,7 @@ _FAR, _FAR_PX = 4.0, 0.5  # standard deviations, and px, beyond which a patch co
 _ALIKE_PX = 0.1  # error of patches beside photon noise
 APART = 9.0  # mean square of the residuals of a patch that does not follow the motion, in variances
 _DAMPING, _TINY = 1e-6, 1e-12
+_AT_ONCE = 256  # pairs whose patches are weighed together: some 10 MB
 
 
 ModelName = Literal["auto", "translation", "euclidean", "similarity", "affine", "homography", "rotation"]
@@ -134,8 +135,13 @@ def agreeing(motions: Sequence[Located], residuals: FloatArray, tolerance_px: fl
 
     `residuals` (E, P, 2) are what that leaves of where patches lie, in px of frames of (height, width).
     """
-    weights = _weights(residuals, tolerance_px)
-    return [_by_patches(*each, tolerance_px, shape) for each in zip(motions, weights, strict=True)]
+    weights, found = _weights(residuals, tolerance_px), list(motions)
+    patched = [index for index, each in enumerate(motions) if each.patches is not None and each.information is not None]
+    for some in (patched[start : start + _AT_ONCE] for start in range(0, len(patched), _AT_ONCE)):
+        pairs = _by_patches([motions[index] for index in some], weights[some], tolerance_px, shape)
+        for index, motion in zip(some, pairs, strict=True):
+            found[index] = motion
+    return found
 
 
 def agreed_share(motions: Sequence[Located], residuals: FloatArray, tolerance_px: float) -> float:
@@ -168,9 +174,9 @@ def _far(patches: Patches, residuals: FloatArray) -> BoolArray:
 
 
 def _covariances(information: FloatArray) -> FloatArray:
-    """Return the inverses of (N, 2, 2) information; what nothing is known of varies by much, but not without end."""
-    traces = np.trace(information, axis1=1, axis2=2)
-    return np.linalg.inv(information + np.maximum(_DAMPING * traces, _TINY)[:, None, None] * np.eye(2))
+    """Return the inverses of (..., 2, 2) information; what nothing is known of varies by much, but not without end."""
+    traces = np.trace(information, axis1=-2, axis2=-1)
+    return np.linalg.inv(information + np.maximum(_DAMPING * traces, _TINY)[..., None, None] * np.eye(2))
 
 
 def layers(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: FloatArray, n_nodes: int) -> FloatArray:
@@ -202,29 +208,38 @@ def travelled(pairs: NDArray[np.integer], motions: Sequence[Located], residuals:
     return float(np.median(steps)) * (len(layers) - 1) if steps else 0.0
 
 
-def _by_patches(motion: Located, weights: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> Located:
-    """Return the homography that patches with these weights, (P,), show, with its information."""
-    patches = motion.patches
-    if patches is None or motion.information is None:
-        return motion
-    middles = patch_centres(shape)
-    there = motion.homography @ np.concatenate([middles, np.ones((len(middles), 1))], axis=1).T
-    moves = generators(shape)
-    by_points = slopes(there, moves @ there).reshape(len(middles), 2, 8)
-    shown = patches.information[:, 0, 0] > 0
-    limited = _covariances(patches.information) + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
-    information = np.where(shown[:, None, None], weights[:, None, None] * np.linalg.inv(limited), 0)
-    if (weights * shown).sum() < _FEWEST:
-        return replace(motion, information=motion.information * _UNCERTAIN, patches=Patches(patches.shifts, information))
-    normal = np.einsum("pki,pkl,plj->ij", by_points, information, by_points)
-    right = np.einsum("pki,pkl,pl->i", by_points, information, patches.shifts)
-    normal += _DAMPING * np.trace(normal) * np.eye(8)
-    step = np.linalg.solve(normal, right)
-    homography = motion.homography + np.einsum("i,ijk->jk", step, moves) @ motion.homography
-    homography /= homography[2, 2]
-    changed = moves @ homography
-    by_step = parameters(np.eye(3) + changed - homography * changed[:, 2:, 2:])
-    to_step = np.linalg.inv(by_step.T)
-    shifts = transform_points(motion.homography, middles) + patches.shifts - transform_points(homography, middles)
-    kept = Patches(np.where(shown[:, None], shifts, 0), information)
-    return replace(motion, homography=homography, information=to_step.T @ normal @ to_step, patches=kept)
+def _by_patches(motions: Sequence[Located], weights: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> list[Located]:
+    """Return the homographies that patches with these weights, (E, P), show, with their information."""
+    middles, moves = patch_centres(shape), generators(shape)
+    observed = np.array([each.homography for each in motions])
+    patches = [each.patches for each in motions if each.patches is not None]
+    shifts, known = np.array([each.shifts for each in patches]), np.array([each.information for each in patches])
+    there = observed @ np.concatenate([middles, np.ones((len(middles), 1))], axis=1).T
+    by_points = slopes(there, moves @ there[:, None])
+    shown = known[..., 0, 0] > 0
+    limited = _covariances(known) + (_CERTAIN * tolerance_px) ** 2 * np.eye(2)
+    information = np.where(shown[..., None, None], weights[..., None, None] * np.linalg.inv(limited), 0)
+    weighted = (information @ by_points.reshape(*shown.shape, 2, 8)).reshape(by_points.shape)
+    normal = np.swapaxes(by_points, 1, 2) @ weighted
+    normal += _DAMPING * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(8)
+    few = (weights * shown).sum(axis=1) < _FEWEST
+    normal[few] = np.eye(8)
+    steps = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ shifts.reshape(len(shifts), -1, 1))[..., 0]
+    homographies = observed + np.einsum("ei,ijk->ejk", steps, moves) @ observed
+    homographies /= homographies[:, 2:, 2:]
+    changed = moves @ homographies[:, None]
+    by_steps = parameters(np.eye(3) + changed - homographies[:, None] * changed[..., 2:, 2:])
+    to_steps = np.linalg.inv(np.swapaxes(by_steps, 1, 2))
+    totals = np.swapaxes(to_steps, 1, 2) @ normal @ to_steps
+    left = transform_points(observed, middles) + shifts - transform_points(homographies, middles)
+    left = np.where(shown[..., None], left, 0)
+    found = []
+    for index, motion in enumerate(motions):
+        if few[index]:
+            assert motion.information is not None
+            kept = Patches(shifts[index], information[index])
+            found.append(replace(motion, information=motion.information * _UNCERTAIN, patches=kept))
+        else:
+            kept = Patches(left[index], information[index])
+            found.append(replace(motion, homography=homographies[index], information=totals[index], patches=kept))
+    return found

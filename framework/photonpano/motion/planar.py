@@ -172,6 +172,15 @@ class PlanarAdjustment(Adjustment[Plane]):
         self.variances = _FIRST**2 / self._durations
         self._of_coupling = np.inf  # variance of the estimated coupling
 
+    def of(self, problem: Problem) -> PlanarAdjustment:
+        """Return the same for other pairs."""
+        return self._like(problem, self._model)
+
+    def _like(self, problem: Problem, model: PlanarName) -> PlanarAdjustment:
+        found = PlanarAdjustment(problem, model)
+        found.variances, found._noise_norm = self.variances[: found._n_walks + found._n_shared], self._noise_norm
+        return found
+
     @property
     def _n_node(self) -> int:
         return int(self._basis.shape[1])
@@ -322,9 +331,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         model = next(name for name in PLANAR_NAMES[1:] if len(_MOVED[name]) - _FREE >= min(most, len(_WALKS)))
         if len(_MOVED[model]) >= self._n_node:
             return self, state
-        narrow = PlanarAdjustment(self._problem, model)
-        narrow.variances, narrow._noise_norm = self.variances[: narrow._n_walks], self._noise_norm
-        return narrow, Plane(nearest(model, state.homographies, self._frame_shape))
+        return self._like(self._problem, model), Plane(nearest(model, state.homographies, self._frame_shape))
 
     @property
     def is_coupled(self) -> bool:

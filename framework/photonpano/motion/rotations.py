@@ -162,6 +162,10 @@ class RotationAdjustment(Adjustment[Rotations]):
         self._near: tuple[Rotations, list[Rotations]] | None = None
         self._shifts: dict[Rotations, FloatArray] = {}
 
+    def of(self, problem: Problem) -> RotationAdjustment:
+        """Return the same for other pairs."""
+        return RotationAdjustment(problem, self._assumed, self._unknown)
+
     @cached_property
     def _lens(self) -> LensShift:
         return LensShift.of(self._frame_shape, self._motions, self._noise.weights)
