@@ -75,6 +75,11 @@ class MotionModel:
         return replace(rotation, distortion=_NO_LENS), replace(rotation, distortion=_LENS)
 
     @property
+    def has_rivals(self) -> bool:
+        """Whether the pairs choose the model: that of "auto", or without a lens that was found without being asked for."""
+        return self.kind == "auto" or (self.doubts_lens and self.finds_lens)
+
+    @property
     def finds_lens(self) -> bool:
         """Whether the distortion of the lens is to be found."""
         return any(index > 0 for index in self.unknown)

@@ -26,7 +26,7 @@ from photonpano.geometry import (
     slopes,
     transform_points,
 )
-from photonpano.motion.adjustment import CAUCHY, Adjustment, Prior, Problem
+from photonpano.motion.adjustment import CAUCHY, Adjustment, Prior, Problem, remembered
 from photonpano.robust import robust_std
 from photonpano.values import FloatArray, Located
 
@@ -158,9 +158,7 @@ class RotationAdjustment(Adjustment[Rotations]):
         """
         super().__init__(problem, n_shared=len(unknown))
         self._assumed, self._unknown = assumed, unknown
-        # What was computed of the current state, and of states near it.
-        self._near: tuple[Rotations, list[Rotations]] | None = None
-        self._shifts: dict[Rotations, FloatArray] = {}
+        self._shifts: dict[Rotations, FloatArray] = {}  # of the last state, and of states near it
 
     @cached_property
     def _lens(self) -> LensShift:
@@ -212,14 +210,12 @@ class RotationAdjustment(Adjustment[Rotations]):
             found.append((there - here).reshape(-1, 8) / _STEP)
         return np.stack(found, axis=-1)
 
+    @remembered
     def _nearby(self, state: Rotations) -> list[Rotations]:
         """Return the state after a small step of each unknown of the camera."""
-        if self._near is None or self._near[0] is not state:
-            units = self._units(state.camera)
-            steps = [self._changed(state, index, _STEP * unit) for index, unit in zip(self._unknown, units, strict=True)]
-            self._near = state, steps
-            self._shifts = {key: shift for key, shift in self._shifts.items() if key is state}
-        return self._near[1]
+        self._shifts = {key: shift for key, shift in self._shifts.items() if key is state}
+        units = self._units(state.camera)
+        return [self._changed(state, index, _STEP * unit) for index, unit in zip(self._unknown, units, strict=True)]
 
     def shifted_patches(self, state: Rotations) -> FloatArray:
         """Return how the lens shifts patches: see `Adjustment`."""
@@ -257,6 +253,7 @@ class RotationAdjustment(Adjustment[Rotations]):
         std = _PRIOR_BEND * float(self._units(state.camera)[self._unknown.index(1)])
         return found + float(2 * np.log1p((k1 / scale) ** 2) - (k1 / std) ** 2 + 2 * np.log(scale / std) + np.log(np.pi / 2))
 
+    @remembered
     def prior(self, state: Rotations) -> Prior:
         """Return what is known before: a focal length of some sides of a frame, a small distortion, and where patches lie."""
         units = self._units(state.camera)
