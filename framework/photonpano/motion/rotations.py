@@ -76,12 +76,12 @@ class LensShift:
         # Four points at least determine a homography; a pair that hardly overlaps takes all.
         seen[seen.sum(axis=1) < _FEWEST] = True
         shifts, weights = np.zeros((*seen.shape, 2)), seen[..., None, None] * np.eye(2)
-        roots = np.zeros_like(weights)
+        shown = np.zeros(len(seen), dtype=bool)
         for edge, patches in enumerate(motion.patches for motion in motions):
             if patches is not None and (patches.information[:, 0, 0] > 0).sum() >= _FEWEST:
-                shifts[edge], weights[edge] = patches.shifts, patches.information
-                values, vectors = np.linalg.eigh(counts[edge] * patches.information)
-                roots[edge] = np.sqrt(np.maximum(values, 0))[..., None] * np.swapaxes(vectors, -1, -2)
+                shown[edge], shifts[edge], weights[edge] = True, patches.shifts, patches.information
+        values, vectors = np.linalg.eigh((counts * shown)[:, None, None, None] * weights)
+        roots = np.sqrt(np.maximum(values, 0))[..., None] * np.swapaxes(vectors, -1, -2)
         by_points = slopes_at(points)
         weighted = weights @ by_points.reshape(*seen.shape, 2, 8)
         weighted = np.swapaxes(weighted.reshape(by_points.shape), -1, -2)
@@ -217,9 +217,9 @@ class RotationAdjustment(Adjustment[Rotations]):
         units = self._units(state.camera)
         return [self._changed(state, index, _STEP * unit) for index, unit in zip(self._unknown, units, strict=True)]
 
-    def shifted_patches(self, state: Rotations) -> FloatArray:
+    def shifted_patches(self, state: Rotations) -> FloatArray | float:
         """Return how the lens shifts patches: see `Adjustment`."""
-        return self._shift(state).reshape(self._lens.shifts.shape)
+        return self._shift(state).reshape(len(self._motions), -1, 2) if self._bends(state) else 0.0
 
     def _bends(self, state: Rotations) -> bool:
         return state.camera.distorts or self._assumed.distorts
