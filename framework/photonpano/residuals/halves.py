@@ -260,7 +260,7 @@ def _agreement(gradients: FluxImage, widest_px: float, square_px: int) -> _Agree
 
 
 def _of_squares(gradients: FluxImage, square_px: int) -> FloatArray:
-    """Return the sums over N squares of products of the gradients of pictures, (4, 2, h, w, C), by two of these: (4, 4, N, 2, 2)."""
+    """Return the sums over squares of products of gradients, (4, 2, h, w, C), of each two pictures: (4, 4, N, 2, 2)."""
     *_, height, width, colours = gradients.shape
     rows, columns = (-(-length // square_px) for length in (height, width))
     filled = np.zeros((8, rows * square_px, columns * square_px, colours), np.float32)
