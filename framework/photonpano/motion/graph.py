@@ -182,8 +182,8 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
 
 def _chosen(fits: dict[MotionModel, _Fit], tied: _Tied) -> MotionModel:
     """Return the likeliest model, whose fit has converged; that of others, which a few steps do not make likelier, need not."""
-    while not fits[chosen := _likeliest(fits, tied.frame_shape)].converged:
-        fits[chosen] = tied.fit(fits[chosen].adjustment, fits[chosen].state)
+    while (start := fits[chosen := _likeliest(fits, tied.frame_shape)].start) is not None:
+        fits[chosen] = tied.fit(fits[chosen].adjustment, start)
     return chosen
 
 
@@ -346,7 +346,7 @@ class _Fit:
     state: Any  # of least cost
     norms: FloatArray  # (E,) of the whitened residuals
     kept: BoolArray  # (E,) False for outliers
-    converged: bool = True  # False after a few steps from the fit of a narrower model
+    start: Any = None  # of a fit that has not converged: the state of a narrower model, from which a few steps led here
 
     @property
     def homographies(self) -> FloatArray:
@@ -466,7 +466,7 @@ class _Tied:
         """Return the fit of a model after a few steps from that of a narrower one, of which another is known to be near."""
         adjustment = self.adjustment(model)
         state, norms = adjustment.minimise(fit.state, fit.kept, fit.weights, iterations=_TRIED)
-        return _Fit(adjustment, state, norms, fit.kept, converged=False)
+        return _Fit(adjustment, state, norms, fit.kept, fit.state)
 
     def _learnt(
         self, adjustment: Adjustment[Any], found: Any, norms: FloatArray, kept: BoolArray
