@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import wraps
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -39,6 +40,23 @@ _COMMON_PX = 0.003
 _UNKNOWN_NORM = 1e-3 * MEDIAN_NORM  # least scale of the residuals of edges that say nothing of their errors
 
 StateT = TypeVar("StateT")
+SelfT = TypeVar("SelfT")
+FoundT = TypeVar("FoundT")
+
+
+def remembered(method: Callable[[SelfT, StateT], FoundT]) -> Callable[[SelfT, StateT], FoundT]:
+    """Have a method remember what it found for the last state, which is stepped to, linearised and compared."""
+    name = f"_last_{method.__name__}"
+
+    @wraps(method)
+    def found(self: SelfT, state: StateT) -> FoundT:
+        last: tuple[StateT, FoundT] | None = getattr(self, name, None)
+        if last is None or last[0] is not state:
+            last = state, method(self, state)
+            setattr(self, name, last)
+        return last[1]
+
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,11 +279,16 @@ class Adjustment(ABC, Generic[StateT]):
         homographies = self.homographies(state)
         return np.linalg.solve(homographies[self._fixed], homographies[self._moving])
 
-    def minimise(self, state: StateT, kept: BoolArray) -> tuple[StateT, FloatArray]:
-        """Return the state of least cost, and the norm of the whitened residual of each edge, (E,); outliers are not `kept`."""
-        # Equal weights at first: the start fits half of the edges exactly, so that robust weights would reject the others.
-        weights = kept * self._noise.weights
-        for iteration in range(MAX_ITERATIONS):
+    def minimise(
+        self, state: StateT, kept: BoolArray, weights: FloatArray | None = None, iterations: int = MAX_ITERATIONS
+    ) -> tuple[StateT, FloatArray]:
+        """Return the state of least cost, and the norm of the whitened residual of each edge, (E,); outliers are not `kept`.
+
+        `weights` (E,) are those of the start, equal ones if it may fit half of the edges exactly: robust weights would reject
+        the others.
+        """
+        weights = kept * self._noise.weights if weights is None else weights
+        for iteration in range(iterations):
             jacobians, residuals = self._linearised(state, weights)
             free, gradient = self._free(state), jacobians.T @ residuals
             step = np.zeros(len(free))
@@ -306,15 +329,15 @@ class Adjustment(ABC, Generic[StateT]):
     def deviance(self, state: StateT, weights: FloatArray) -> float:
         """Return minus twice the logarithm of the marginal likelihood of a solution, up to a constant that all models share.
 
-        Unknowns are integrated out around it (Laplace), and each variance that was estimated has its price. `weights` (E,) are
-        the same for all models.
+        Unknowns are integrated out around it (Laplace), as if the problem were linear from there on: what another step would
+        gain counts. Each variance that was estimated has its price. `weights` (E,) are the same for all models.
         """
         jacobians, residuals = self._linearised(state, weights)
         free = self._free(state)
-        factors = factorised((jacobians.T @ jacobians)[free][:, free])
+        factors, gradient = factorised((jacobians.T @ jacobians)[free][:, free]), (jacobians.T @ residuals)[free]
         determinant = float(np.log(np.abs(factors.U.diagonal())).sum())
         known = self.prior(state).log_variances + self.n_hyperparameters * self.price
-        return float(residuals @ residuals) + determinant + known
+        return float(residuals @ residuals - gradient @ factors.solve(gradient)) + determinant + known
 
     def assess(self, state: StateT, norms: FloatArray, kept: BoolArray) -> Assessment:
         """Return the information on each node while the others are held, and the expected error of its corners.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -44,6 +44,7 @@ from photonpano.values import BoolArray, Edge, FloatArray, FrameSpan, Group, Loc
 _CONTRADICTED = 0.005
 _HELD = 3.0  # expected errors by which k1 may differ from what is given, to be held while the focal length is free
 _FEWEST_NODES = 12  # of which pairs tell what is the background over time
+_TRIED = 2  # steps towards a lens that show whether it is likelier: its numbers grow with the focal length
 _LEARNT = 3  # times that the variances of the prior are estimated, each along the motion by those before
 
 
@@ -149,14 +150,13 @@ def solve(
     if not len(tied.motions):
         return tied.alone(model)
     fits = _rivals(tied, start, model)
-    tied, fits = _of_background(tied, start, fits)
-    chosen = _likeliest(fits, frame_shape)
-    return tied.solution(fits[chosen], chosen, partial(_compared, tied, start, fits, chosen))
+    tied, fits, chosen = _of_background(tied, start, fits, _chosen(fits, tied))
+    return tied.solution(fits[chosen], chosen, cache(partial(_compared, tied, start, fits, chosen)))
 
 
 def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[MotionModel, _Fit]:
     """Fit a model; for "auto", homographies, and rotations if perspective follows the shift."""
-    if model.kind != "auto" and not model.doubts_lens:
+    if not model.has_rivals:
         return {model: _fitted(tied, start, model)}
     fits: dict[MotionModel, _Fit] = {}
     # No plane holds all frames of a camera that turns far.
@@ -169,13 +169,22 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
             fits[plane] = _planar(tied, start, "euclidean") if still else _nearer(tied, start, free)
             if not free.adjustment.is_coupled:
                 return fits
+    turned: _Fit | None = None
     for rotation in model.rotations:
-        if fits:
-            with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
-                fits[rotation] = _fitted(tied, start, rotation, list(fits.values()))
-        else:
-            fits[rotation] = _fitted(tied, start, rotation)
+        if not fits:
+            fits[rotation] = turned = _fitted(tied, start, rotation)
+            continue
+        with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
+            fits[rotation] = _fitted(tied, start, rotation) if turned is None else tied.stepped(rotation, turned)
+            turned = fits[rotation]
     return fits
+
+
+def _chosen(fits: dict[MotionModel, _Fit], tied: _Tied) -> MotionModel:
+    """Return the likeliest model, whose fit has converged; that of others, which a few steps do not make likelier, need not."""
+    while (start := fits[chosen := _likeliest(fits, tied.frame_shape)].start) is not None:
+        fits[chosen] = tied.fit(fits[chosen].adjustment, start)
+    return chosen
 
 
 def _in_front(homographies: FloatArray, frame_shape: tuple[int, int]) -> bool:
@@ -185,18 +194,17 @@ def _in_front(homographies: FloatArray, frame_shape: tuple[int, int]) -> bool:
 
 
 def _of_background(
-    tied: _Tied, start: FloatArray | None, fits: dict[MotionModel, _Fit]
-) -> tuple[_Tied, dict[MotionModel, _Fit]]:
+    tied: _Tied, start: FloatArray | None, fits: dict[MotionModel, _Fit], likeliest: MotionModel
+) -> tuple[_Tied, dict[MotionModel, _Fit], MotionModel]:
     """Have pairs follow the patches that agree with one motion, if others contradict it: what moves by itself, or is near.
 
-    Returns the pairs by these patches, and all models fitted to them.
+    Returns the pairs by these patches, all models fitted to them, and the likeliest one.
     """
     if len(tied.order) < _FEWEST_NODES:
-        return tied, fits
-    likeliest = _likeliest(fits, tied.frame_shape)
+        return tied, fits, likeliest
     contradicted = contradicting(tied.motions, fits[likeliest].adjustment.beside(fits[likeliest].state)) >= _CONTRADICTED
     if not (likeliest.layered or contradicted):
-        return tied, fits
+        return tied, fits, likeliest
     # A richer model may follow what is near, too, but then fits neither part: most patches agree with the right one.
     # What a narrow planar model cannot follow need not move by itself: homographies tell.
     turning = {model: fit for model, fit in fits.items() if model.kind == "rotation"}
@@ -205,7 +213,7 @@ def _of_background(
     rivals = dict.fromkeys([likeliest, _likeliest(turning, tied.frame_shape)] if turning else planar)
     selected = {model: agreed for model in rivals if (agreed := _agreed(tied, model, telling[model]))}
     if not selected:
-        return tied, fits
+        return tied, fits, likeliest
     model = max(selected, key=lambda each: selected[each].share)
     first, (background, fit, _) = telling[model].adjustment, selected[model]
     found = layers(tied.pairs, tied.motions, first.beside(fit.state), len(tied.located))
@@ -214,7 +222,8 @@ def _of_background(
         way_px = travelled(tied.pairs, tied.motions, first.beside(fit.state), found)
         background = replace(background, parallax=way_px / fit.state.camera.focal_px)
     others = [each for each in fits if each is not model]
-    return background, {each: _fitted(background, start, each) for each in others} | ({model: fit} if model in fits else {})
+    fits = {each: _fitted(background, start, each) for each in others} | ({model: fit} if model in fits else {})
+    return background, fits, _likeliest(fits, tied.frame_shape)
 
 
 class _Agreed(NamedTuple):
@@ -300,21 +309,18 @@ def _freed(tied: _Tied, model: MotionModel, fit: _Fit) -> Freed | None:
     return Freed(number, given[number], found[number], stds[number]) if away.any() else None
 
 
-def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel, fits: Sequence[_Fit] = ()) -> _Fit:
-    """Fit a model; rotations through a lens begin with those without, if these are among the `fits`."""
+def _fitted(tied: _Tied, start: FloatArray | None, model: MotionModel) -> _Fit:
+    """Fit a model."""
     if model.kind != "rotation":
         fit = _planar(tied, start, model.planar)
         return _nearer(tied, start, fit) if model.planar == "homography" else fit
     shape, given = tied.frame_shape, tied.given(start)
     adjustment = RotationAdjustment(tied.problem, model.seen_by(shape), model.unknown)
-    state = next((fit.state for fit in fits if isinstance(fit.state, Rotations)), None)
-    if state is None:
-        camera = model.camera(shape)
-        if model.focal_px is None and model.known is None:
-            camera = adjustment.likeliest_camera(camera)
-        rotations = likely_rotations(camera, tied.problem.observed if given is None else given, shape)
-        state = Rotations(tied.composed(rotations) if given is None else rotations, camera)
-    return tied.fit(adjustment, state)
+    camera = model.camera(shape)
+    if model.focal_px is None and model.known is None:
+        camera = adjustment.likeliest_camera(camera)
+    rotations = likely_rotations(camera, tied.problem.observed if given is None else given, shape)
+    return tied.fit(adjustment, Rotations(tied.composed(rotations) if given is None else rotations, camera))
 
 
 def _planar(tied: _Tied, start: FloatArray | None, model: PlanarName) -> _Fit:
@@ -342,6 +348,7 @@ class _Fit:
     state: Any  # of least cost
     norms: FloatArray  # (E,) of the whitened residuals
     kept: BoolArray  # (E,) False for outliers
+    start: Any = None  # of a fit that has not converged: the state of a narrower model, from which a few steps led here
 
     @property
     def homographies(self) -> FloatArray:
@@ -461,6 +468,12 @@ class _Tied:
             kept = inliers
             adjustment, found, norms = self._learnt(adjustment, *adjustment.minimise(found, kept), kept)
         return _Fit(adjustment, found, norms, kept)
+
+    def stepped(self, model: MotionModel, fit: _Fit) -> _Fit:
+        """Return the fit of a model after a few steps from that of a narrower one, of which another is known to be near."""
+        adjustment = self.adjustment(model)
+        state, norms = adjustment.minimise(fit.state, fit.kept, fit.weights, iterations=_TRIED)
+        return _Fit(adjustment, state, norms, fit.kept, fit.state)
 
     def _learnt(
         self, adjustment: Adjustment[Any], found: Any, norms: FloatArray, kept: BoolArray

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -53,8 +53,13 @@ class LocatedLevel:
     solution: GraphSolution  # one homography for each exposure
     assessed: Assessment  # how well the located exposures are determined
     frame_shape: tuple[int, int]  # (height, width) of a frame
-    rivals: Mapping[str, Rival]  # how well models of the motion explain the pairs, by their names
+    compare: Callable[[], Mapping[str, Rival]]  # that of `GraphSolution`, before loop closures
     ambiguity: Ambiguity | None = None  # pairs that fit the scene at more than one place; None where there are none
+
+    @property
+    def rivals(self) -> Mapping[str, Rival]:
+        """How well models of the motion explain the pairs, by their names."""
+        return self.compare()
 
     @property
     def std_px(self) -> FloatArray:
@@ -165,7 +170,7 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
             anchor = int(largest[len(largest) // 2])
             to_plane = registrar.to_plane
             solution = solve(groups, edges, anchor, frame_shape=shape, start=to_plane, model=model)
-            rivals = solution.compare()
+            compare = solution.compare
             candidates = [pair for pair in closure_candidates(groups, solution, shape, graph) if pair not in excluded]
             between = [inverse(solution.homographies[fixed]) @ solution.homographies[moving] for moving, fixed in candidates]
         revisits = context.checkpoints.log(
@@ -191,7 +196,7 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
         solution=solution,
         assessed=assessed,
         frame_shape=shape,
-        rivals=rivals,
+        compare=compare,
         ambiguity=_ambiguity(level.number, registrar.alternatives_px, edges, shape),
     )
 

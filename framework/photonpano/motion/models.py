@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photonpano.geometry import Camera, camera_matrix, generators, parameters, patch_centres, slopes, transform_points
 from photonpano.motion.planar import PlanarName
-from photonpano.values import BoolArray, FloatArray, Located, Patches
+from photonpano.values import FloatArray, Located, Patches
 
 # Initial focal length, in longer sides of a frame.
 _FIRST_FOCAL = 3.0
@@ -74,6 +74,11 @@ class MotionModel:
         if not self.doubts_lens and (any(self.distortion) or self.finds_lens):
             return (rotation,)
         return replace(rotation, distortion=_NO_LENS), replace(rotation, distortion=_LENS)
+
+    @property
+    def has_rivals(self) -> bool:
+        """Whether the pairs choose the model: that of "auto", or without a lens that was found without being asked for."""
+        return self.kind == "auto" or (self.doubts_lens and self.finds_lens)
 
     @property
     def finds_lens(self) -> bool:
@@ -159,18 +164,13 @@ def _weights(residuals: FloatArray, tolerance_px: float) -> FloatArray:
 
 def contradicting(motions: Sequence[Located], residuals: FloatArray) -> float:
     """Return the share of the patches that lie elsewhere than a motion lets expect; 0 if too few show anything to tell."""
-    shown = [(motion.patches, left) for motion, left in zip(motions, residuals, strict=True) if motion.patches is not None]
-    found = [_far(*each) for each in shown]
-    if np.median([len(each) for each in found] or [0]) < _TELLING:
+    shown = np.array([motion.patches is not None for motion in motions])
+    information = np.array([motion.patches.information for motion in motions if motion.patches is not None])
+    if not len(information) or np.median((seen := information[..., 0, 0] > 0).sum(axis=1)) < _TELLING:
         return 0.0
-    return float(np.concatenate(found).mean())
-
-
-def _far(patches: Patches, residuals: FloatArray) -> BoolArray:
-    """Return which of the patches that show something are far from where they are expected."""
-    seen = patches.information[:, 0, 0] > 0
-    variances = np.trace(_covariances(patches.information[seen]), axis1=1, axis2=2)
-    return np.asarray((residuals[seen] ** 2).sum(axis=-1) > _FAR**2 * variances + _FAR_PX**2)
+    information, left = information[seen], residuals[shown][seen]
+    variances = np.trace(_covariances(information), axis1=1, axis2=2)
+    return float(((left**2).sum(axis=-1) > _FAR**2 * variances + _FAR_PX**2).mean())
 
 
 def _covariances(information: FloatArray) -> FloatArray:

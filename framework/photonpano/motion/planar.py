@@ -17,7 +17,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU
 
 from photonpano.geometry import corners, generators, inverse, parameters, scaled_ahead, transform_points, unit_coordinates
-from photonpano.motion.adjustment import SAMPLES, Adjustment, Assessment, Prior, Problem, factorised
+from photonpano.motion.adjustment import SAMPLES, Adjustment, Assessment, Prior, Problem, factorised, remembered
 from photonpano.values import BoolArray, FloatArray, Homography
 
 PlanarName = Literal["translation", "euclidean", "similarity", "affine", "homography"]
@@ -342,6 +342,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         """Return the focal length of a camera that turns; None unless perspective follows the shift."""
         return self._half / float(np.sqrt(-state.coupling)) if self.is_coupled and state.coupling < 0 else None
 
+    @remembered
     def _components(self, state: Plane) -> list[Prior]:
         """Return the steps of each walk beyond the coupling, over the roots of their times; and the coupling."""
         n_steps, k, w = len(self._times), self._n_node, self._n_walks

@@ -26,7 +26,7 @@ from photonpano.geometry import (
     slopes,
     transform_points,
 )
-from photonpano.motion.adjustment import CAUCHY, Adjustment, Prior, Problem
+from photonpano.motion.adjustment import CAUCHY, Adjustment, Prior, Problem, remembered
 from photonpano.robust import robust_std
 from photonpano.values import FloatArray, Located
 
@@ -76,12 +76,12 @@ class LensShift:
         # Four points at least determine a homography; a pair that hardly overlaps takes all.
         seen[seen.sum(axis=1) < _FEWEST] = True
         shifts, weights = np.zeros((*seen.shape, 2)), seen[..., None, None] * np.eye(2)
-        roots = np.zeros_like(weights)
+        shown = np.zeros(len(seen), dtype=bool)
         for edge, patches in enumerate(motion.patches for motion in motions):
             if patches is not None and (patches.information[:, 0, 0] > 0).sum() >= _FEWEST:
-                shifts[edge], weights[edge] = patches.shifts, patches.information
-                values, vectors = np.linalg.eigh(counts[edge] * patches.information)
-                roots[edge] = np.sqrt(np.maximum(values, 0))[..., None] * np.swapaxes(vectors, -1, -2)
+                shown[edge], shifts[edge], weights[edge] = True, patches.shifts, patches.information
+        values, vectors = np.linalg.eigh((counts * shown)[:, None, None, None] * weights)
+        roots = np.sqrt(np.maximum(values, 0))[..., None] * np.swapaxes(vectors, -1, -2)
         by_points = slopes_at(points)
         weighted = weights @ by_points.reshape(*seen.shape, 2, 8)
         weighted = np.swapaxes(weighted.reshape(by_points.shape), -1, -2)
@@ -158,9 +158,7 @@ class RotationAdjustment(Adjustment[Rotations]):
         """
         super().__init__(problem, n_shared=len(unknown))
         self._assumed, self._unknown = assumed, unknown
-        # What was computed of the current state, and of states near it.
-        self._near: tuple[Rotations, list[Rotations]] | None = None
-        self._shifts: dict[Rotations, FloatArray] = {}
+        self._shifts: dict[Rotations, FloatArray] = {}  # of the last state, and of states near it
 
     def of(self, problem: Problem) -> RotationAdjustment:
         """Return the same for other pairs."""
@@ -216,18 +214,16 @@ class RotationAdjustment(Adjustment[Rotations]):
             found.append((there - here).reshape(-1, 8) / _STEP)
         return np.stack(found, axis=-1)
 
+    @remembered
     def _nearby(self, state: Rotations) -> list[Rotations]:
         """Return the state after a small step of each unknown of the camera."""
-        if self._near is None or self._near[0] is not state:
-            units = self._units(state.camera)
-            steps = [self._changed(state, index, _STEP * unit) for index, unit in zip(self._unknown, units, strict=True)]
-            self._near = state, steps
-            self._shifts = {key: shift for key, shift in self._shifts.items() if key is state}
-        return self._near[1]
+        self._shifts = {key: shift for key, shift in self._shifts.items() if key is state}
+        units = self._units(state.camera)
+        return [self._changed(state, index, _STEP * unit) for index, unit in zip(self._unknown, units, strict=True)]
 
-    def shifted_patches(self, state: Rotations) -> FloatArray:
+    def shifted_patches(self, state: Rotations) -> FloatArray | float:
         """Return how the lens shifts patches: see `Adjustment`."""
-        return self._shift(state).reshape(self._lens.shifts.shape)
+        return self._shift(state).reshape(len(self._motions), -1, 2) if self._bends(state) else 0.0
 
     def _bends(self, state: Rotations) -> bool:
         return state.camera.distorts or self._assumed.distorts
@@ -261,6 +257,7 @@ class RotationAdjustment(Adjustment[Rotations]):
         std = _PRIOR_BEND * float(self._units(state.camera)[self._unknown.index(1)])
         return found + float(2 * np.log1p((k1 / scale) ** 2) - (k1 / std) ** 2 + 2 * np.log(scale / std) + np.log(np.pi / 2))
 
+    @remembered
     def prior(self, state: Rotations) -> Prior:
         """Return what is known before: a focal length of some sides of a frame, a small distortion, and where patches lie."""
         units = self._units(state.camera)

@@ -87,7 +87,7 @@ def record_of(
         **started,
         "decisions": [*started["decisions"], *decision_records(decisions)],
         "findings": _FINDINGS.dump_python(findings, mode="json"),
-        "levels": [level_record(result) for result in levels],
+        "levels": [level_record(result, compared=result is levels[-1]) for result in levels],
         "panorama": panorama_record(plan, panorama, rendered),
         "motion": _motion_record(motion.std_px),
         "refinements": [refinement_record(each) for each in explained.refinements],
@@ -156,8 +156,8 @@ def read_record(run_folder: Path) -> RunRecord:
     return record
 
 
-def level_record(result: LevelResult) -> LevelRecord:
-    """Describe one level."""
+def level_record(result: LevelResult, *, compared: bool = False) -> LevelRecord:
+    """Describe one level; whether models of its motion are `compared`, which may take as long as to find it."""
     located, groups = result.located, result.groups
     first, *_ = result.level.locators
     mean_px = result.uncertainty.mean_px
@@ -188,7 +188,7 @@ def level_record(result: LevelResult) -> LevelRecord:
         "camera": _camera_record(result),
         "evidence": {
             name: RivalRecord(chi2=chi2, unknowns=number, deviance=more, apart_px=apart_px)
-            for name, (chi2, number, more, apart_px) in located.rivals.items()
+            for name, (chi2, number, more, apart_px) in (located.rivals if compared else {}).items()
         },
         "walks_px": dict(located.solution.walks_px),
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},

@@ -87,7 +87,7 @@ class LevelRecord(TypedDict):
     mean distance by which the level moved the corners of the frames, None at the first level; `std_px` is the expected corner
     error, None where a single exposure was located. `camera` is that of a level whose camera turns, None where homographies
     were fitted; `walks_px` is how far zoom, shears and perspectives of these move the ends of a frame over the capture, and
-    `evidence` how well models explain the pairs. `seconds` has an entry for each stage.
+    `evidence` how well models explain the pairs of the last level. `seconds` has an entry for each stage.
     """
 
     level: int

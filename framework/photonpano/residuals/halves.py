@@ -215,13 +215,13 @@ def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreeme
     lit, weight = sums[:, 0][:, *part], np.maximum(sums[:, 1][:, *part], np.float32(1e-6))
     known, noise = seen[part].astype(np.float32), np.float32(0)
     for first in (0, 2):  # of the mean of the parts of a half
-        whole = np.maximum(lit[first : first + 2].sum(axis=0) / weight[first : first + 2].sum(axis=0), _DARKEST)
-        noise = noise + frame_variance(whole, response) / weight[first : first + 2].sum(axis=0)
+        frames = weight[first] + weight[first + 1]
+        noise = noise + frame_variance(np.maximum((lit[first] + lit[first + 1]) / frames, _DARKEST), response) / frames
+    pictures, scale = lit / weight * known, known / np.sqrt(noise)
     for number, blur_px in enumerate(_BLURS_PX):
         within = np.maximum(_blurred(known, blur_px), np.float32(1e-6))
-        smooth = np.stack([_blurred(picture, blur_px) for picture in lit / weight * known]) / within
-        along_x, along_y = (np.asarray(np.gradient(smooth, axis=axis)) for axis in (2, 1))
-        gradients = np.stack([along_x, along_y], axis=1) * known / np.sqrt(noise)
+        smooth = [_blurred(picture, blur_px) / within for picture in pictures]
+        gradients = np.array([[np.gradient(each, axis=axis) * scale for axis in (1, 0)] for each in smooth])
         coarser = _agreement(gradients, widest_px, round(_SQUARE_PX * blur_px))
         strong, weak = (min(pair) for pair in zip(found.std_px, coarser.std_px, strict=True))
         found = (found if number else coarser)._replace(std_px=(strong, weak))
@@ -237,19 +237,19 @@ def _blurred(picture: FluxImage, blur_px: float) -> FluxImage:
 
 def _agreement(gradients: FluxImage, widest_px: float, square_px: int) -> _Agreement:
     """Compare the gradients of four pictures, in units of their noise: (4, 2, h, w, C)."""
-    (first, of_first), (second, of_second) = (
-        ((gradients[i] + gradients[i + 1]) / 2, (gradients[i] - gradients[i + 1]) / 2) for i in (0, 2)
-    )
-    between = _of_squares(first, second, square_px)
+    # The means of both parts of each half, and then half their differences.
+    parts = np.array([[1, 1, 0, 0], [0, 0, 1, 1], [1, -1, 0, 0], [0, 0, 1, -1]]) / 2
+    products = np.einsum("ak,klnij,bl->abnij", parts, _of_squares(gradients, square_px), parts, optimize=True)
+    between = products[0, 1]
     information = between.sum(axis=0)
     values, vectors = np.linalg.eigh((information + information.T) / 2)
     # Products of one part with the difference of others have noise, and no signal.
-    errors = [_of_squares(*each, square_px) for each in ((first, of_second), (of_first, second), (of_first, of_second))]
+    errors = products[0, 3], products[2, 1], products[2, 3]
     squares = [np.square(np.einsum("is,nij,js->ns", vectors, each, vectors)).sum(axis=0) for each in errors]
     std = np.sqrt(np.maximum(squares[0] + squares[1] - squares[2], 0))
     weak, strong = (1 / np.sqrt(np.maximum(values - _ERRORS * std, 0) + 1 / widest_px**2)).tolist()
     angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])) % 180)
-    own = [np.trace(_of_squares(gradients[i], gradients[i + 1], square_px), axis1=1, axis2=2) for i in (0, 2)]
+    own = [np.trace(products[i, i] - products[i + 2, i + 2], axis1=1, axis2=2) for i in (0, 1)]
     across, (before, after) = np.trace(between, axis1=1, axis2=2), (each.sum() for each in own)
     if min(before, after) <= 0:
         return _Agreement(np.nan, np.nan, (strong, weak), angle)
@@ -259,9 +259,12 @@ def _agreement(gradients: FluxImage, widest_px: float, square_px: int) -> _Agree
     return _Agreement(float(coherence), float(np.sqrt((left**2).sum() / (before * after))), (strong, weak), angle)
 
 
-def _of_squares(first: FluxImage, second: FluxImage, square_px: int) -> FloatArray:
-    """Return the sums of products of gradients, (2, h, w, C), over squares: (N, 2, 2)."""
-    products = np.einsum("ihwc,jhwc->ijhw", first, second)
-    starts = [np.arange(0, length, square_px) for length in products.shape[2:]]
-    sums = np.add.reduceat(np.add.reduceat(products, starts[0], axis=2), starts[1], axis=3)
-    return sums.astype(np.float64).reshape(2, 2, -1).transpose(2, 0, 1)
+def _of_squares(gradients: FluxImage, square_px: int) -> FloatArray:
+    """Return the sums over squares of products of gradients, (4, 2, h, w, C), of each two pictures: (4, 4, N, 2, 2)."""
+    *_, height, width, colours = gradients.shape
+    rows, columns = (-(-length // square_px) for length in (height, width))
+    filled = np.zeros((8, rows * square_px, columns * square_px, colours), np.float32)
+    filled[:, :height, :width] = gradients.reshape(8, height, width, colours)
+    squares = filled.reshape(8, rows, square_px, columns, -1).transpose(1, 3, 0, 2, 4).reshape(rows * columns, 8, -1)
+    products = squares @ squares.transpose(0, 2, 1)
+    return products.astype(np.float64).reshape(-1, 4, 2, 4, 2).transpose(1, 3, 0, 2, 4)
