@@ -46,7 +46,7 @@ class Config(BaseModel):
     Give every field a description, bounds, and its unit in the name or the description.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 def _relative_to_spec(path: Path, info: ValidationInfo) -> Path:

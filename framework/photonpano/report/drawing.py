@@ -19,20 +19,27 @@ from numpy.typing import NDArray
 
 from photonpano import text
 from photonpano.record.batch_row import written
+from photonpano.values import FloatArray
 
 if TYPE_CHECKING:
     from jinja2 import Environment
     from matplotlib.axes import Axes
-    from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure
 
 _JPEG_QUALITY = 90
 WIDTH_IN = 10.0
-_MAX_MAP_HEIGHT_IN = 5.0
-_MIN_MAP_IN = 0.8
-BAR_IN = 1.0  # room for a colour bar to the right of a map, with its numbers and its label
-MAP_PIXELS = 1000
-_X_LABEL_IN, _Y_LABEL_IN, _BAR_LABEL_IN = 0.25, 0.55, 0.45  # distance of the labels of axes, and of colour bars, from these
+_X_LABEL_IN, _Y_LABEL_IN = 0.25, 0.55  # distance of the labels of axes from these
+_MAP_PIXELS = 500  # longer side of a map
+_ROW_SIZE = 990, 480  # maximum width and height of a row of maps, in pixels of the page
+_GAP = 40  # between the columns of the page
+# Evenly spaced colours of maps: between them values are interpolated, and a browser blends them in legends.
+_COLOURS = {
+    "inferno": "000004 210c4a 57106e 8a226a bc3754 e45a31 f98e09 f9cb35 fcffa4",
+    "magma": "000004 1d1147 51127c 832681 b73779 e75263 fc8961 fec488 fcfdbf",
+    "red-blue": "053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f",
+    "twilight": "e2d9e2 95b5c7 6276ba 592a8f 2f1436 741e4f b25652 cca389 e2d9e2",
+    "viridis": "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725",
+}
 
 # matplotlib knows no CSS variables: each of these stand-ins is replaced by one in the finished SVG.
 INK, MUTED, LINE, PAPER, BAD = "#010101", "#010102", "#010103", "#010104", "#010105"
@@ -130,63 +137,6 @@ def add_axes(
     return axes
 
 
-@contextmanager
-def map_figure(height: int, width: int, side_in: float = 0) -> Iterator[tuple[Figure, Axes]]:
-    """Open a figure with the proportions of a panorama, with `side_in` inches beside it for a colour bar."""
-    margins = Margins(left=0.6, right=0.3 + side_in, top=0.15, bottom=0.35)
-    margin_in = margins.left + margins.right
-    map_width = min(WIDTH_IN - margin_in, _MAX_MAP_HEIGHT_IN * width / height)
-    size_in = max(map_width, _MIN_MAP_IN), max(map_width * height / width, _MIN_MAP_IN)
-    with plain_figure(size_in[0] + margin_in, size_in[1] + margins.top + margins.bottom) as figure:
-        [axes] = add_axes(figure, margins)
-        _show_pixels(axes, height, width)
-        axes.locator_params(axis="x", nbins=max(2, min(9, int(map_width))))
-        axes.locator_params(axis="y", nbins=5)
-        yield figure, axes
-
-
-@contextmanager
-def maps_figure(height: int, width: int, n_maps: int) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Open a figure of 2 or 3 maps in a row, each with room for a colour bar, but the third."""
-    margins = Margins(left=0.6, right=BAR_IN if n_maps == 2 else 0.1, top=0.35, bottom=0.3)
-    gap_in = BAR_IN + 0.35
-    map_width = (WIDTH_IN - margins.left - margins.right - (n_maps - 1) * gap_in) / n_maps
-    map_height = float(np.clip(map_width * height / width, _MIN_MAP_IN, 4.0))
-    with plain_figure(WIDTH_IN, map_height + margins.top + margins.bottom) as figure:
-        maps = add_axes(figure, margins, columns=n_maps, gap_in=gap_in)
-        for axes in maps:
-            _show_pixels(axes, height, width)
-            axes.set_facecolor(LINE)
-            axes.locator_params(nbins=4)
-        yield figure, maps
-
-
-def _show_pixels(axes: Axes, height: int, width: int) -> None:
-    """Give axes the coordinates of the pixels of an image."""
-    axes.grid(visible=False)
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    axes.set_aspect("equal")
-    for ticks in (axes.xaxis, axes.yaxis):
-        ticks.set_major_formatter("{x:,.0f}")
-
-
-def add_colour_bar(axes: Axes, image: Any, label: str, numbers: str) -> Colorbar:
-    """Add the colours of an image to the right of its axes, which have `BAR_IN` inches of room there."""
-    from matplotlib.transforms import ScaledTranslation, blended_transform_factory
-
-    figure: Any = axes.get_figure(root=True)
-    right_edge: Any = axes.transAxes
-    inches = figure.dpi_scale_trans
-    beside = blended_transform_factory(inches + ScaledTranslation(1, 0, right_edge), axes.transAxes)
-    place = axes.inset_axes((0.1, 0.05, 0.16, 0.9), transform=beside)
-    bar: Colorbar = figure.colorbar(image, cax=place, format=numbers)
-    bar.outline.set_visible(False)
-    bar.set_label(label)
-    bar.ax.yaxis.set_label_coords(1, 0.5, bar.ax.transAxes + ScaledTranslation(_BAR_LABEL_IN, 0, inches))
-    return bar
-
-
 def svg_of(figure: Figure, name: str) -> str:
     """Return the SVG element, with unique identifiers and the colour variables of the page."""
     buffer = io.StringIO()
@@ -239,11 +189,6 @@ def add_time_axis(axes: Axes, n_frames: int, frame_rate_hz: float) -> None:
     time.spines["top"].set_visible(False)
 
 
-def extent_of(height: int, width: int) -> tuple[float, float, float, float]:
-    """Return the edges of an image in its own pixels, whose centres are integers."""
-    return -0.5, width - 0.5, height - 0.5, -0.5
-
-
 def shrunk(image: NDArray[Any], max_pixels: int) -> NDArray[Any]:
     """Reduce an image by averaging until its longer side has at most `max_pixels`; smaller images are not changed."""
     import cv2
@@ -271,6 +216,30 @@ def jpeg_uri(image: NDArray[np.uint8], quality: int = _JPEG_QUALITY) -> str:
     in_opencv_order = image if image.ndim == 2 else image[..., ::-1]
     _, encoded = cv2.imencode(".jpg", in_opencv_order, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+def map_of(values: NDArray[Any], colours: str, low: float, high: float) -> dict[str, Any]:
+    """Return a map as a picture in colours, transparent where it is NaN, with the range and the colours of its legend."""
+    share = shrunk(np.isfinite(values).astype(np.float32), _MAP_PIXELS)
+    small = shrunk(np.nan_to_num(values).astype(np.float32), _MAP_PIXELS) / np.maximum(share, np.float32(1e-6))
+    legend = _COLOURS[colours].split()
+    between = np.linspace(0, len(legend) - 1, 256)
+    channels = zip(*map(bytes.fromhex, legend), strict=True)
+    table = np.stack([np.interp(between, range(len(legend)), channel) for channel in channels], axis=1)
+    shades = table[np.rint(255 * np.clip((small - low) / max(high - low, 1e-12), 0, 1)).astype(np.uint8)]
+    picture = np.rint(np.dstack([shades, 255 * (share > 0)])).astype(np.uint8)
+    return {"uri": png_uri(picture), "low": low, "high": high, "colours": [f"#{colour}" for colour in legend]}
+
+
+def page_scale(shape: tuple[int, int], columns: int = 1) -> float:
+    """Return how many pixels of the page a pixel of images with this shape takes, in columns of the page."""
+    height, width = shape
+    return min(((_ROW_SIZE[0] + _GAP) / columns - _GAP) / width, _ROW_SIZE[1] / height)
+
+
+def svg_path(points: FloatArray) -> str:
+    """Return the data of an SVG path through points, (N, 2)."""
+    return "M" + " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
 
 
 def filled(template: str, package: str = "photonpano.report", /, **values: Any) -> str:

@@ -28,26 +28,24 @@ from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.report.drawing import (
     BAD,
-    BAR_IN,
     INK,
-    LINE,
-    MAP_PIXELS,
     MUTED,
     PAPER,
     SERIES,
     WIDTH_IN,
     Margins,
     add_axes,
-    add_colour_bar,
     add_time_axis,
-    extent_of,
-    map_figure,
-    maps_figure,
+    filled,
+    jpeg_uri,
+    map_of,
     mark_frames,
     mark_logarithmic,
+    page_scale,
     plain_figure,
     shrunk,
     svg_of,
+    svg_path,
 )
 from photonpano.residuals.block_sums import BLOCK_PX, M, R
 from photonpano.residuals.halves import Halves
@@ -57,8 +55,11 @@ from photonpano.values import FloatArray, FluxImage, Group, Light, SpanResiduals
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+Box = tuple[float, float, float, float]  # left, top, right, bottom
+
 MAX_INSTANTS = 1500  # maximum number of instants at which a trajectory is drawn
 
+_PATH_PIXELS = 1000  # longer side of the picture below the path
 _MAX_PARTS = 5  # maximum number of parts of a motion graph with a row of their own
 
 STAGE_NAMES = {"resample": "re-sample", "merge": "merge", "locate": "locate", "interpolate": "interpolate"}
@@ -100,19 +101,27 @@ def path_on_panorama(motion: FrameMotion, panorama: RenderedPanorama) -> str:
     instants = instants_of(len(motion.homographies))
     path = places_on(panorama, motion.homographies[instants], centre_of(motion.frame_shape))[:, 0]
     height, width = panorama.picture.shape[:2]
-    with map_figure(height, width) as (figure, axes):
-        picture = shrunk(panorama.picture, MAP_PIXELS)
-        axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent_of(height, width), alpha=0.55)
-        for index, style in ((motion.reference, "-"), (0, ":"), (-1, ":")):
-            outline = places_on(panorama, motion.homographies[index, None], outline_of(motion.frame_shape))[0]
-            axes.plot(*_cut_at_seam(np.vstack([outline, outline[:1]]), width).T, color=INK, linewidth=0.9, linestyle=style)
-        drawn = _cut_at_seam(path, width)
-        axes.plot(*drawn.T, color=PAPER, linewidth=3.5)
-        axes.plot(*drawn.T, color=SERIES[1], linewidth=1.6)
-        for point, name in ((path[0], "first"), (path[-1], "last")):
-            axes.plot(*point, "o", color=SERIES[1], markeredgecolor=PAPER, markersize=7)
-            axes.annotate(name, point, xytext=(0, 9), textcoords="offset points", ha="center", fontweight="bold")
-        return svg_of(figure, "path-on-panorama")
+    scale = page_scale((height, width))
+
+    def drawn(points: FloatArray) -> str:
+        """Return the SVG of a path, with a gap where it leaves the picture at one side and comes back at the other."""
+        points = points[np.isfinite(points).all(axis=1)]
+        jumps = 1 + np.flatnonzero(np.abs(np.diff(points[:, 0])) > width / 2)
+        return " ".join(svg_path(scale * (part + 0.5)) for part in np.split(points, jumps) if len(part))
+
+    def outline(index: int) -> str:
+        [border] = places_on(panorama, motion.homographies[index, None], outline_of(motion.frame_shape))
+        return drawn(np.vstack([border, border[:1]]))
+
+    return filled(
+        "path.html",
+        size=(scale * width, scale * height),
+        picture=jpeg_uri(shrunk(panorama.picture, _PATH_PIXELS)),
+        reference=outline(motion.reference),
+        others=[outline(0), outline(-1)],
+        path=drawn(path),
+        ends=[("first", *scale * (path[0] + 0.5)), ("last", *scale * (path[-1] + 0.5))],
+    )
 
 
 def _path(motion: FrameMotion, instants: NDArray[np.int64]) -> tuple[FloatArray, str]:
@@ -137,22 +146,23 @@ def places_on(panorama: RenderedPanorama, homographies: FloatArray, pixels: Floa
     return (places + 0.5) / panorama.reduction - 0.5
 
 
-def _cut_at_seam(path: FloatArray, width: int) -> FloatArray:
-    """Return a path, (N, 2), with a gap where it leaves the picture at one side and comes back at the other."""
-    jumps = 1 + np.flatnonzero(np.abs(np.diff(path[:, 0])) > width / 2)
-    return np.insert(path, jumps, np.nan, axis=0)
-
-
 def coverage_map(coverage: FluxImage) -> str:
     """Draw the number of frames that saw each pixel, (H, W) or (H, W, 3), in any colour; unseen pixels are grey."""
-    coverage = coverage if coverage.ndim == 2 else coverage.sum(axis=-1)
-    height, width = coverage.shape
-    with map_figure(height, width, side_in=BAR_IN) as (figure, axes):
-        axes.set_facecolor(LINE)
-        small = shrunk(np.nan_to_num(coverage), MAP_PIXELS)
-        image = axes.imshow(np.ma.masked_less_equal(small, 0), cmap="viridis", vmin=0, extent=extent_of(height, width))
-        add_colour_bar(axes, image, "frames", "{x:,.0f}")
-        return svg_of(figure, "coverage")
+    coverage = np.nan_to_num(coverage if coverage.ndim == 2 else coverage.sum(axis=-1))
+    seen = np.where(coverage > 0, coverage, np.nan)
+    return _in_row(coverage.shape, [_map("frames", seen, "viridis", (0.0, float(coverage.max())), ",.0f")])
+
+
+def _in_row(shape: tuple[int, int], maps: Sequence[dict[str, Any]], arrows: dict[str, Any] | None = None) -> str:
+    """Draw maps over images with a shape beside each other, and arrows."""
+    scale = page_scale(shape, len(maps) + (arrows is not None))
+    return filled("maps.html", shape=shape, scale=scale, maps=maps, arrows=arrows)
+
+
+def _map(label: str, values: Any, colours: str, limits: tuple[float, float], numbers: str = ".3g") -> dict[str, Any]:
+    """Return a map of an image with numbers at the ends and the middle of its legend."""
+    ticks = [(tick, format(tick, numbers)) for tick in np.linspace(*limits, 3)]
+    return {"label": label, "ticks": ticks, "box": None, **map_of(values, colours, *limits)}
 
 
 def tied_parts(groups: Sequence[Group], parts: NDArray[np.integer]) -> str:
@@ -209,15 +219,8 @@ def chi2_over_panorama(residuals: Residuals, measured: Canvas, canvas: Canvas) -
     """
     same = same_projection(measured, canvas)
     shape, onto = (canvas.shape, canvas.transform) if same else (measured.shape, measured.transform)
-    reduced_chi2, (left, top, right, bottom) = chi2_cells(residuals, measured, onto)
-    with map_figure(*shape, side_in=BAR_IN) as (figure, axes):
-        axes.set_facecolor(LINE)
-        extent = left, right, bottom, top
-        image = axes.imshow(reduced_chi2, **_chi2_colours(residuals), extent=extent, interpolation="nearest")
-        axes.set_xlim(-0.5, shape[1] - 0.5)
-        axes.set_ylim(shape[0] - 0.5, -0.5)
-        _add_colour_bar(axes, image, "reduced chi-square")
-        return svg_of(figure, "chi2-panorama")
+    cells, box = chi2_cells(residuals, measured, onto)
+    return _in_row(shape, [_chi2_map(residuals, cells, box)])
 
 
 def same_projection(one: Canvas, other: Canvas) -> bool:
@@ -225,12 +228,12 @@ def same_projection(one: Canvas, other: Canvas) -> bool:
     return one.projection == other.projection and one.horizon is other.horizon
 
 
-def chi2_cells(residuals: Residuals, measured: Canvas, onto: FloatArray) -> tuple[Any, tuple[float, float, float, float]]:
-    """Return the reduced chi-square over the panorama, masked where it was seen too briefly, and its box.
+def chi2_cells(residuals: Residuals, measured: Canvas, onto: FloatArray) -> tuple[FloatArray, Box]:
+    """Return the reduced chi-square over the panorama, NaN where it was seen too briefly, and its box.
 
     The box is left, top, right, bottom in the pixels of the canvas with the transform `onto`.
     """
-    reduced_chi2 = np.ma.masked_where(residuals.cell_count < _FEWEST_BLOCKS, np.nan_to_num(residuals.cell_chi2))
+    reduced_chi2 = np.where(residuals.cell_count < _FEWEST_BLOCKS, np.nan, np.nan_to_num(residuals.cell_chi2))
     rows, columns = reduced_chi2.shape
     edges = [[-0.5, -0.5], [columns * BLOCK_PX - 0.5, rows * BLOCK_PX - 0.5]]
     (left, top), (right, bottom) = transform_points(onto @ inverse(measured.transform), edges)
@@ -239,20 +242,21 @@ def chi2_cells(residuals: Residuals, measured: Canvas, onto: FloatArray) -> tupl
 
 def over_sensor(residuals: Residuals) -> str:
     """Draw the reduced chi-square and the brightness of the blocks of the sensor, and their shifts if these are significant."""
-    height, width = residuals.frame_shape
     shifts = significant_shifts(residuals)
-    with maps_figure(height, width, 2 if shifts is None else 3) as (figure, maps):
-        extent = extent_of(*(BLOCK_PX * n_blocks for n_blocks in residuals.block_chi2.shape))
-        reduced_chi2 = np.ma.masked_invalid(residuals.block_chi2)
-        image = maps[0].imshow(reduced_chi2, **_chi2_colours(residuals), extent=extent, interpolation="nearest")
-        _add_colour_bar(maps[0], image, "reduced chi-square")
-        gain = np.ma.masked_invalid(100 * _brightness(residuals))
-        limit = max(_GAIN_RANGE_PERCENT, float(np.abs(gain).max())) if gain.count() else _GAIN_RANGE_PERCENT
-        image = maps[1].imshow(gain, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
-        _add_colour_bar(maps[1], image, "brightness (%)", "{x:+.3g}")
-        if shifts is not None:
-            _draw_shifts(maps[2], shifts)
-        return svg_of(figure, "sensor")
+    rows, columns = residuals.block_chi2.shape
+    box = -0.5, -0.5, columns * BLOCK_PX - 0.5, rows * BLOCK_PX - 0.5
+    gain = 100 * _brightness(residuals)
+    limit = max(_GAIN_RANGE_PERCENT, float(np.nanmax(np.abs(gain), initial=0)))
+    brightness = _map("brightness (%)", gain, "red-blue", (-limit, limit), "+.3g") | {"box": box}
+    maps = [_chi2_map(residuals, residuals.block_chi2, box), brightness]
+    return _in_row(residuals.frame_shape, maps, None if shifts is None else _arrows(*shifts))
+
+
+def _arrows(places: FloatArray, shifts: FloatArray) -> dict[str, Any]:
+    """Return arrows, whose usual length is that of a block and a half."""
+    usual = float(np.quantile(np.linalg.norm(shifts, axis=1), 0.95))
+    length = 1.5 * BLOCK_PX
+    return {"length": length, "shift": usual, "ends": np.stack([places, places + length / usual * shifts], axis=1)}
 
 
 def shifts_over_time(residuals: Residuals, frame_rate_hz: float | None) -> str:
@@ -327,16 +331,16 @@ def flicker_over_panorama(light: Light | None, canvas: Canvas) -> str | None:
     small = -(-shape[0] // step), -(-shape[1] // step)
     coarse = replace(canvas, height=small[0], width=small[1], transform=rescaling(1 / step) @ canvas.transform)
     cosine, sine = amplitudes_on(light, coarse)
-    extent = -0.5, small[1] * step - 0.5, small[0] * step - 0.5, -0.5
+    box = -0.5, -0.5, small[1] * step - 0.5, small[0] * step - 0.5
     depth = np.hypot(cosine, sine)
-    with maps_figure(*shape, 2) as (figure, (left, right)):
-        image = left.imshow(depth, cmap="viridis", vmin=0, extent=extent)
-        _add_colour_bar(left, image, "flicker / mean light")
-        # Places that hardly flicker have no phase.
-        phase = np.ma.masked_where(depth < _FLICKERS * depth.max(), np.degrees(np.arctan2(-sine, cosine)))
-        image = right.imshow(phase, cmap="twilight", vmin=-180, vmax=180, extent=extent)
-        _add_colour_bar(right, image, "phase (degrees)")
-        return svg_of(figure, "flicker")
+    deepest = float(depth.max())
+    # Places that hardly flicker have no phase.
+    phase = np.where(depth < _FLICKERS * deepest, np.nan, np.degrees(np.arctan2(-sine, cosine)))
+    maps = [
+        _map("flicker / mean light", depth, "viridis", (0.0, deepest)),
+        _map("phase (degrees)", phase, "twilight", (-180.0, 180.0)),
+    ]
+    return _in_row(shape, [each | {"box": box} for each in maps])
 
 
 def spectrum_over_noise(residuals: Residuals) -> tuple[FloatArray, FloatArray]:
@@ -376,14 +380,14 @@ def significant_shifts(residuals: Residuals) -> tuple[FloatArray, FloatArray] | 
     return places, field[known]
 
 
-def _chi2_colours(residuals: Residuals) -> dict[str, Any]:
-    """Return one logarithmic scale of colours for all maps of it, as noise is near 1 and a moving thing at 100."""
-    from matplotlib.colors import LogNorm
-
+def _chi2_map(residuals: Residuals, reduced_chi2: FloatArray, box: Box) -> dict[str, Any]:
+    """Return a map in one logarithmic scale of colours for all maps of it, as noise is near 1 and a moving thing at 100."""
     drawn = np.r_[residuals.cell_chi2[residuals.cell_count >= _FEWEST_BLOCKS], residuals.block_chi2.ravel()]
     drawn = drawn[np.isfinite(drawn)]
-    high = float(np.quantile(drawn, 0.99)) if len(drawn) else 0.0
-    return {"cmap": "inferno", "norm": LogNorm(_CHI2_RANGE[0], max(_CHI2_RANGE[1], high))}
+    low, high = _CHI2_RANGE[0], max(_CHI2_RANGE[1], float(np.quantile(drawn, 0.99)) if len(drawn) else 0.0)
+    ticks = [(np.log(tick), f"{tick:g}") for tick in _REDUCED_CHI2_TICKS if low <= tick <= high]
+    colours = map_of(np.log(np.maximum(reduced_chi2, low)), "inferno", float(np.log(low)), float(np.log(high)))
+    return {"label": "reduced chi-square", "ticks": ticks, "box": box, **colours}
 
 
 def _brightness(residuals: Residuals) -> FloatArray:
@@ -397,24 +401,6 @@ def _brightness(residuals: Residuals) -> FloatArray:
 def _noise_px(found: SpanResiduals) -> FloatArray:
     """Return the standard deviation of the shifts along x and y that noise and interpolation explain: (S, 2)."""
     return np.asarray(np.sqrt(found.variances[:, :2] + SYSTEMATIC_PX**2))
-
-
-def _add_colour_bar(axes: Axes, image: Any, label: str, numbers: str = "{x:.3g}") -> None:
-    bar = add_colour_bar(axes, image, label, numbers)
-    if image.norm.vmin > 0:
-        bar.set_ticks([tick for tick in _REDUCED_CHI2_TICKS if image.norm.vmin <= tick <= image.norm.vmax])
-        bar.ax.minorticks_off()
-
-
-def _draw_shifts(axes: Axes, shifts: tuple[FloatArray, FloatArray]) -> None:
-    """Draw arrows, as long as a block for the longest, and one of a known length."""
-    places, field = shifts
-    typical = float(np.quantile(np.linalg.norm(field, axis=1), 0.95))
-    arrows = axes.quiver(
-        *places.T, *field.T, color=SERIES[1], angles="xy", scale_units="xy", scale=typical / (1.5 * BLOCK_PX), width=0.006
-    )
-    axes.quiverkey(arrows, 0.5, 1.08, typical, f"{typical:.2g} px", labelpos="E", coordinates="axes", labelcolor=INK)
-    axes.set_facecolor("none")
 
 
 def _draw_dots(axes: Axes, x: FloatArray, y: FloatArray, colour: str) -> None:
@@ -434,8 +420,7 @@ def _draw_spectrum(axes: Axes, residuals: Residuals, frame_rate_hz: float | None
         axes.set_yscale("log")
         axes.set_ylim(min(0.2, 0.8 * float(power.min())), max(10.0, 1.5 * float(power.max())))
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter("")
-        axes.tick_params(which="minor", length=0)
+        axes.minorticks_off()
     axes.xaxis.set_major_formatter("{x:,g}")
     axes.set_xlabel(label)
     axes.set_ylabel("power / noise")

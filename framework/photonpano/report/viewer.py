@@ -19,7 +19,7 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.photometry import balanced, tone_mapped
 from photonpano.record.schema import RunRecord
-from photonpano.report.drawing import jpeg_uri, png_uri, shrunk
+from photonpano.report.drawing import jpeg_uri, map_of, png_uri, shrunk
 from photonpano.report.figures import centre_of, chi2_cells, instants_of, places_on, same_projection
 from photonpano.report.preview import still_exposure
 from photonpano.residuals.refinement import Explained, distance_to_nearest
@@ -29,7 +29,6 @@ from photonpano.values import Background, FloatArray, FluxImage, FrameSpan
 LINEAR_VALUES = 1_200_000
 CODES = 4095  # codes of 12 bits, logarithmic in the flux
 DECADES = 5.0  # range of the codes, in powers of ten below the highest flux: a step is 0.28 %
-MAP_PIXELS = 500  # longer side of a map
 # Number of short sums of frames on the page; fewer in colour, where a sum takes a hundred times as long.
 GLIMPSES, COLOURED_GLIMPSES = 40, 12
 GLIMPSE_PIXELS = 240
@@ -37,7 +36,6 @@ TINT = "#ff3d9a"  # over what hides the background; its opacity, and that of its
 _OPACITY, _OUTLINE = 80, 255
 VIEW_PIXELS = 1000  # longer side of the pictures of one instant
 _INSTANTS = 600  # number of frames whose outline is on the page
-_COLOURS = 6  # colours of a legend, between which a browser blends
 
 
 def viewer_data(
@@ -118,26 +116,16 @@ def _chi2_map(explained: Explained, canvas: Canvas) -> list[dict[str, Any]]:
         return []
     reduced_chi2, (left, top, right, bottom) = chi2_cells(explained.residuals, explained.canvas, canvas.transform)
     box = [round(float(side) + 0.5, 2) for side in (left, top, right, bottom)]
-    return [_map("Reduced chi-square", reduced_chi2.filled(np.nan), "(1 is photon noise)", box=box, colours="inferno")]
+    return [_map("Reduced chi-square", reduced_chi2, "(1 is photon noise)", box=box, colours="inferno")]
 
 
 def _map(
     name: str, values: FloatArray | FluxImage, unit: str, *, box: Sequence[float], colours: str, low: float | None = None
 ) -> dict[str, Any]:
     """Return a map as a picture in colours, transparent where it is NaN, with its legend."""
-    from matplotlib import colormaps
-    from matplotlib.colors import rgb2hex
-
     known = values[np.isfinite(values)]
     first, last = (float(each) for each in np.quantile(known, (0.01, 0.99))) if known.size else (0.0, 1.0)
-    first = first if low is None else low
-    share = shrunk(np.isfinite(values).astype(np.float32), MAP_PIXELS)
-    small = shrunk(np.nan_to_num(values).astype(np.float32), MAP_PIXELS) / np.maximum(share, np.float32(1e-6))
-    table = colormaps[colours]
-    shades = np.rint(255 * table(np.clip((small - first) / max(last - first, 1e-12), 0, 1))).astype(np.uint8)
-    shades[..., 3] = np.where(share > 0, 255, 0)
-    legend = [rgb2hex(table(each)) for each in np.linspace(0, 1, _COLOURS)]
-    return {"name": name, "uri": png_uri(shades), "low": first, "high": last, "unit": unit, "box": list(box), "colours": legend}
+    return {"name": name, "unit": unit, "box": list(box), **map_of(values, colours, first if low is None else low, last)}
 
 
 def path_data(motion: FrameMotion, panorama: RenderedPanorama) -> dict[str, Any]:

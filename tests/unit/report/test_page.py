@@ -71,8 +71,8 @@ def test_page_is_self_contained_and_deterministic(record, explained, panorama):
     assert page == render_report(record, explained, panorama)
     check_self_contained(page)
     assert "http" not in page
-    assert page.count("data:image/jpeg") == 1
-    assert page.count("<svg") == 7
+    assert page.count("data:image/jpeg") == 2
+    assert page.count("<svg") == 8
 
 
 def test_page_shows_facts_warnings_and_failures(text, panorama):
@@ -206,7 +206,7 @@ def test_page_says_verdict_in_words(record, text):
 def test_report_imports_no_library_before_it_draws_and_never_pyplot():
     code = (
         "import sys, photonpano.report; print(sorted(sys.modules)); "
-        "from photonpano.report.figures import coverage_map as draw; import numpy; draw(numpy.ones((9, 9))); "
+        "from photonpano.report.drawing import plain_figure as drawn, svg_of\nwith drawn(1, 1) as figure: svg_of(figure, '')\n"
         "print(sorted(sys.modules))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
