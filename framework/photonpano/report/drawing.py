@@ -225,9 +225,9 @@ def map_of(values: NDArray[Any], colours: str, low: float, high: float) -> dict[
     legend = _COLOURS[colours].split()
     between = np.linspace(0, len(legend) - 1, 256)
     channels = zip(*map(bytes.fromhex, legend), strict=True)
-    table = np.stack([np.interp(between, range(len(legend)), channel) for channel in channels], axis=1)
+    table = np.rint([np.interp(between, range(len(legend)), channel) for channel in channels]).astype(np.uint8).T
     shades = table[np.rint(255 * np.clip((small - low) / max(high - low, 1e-12), 0, 1)).astype(np.uint8)]
-    picture = np.rint(np.dstack([shades, 255 * (share > 0)])).astype(np.uint8)
+    picture = np.dstack([shades, np.where(share > 0, 255, 0).astype(np.uint8)])
     return {"uri": png_uri(picture), "low": low, "high": high, "colours": [f"#{colour}" for colour in legend]}
 
 

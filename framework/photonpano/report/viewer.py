@@ -81,7 +81,7 @@ def linear_data(flux: FluxImage, white: float) -> dict[str, Any]:
     with np.errstate(invalid="ignore", divide="ignore"):
         place = np.log(np.maximum(flux, low) / low) / np.log(high / low)
     codes = np.where(seen, 1 + np.rint((CODES - 1) * np.nan_to_num(place)), 0).astype(np.uint16).ravel()
-    packed = zlib.compress((codes >> 8).astype(np.uint8).tobytes() + (codes & 255).astype(np.uint8).tobytes(), 9)
+    packed = zlib.compress((codes >> 8).astype(np.uint8).tobytes() + (codes & 255).astype(np.uint8).tobytes())
     return {
         "width": flux.shape[1],
         "height": flux.shape[0],
