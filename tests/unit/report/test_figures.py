@@ -1,14 +1,17 @@
 """The figures of a page, and their pictures."""
 
+import base64
 import re
 from dataclasses import replace
 from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 import pytest
 
-from photonpano.geometry import Camera, rotation_matrices, translation
+from photonpano.geometry import Camera, Canvas, rotation_matrices, translation
 from photonpano.report import figures
+from photonpano.values import Light
 
 
 @pytest.fixture
@@ -69,3 +72,23 @@ def test_path_of_full_turn_is_in_degrees_from_the_reference_frame(motion):
     path, unit = figures._path(turning, np.arange(len(yaws)))
     assert unit == "degrees"
     np.testing.assert_allclose(path[:, 0], np.degrees(yaws), atol=1e-6)
+
+
+@pytest.mark.parametrize("depth", [0.4, 0.0])
+def test_maps_show_where_lamps_flicker(depth):
+    """Lamps light the left half of the scene; in the dark half there is no phase."""
+    maps = np.zeros((2, 20, 40), np.float32)
+    maps[0, :, :20] = depth
+    light = Light(np.ones(8), np.ones((2, 8)), maps, np.eye(3), 0.1, np.zeros(8))
+    svg = figures.flicker_over_panorama(light, Canvas(20, 40, np.eye(3)))
+    flicker, phase = (
+        cv2.imdecode(np.frombuffer(base64.b64decode(each), np.uint8), cv2.IMREAD_UNCHANGED).astype(float)
+        for each in re.findall(r'data:image/png;base64,([^"]*)"', svg)
+    )
+    assert (flicker[..., 3] == 255).all()
+    assert (np.ptp(flicker[:, :19], axis=(0, 1)) == 0).all()
+    assert np.array_equal(flicker[5, 5], flicker[5, 35]) == (depth == 0)
+    if depth:
+        assert (phase[:, :19, 3] == 255).all()
+        assert (phase[:, 21:, 3] == 0).all()
+        assert f">{depth:g}</span>" in svg
