@@ -161,7 +161,8 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
     fits: dict[MotionModel, _Fit] = {}
     # No plane holds all frames of a camera that turns far.
     with suppress(ValueError, np.linalg.LinAlgError, RuntimeError), np.errstate(all="ignore"):
-        if model.kind == "auto" and _in_front((free := _planar(tied, start, "homography")).homographies, tied.frame_shape):
+        free = _planar(tied, start, "homography") if model.kind == "auto" else None
+        if free is not None and _in_front(free.homographies, tied.frame_shape):
             assert isinstance(free.adjustment, PlanarAdjustment)
             # Where all that is left of homographies is that perspective follows the shift, they are rotations.
             still = free.adjustment.is_coupled and not free.adjustment.walks_px
@@ -182,8 +183,10 @@ def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[M
 
 def _chosen(fits: dict[MotionModel, _Fit], tied: _Tied) -> MotionModel:
     """Return the likeliest model, whose fit has converged; that of others, which a few steps do not make likelier, need not."""
-    while (start := fits[chosen := _likeliest(fits, tied.frame_shape)].start) is not None:
-        fits[chosen] = tied.fit(fits[chosen].adjustment, start)
+    chosen = _likeliest(fits, tied.frame_shape)
+    while fits[chosen].start is not None:
+        fits[chosen] = tied.fit(fits[chosen].adjustment, fits[chosen].start)
+        chosen = _likeliest(fits, tied.frame_shape)
     return chosen
 
 
@@ -455,7 +458,7 @@ class _Tied:
     def fit(self, adjustment: Adjustment[Any], state: Any, *, learns: bool = True) -> _Fit:
         """Solve from a start; drop outliers, unless the graph would fall apart, and solve again.
 
-        One that does not learn has the variances of its prior already.
+        One that does not learn keeps the variances of its prior, and drops nothing: it is on the way to another.
         """
         kept = np.ones(len(self.motions), dtype=bool)
         found, norms = adjustment.minimise(state, kept)
@@ -470,7 +473,7 @@ class _Tied:
         return _Fit(adjustment, found, norms, kept)
 
     def stepped(self, model: MotionModel, fit: _Fit) -> _Fit:
-        """Return the fit of a model after a few steps from that of a narrower one, of which another is known to be near."""
+        """Return the fit of a model after a few steps from that of a narrower one."""
         adjustment = self.adjustment(model)
         state, norms = adjustment.minimise(fit.state, fit.kept, fit.weights, iterations=_TRIED)
         return _Fit(adjustment, state, norms, fit.kept, fit.state)

@@ -222,7 +222,7 @@ def _by_patches(motions: Sequence[Located], weights: FloatArray, tolerance_px: f
     weighted = (information @ by_points.reshape(*shown.shape, 2, 8)).reshape(by_points.shape)
     normal = np.swapaxes(by_points, 1, 2) @ weighted
     normal += _DAMPING * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(8)
-    few = (weights * shown).sum(axis=1) < _FEWEST
+    few = (weights * shown).sum(axis=1) < _FEWEST  # such pairs keep their homographies
     normal[few] = np.eye(8)
     steps = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ shifts.reshape(len(shifts), -1, 1))[..., 0]
     homographies = observed + np.einsum("ei,ijk->ejk", steps, moves) @ observed

@@ -172,12 +172,9 @@ class PlanarAdjustment(Adjustment[Plane]):
         self.variances = _FIRST**2 / self._durations
         self._of_coupling = np.inf  # variance of the estimated coupling
 
-    def of(self, problem: Problem) -> PlanarAdjustment:
-        """Return the same for other pairs."""
-        return self._like(problem, self._model)
-
-    def _like(self, problem: Problem, model: PlanarName) -> PlanarAdjustment:
-        found = PlanarAdjustment(problem, model)
+    def of(self, problem: Problem, model: PlanarName | None = None) -> PlanarAdjustment:
+        """Return the same for other pairs, or for a narrower model, with the variances of these walks."""
+        found = PlanarAdjustment(problem, model or self._model)
         found.variances, found._noise_norm = self.variances[: found._n_walks + found._n_shared], self._noise_norm
         return found
 
@@ -331,7 +328,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         model = next(name for name in PLANAR_NAMES[1:] if len(_MOVED[name]) - _FREE >= min(most, len(_WALKS)))
         if len(_MOVED[model]) >= self._n_node:
             return self, state
-        return self._like(self._problem, model), Plane(nearest(model, state.homographies, self._frame_shape))
+        return self.of(self._problem, model), Plane(nearest(model, state.homographies, self._frame_shape))
 
     @property
     def is_coupled(self) -> bool:

@@ -115,9 +115,10 @@ def tried(state: State, propose: Pass) -> Trial:
 
 
 def through_found_lens(state: State) -> Proposal | None:
-    """Run the last level again with the lens that it found, if that matters beside the one through which it saw the frames.
+    """Run the last level again with the lens that it found, if that differs from the one through which it saw the frames.
 
-    Homographies between frames with a lens are not exact: pairs are off by pixels.
+    Homographies between frames with a lens are not exact: pairs are off by pixels. Lenses that differ by less than the expected
+    error of the motion move it by no more than that.
     """
     found, result = camera_of_motion(state.trajectory), state.results[-1]
     if found is None:

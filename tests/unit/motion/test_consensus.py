@@ -44,3 +44,20 @@ def test_patches_of_another_motion_do_not_count() -> None:
     """A third of the patches that lie 1 px further move the middle by a hundredth of that."""
     found = _agreeing(_pair(0.05, wrong=3))
     assert np.abs(transform_points(found.homography, np.array([[79.5, 59.5]])) - [79.5, 59.5]).max() < 0.02
+
+
+def test_pairs_among_others_are_as_they_are_alone() -> None:
+    """One has no patches, and one so few that agree that it says next to nothing."""
+    lost = _pair(0.05, wrong=1)
+    pairs = [_pair(0.05), Located(translation(3, 0), np.eye(8)), lost, _pair(0.3, wrong=3, seed=2)]
+    shifts = np.array([np.zeros_like(lost.patches.shifts) if each.patches is None else each.patches.shifts for each in pairs])
+    shifts[2] += 10
+    found = agreeing(pairs, shifts, 0.5, SHAPE)
+    for index, pair in enumerate(pairs):
+        [alone] = agreeing([pair], shifts[index, None], 0.5, SHAPE)
+        np.testing.assert_allclose(found[index].homography, alone.homography, atol=1e-9)
+        np.testing.assert_allclose(found[index].information, alone.information, rtol=1e-6)
+    assert found[1] is pairs[1]
+    np.testing.assert_array_equal(found[2].homography, lost.homography)
+    assert np.trace(found[2].information) < 1e-3 * np.trace(lost.information)
+    assert not np.array_equal(found[3].homography, pairs[3].homography)
