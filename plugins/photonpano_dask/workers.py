@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from concurrent.futures import CancelledError, Future
 from contextlib import ExitStack
 from typing import Any
 
@@ -66,6 +67,29 @@ class DaskExecutor(ClientExecutor):  # type: ignore[misc]  # distributed has no 
         # Tasks are not pure: a key that is computed from large arguments takes time, and none is submitted twice.
         super().__init__(client, pure=False)
         self.under_way, self._ending = under_way, ending
+
+    def _wrap_future(self, remote: Any) -> Future[Any]:
+        # Not the method of distributed, which asks for the state of a task once it has the result: that is an error, or
+        # never ends, if the worker was lost in between.
+        here: Future[Any] = Future()
+        here.add_done_callback(lambda done: remote.cancel() if done.cancelled() else None)
+
+        async def hand_over() -> None:
+            try:
+                result, error = await remote._result(), None
+            except CancelledError:
+                here.cancel()
+            except Exception as caught:
+                result, error = None, caught
+            if not here.set_running_or_notify_cancel():
+                return
+            if error is None:
+                here.set_result(result)
+            else:
+                here.set_exception(error)
+
+        self._client.loop.add_callback(hand_over)
+        return here
 
     def shutdown(self, *_: Any, **__: Any) -> None:
         """Cancel what is under way, and end the processes that were started."""

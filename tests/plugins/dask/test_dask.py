@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -89,6 +92,31 @@ def test_same_bytes_and_decisions_as_on_threads_though_workers_are_killed(spec: 
     # Once for each of the two levels, which are merged along different motions.
     assert [each["what"] for each in here.record["decisions"]].count("chunk_frames") == 2
     assert not worker_pids()
+
+
+class Lost:
+    """A task whose worker was lost just after its result was gathered, so that it is no longer finished."""
+
+    status = "pending"
+
+    def __init__(self, result: Any) -> None:
+        self._answer = result
+
+    async def _result(self, raiseit: bool = True) -> Any:
+        if raiseit and isinstance(self._answer, BaseException):
+            raise self._answer
+        return self._answer
+
+    def cancel(self) -> None:
+        self.status = "cancelled"
+
+
+def test_result_counts_though_its_worker_is_lost_meanwhile() -> None:
+    client = SimpleNamespace(loop=SimpleNamespace(add_callback=lambda call: asyncio.run(call())))
+    executor = workers.DaskExecutor(client, 1, ExitStack())
+    assert executor._wrap_future(Lost(3)).result(timeout=0) == 3
+    assert isinstance(executor._wrap_future(Lost(ValueError("no"))).exception(timeout=0), ValueError)
+    assert executor._wrap_future(Lost(CancelledError())).cancelled()
 
 
 def test_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
