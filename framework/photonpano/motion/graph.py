@@ -45,6 +45,7 @@ _CONTRADICTED = 0.005
 _HELD = 3.0  # expected errors by which k1 may differ from what is given, to be held while the focal length is free
 _FEWEST_NODES = 12  # of which pairs tell what is the background over time
 _TRIED = 2  # steps towards a lens that show whether it is likelier: its numbers grow with the focal length
+_CLEAR = 6.0  # deviance by which one model is likelier than another beyond doubt, a ratio of likelihoods of 20
 _LEARNT = 3  # times that the variances of the prior are estimated, each along the motion by those before
 
 
@@ -253,13 +254,18 @@ def _agreed(tied: _Tied, model: MotionModel, fit: _Fit) -> _Agreed | None:
 
 
 def _likeliest(fits: Mapping[MotionModel, _Fit], frame_shape: tuple[int, int]) -> MotionModel:
-    """Return the likeliest model; a lens that is not asked for must move pixels enough to matter, and not fold the frame."""
+    """Return the likeliest model; a lens that is not asked for must move pixels enough to matter, and not fold the frame.
+
+    Before the last level, it must be clear, too: the next level sees frames through it, and would run again without it.
+    """
     deviances = _deviances(fits)
     if any(model.kind == "rotation" and not model.finds_lens for model in fits):
         for model in [each for each in fits if each.finds_lens]:
             camera: Camera = fits[model].state.camera
             if not lenses_apart_px(camera, Camera(camera.matrix), frame_shape) >= SAME_LENS_PX:
                 del deviances[model]
+            elif model.rough:
+                deviances[model] += _CLEAR
     return min(deviances, key=deviances.__getitem__)
 
 
