@@ -11,7 +11,7 @@ from photonpano.geometry import corners, inverse, transform_points
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
-from photonpano.residuals.causes import TestedRun, changing_places, distorting_lens
+from photonpano.residuals.causes import TestedRun, changing_places
 from photonpano.residuals.findings import Doubt, Findings
 from photonpano.residuals.refinement import Explained
 from photonpano.residuals.verdict import MUCH, of_either_part, second_place_px
@@ -37,7 +37,7 @@ def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, 
     last = state.results[-1]
     freer_px = last.located.rivals["homography"].apart_px if last.narrow else 0.0
     explained = _apart(explained, np.full(n_frames, np.linalg.norm([jumps_px, second_place_px(run), freer_px])))
-    if (lens := distorting_lens(explained)) is not None:
+    if (lens := explained.lens) is not None:
         frames = np.linspace(located[0], located[-1], len(lens.bend_px))
         explained = _apart(explained, np.interp(np.arange(n_frames), frames, abs(lens.k1) * lens.bend_px))
     beside, rival = _beside_rival(state, explained)

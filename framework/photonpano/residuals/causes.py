@@ -12,7 +12,7 @@ from photonpano.motion.loop import LevelResult
 from photonpano.residuals.block_sums import BLOCK_PX, M, R, V
 from photonpano.residuals.findings import Findings
 from photonpano.residuals.measure import FEWEST_FRAMES, Residuals
-from photonpano.residuals.patterns import LensDistortion, deformation_px, lens_distortion
+from photonpano.residuals.patterns import deformation_px
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
 from photonpano.values import BoolArray
 from photonpano.values.verdict import Found, Test
@@ -165,15 +165,6 @@ def _hot_pixels(run: TestedRun) -> Found:
     excess = np.abs(run.explained.residuals.pixel_gain - 1) * predicted
     outlier = known & (excess > _STANDARD_DEVIATIONS * np.sqrt(predicted) + 5) & (excess > 0.5 * predicted)
     return Found(float(outlier.sum() / max(known.sum(), 1)), f"{int(outlier.sum())} pixels")
-
-
-def distorting_lens(explained: Explained) -> LensDistortion | None:
-    """Return the distortion that the residuals of a run show; None if it is not significant."""
-    residuals, motion = explained.residuals, explained.motion
-    found = lens_distortion(*residuals.block_shifts(), motion.homographies[motion.located], residuals.frame_shape)
-    # What else is not explained, such as a tremor, moves blocks by more than photon noise.
-    misfit = max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
-    return None if found is None or found.sigmas <= 5 * misfit else found
 
 
 @CAUSES.doubtful_above(

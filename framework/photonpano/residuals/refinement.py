@@ -22,6 +22,7 @@ from photonpano.merging.panorama import BYTES_PER_PIXEL, plan_canvas, render
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.residuals.halves import Halves, halves_of
 from photonpano.residuals.measure import Lasting, Residuals, lasting_of, measure, noise_hides_shifts
+from photonpano.residuals.patterns import LensDistortion, lens_distortion
 from photonpano.residuals.prediction import Predictions
 from photonpano.values import FloatArray, Panorama
 
@@ -153,6 +154,7 @@ class Explained:
     ratio: float  # see `residual_ratio`
     halves: Halves  # how well the frames before and after cuts agree
     refinements: tuple[Refinement, ...]  # what each refiner did
+    lens: LensDistortion | None = None  # that the residuals show; None if it is not significant
     lasting: Lasting | None = None  # what brief spans have in common, where photon noise hides the shift of longer ones
 
 
@@ -228,6 +230,7 @@ class MotionFit:
             ratio=self.ratio,
             halves=halves,
             refinements=tuple(refinements),
+            lens=self._lens(),
             lasting=lasting,
         )
 
@@ -241,6 +244,13 @@ class MotionFit:
         fit.motion, fit.residuals = motion, self.residuals.moved(steps - steps.mean(axis=0))
         fit.ratio = residual_ratio(fit.residuals)
         return fit
+
+    def _lens(self) -> LensDistortion | None:
+        shown = self.motion.homographies[self.motion.located], self.residuals.frame_shape
+        found = lens_distortion(*self.residuals.block_shifts(), *shown)
+        # What else is not explained, such as a tremor, moves blocks by more than photon noise.
+        misfit = max(1.0, float(self.residuals.reduced_chi2.mean())) ** 0.5
+        return None if found is None or found.sigmas <= 5 * misfit else found
 
     def _lasting(self) -> Lasting:
         return lasting_of(self.residuals, self.predictions, self._context)

@@ -15,7 +15,7 @@ from scipy import ndimage
 from photonpano.geometry import corners, transform_points
 from photonpano.motion.loop import TOO_NARROW, LevelResult
 from photonpano.residuals.block_sums import M, V
-from photonpano.residuals.causes import CAUSES, FIND_LENS, FREE, TestedRun, Tests, changing_places, distorting_lens
+from photonpano.residuals.causes import CAUSES, FIND_LENS, FREE, TestedRun, Tests, changing_places
 from photonpano.residuals.findings import NOTHING, Findings
 from photonpano.residuals.measure import FEWEST_FRAMES
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
@@ -112,7 +112,7 @@ def _narrow(run: TestedRun) -> Found | None:
     f"write motion: {{model: rotation}} and {FIND_LENS} for a camera that only turns; or {_WITHOUT_LENS}",
 )
 def _lens(run: TestedRun) -> Found | None:
-    found = distorting_lens(run.explained)
+    found = run.explained.lens
     if found is None:
         return None
     camera, what_to_do = run.explained.motion.camera, run.freer_model

@@ -277,12 +277,10 @@ WITHOUT_LENS = "or undistort the frames before, or use their middle only (correc
     ],
     ids=["homographies", "rotations", "rotations through a lens that was found"],
 )
-def test_advice_is_not_what_the_run_does_already(
-    explained: Explained, monkeypatch: pytest.MonkeyPatch, camera: Camera | None, lens: str, turn: str
-) -> None:
-    monkeypatch.setattr("photonpano.residuals.verdict.distorting_lens", lambda _: LensDistortion(-0.1, 0.005, np.zeros((1, 2))))
+def test_advice_is_not_what_the_run_does_already(explained: Explained, camera: Camera | None, lens: str, turn: str) -> None:
     rivals = {"homography": Rival(1.0, 232, 0.0, 9.0), "rotation": Rival(25.0, 88, 3.0)}
-    run = replace(explained, motion=replace(explained.motion, camera=camera))
+    bent = LensDistortion(-0.1, 0.005, np.zeros((1, 2)))
+    run = replace(explained, motion=replace(explained.motion, camera=camera), lens=bent)
     found = {reason.what: reason.what_to_do for reason in judge(run, [level_with(object(), rivals)]).reasons}
     assert found == {"the lens distorts the frames, which bends the motion": lens, NARROW: turn}
 
