@@ -210,7 +210,7 @@ def _descend(  # noqa: PLR0913, PLR0917
             return _FLAT, homography, pixels, squares, weights
         if not hessian_is_current:
             floor = min(0.5, _MIN_CURVATURE * chance_level(pixels, moving.blur_px))
-            own, hessian = curvatures(moving, buffers, 0.0, floor)
+            own, hessian, _ = curvatures(moving, buffers, 0.0, floor)
             for i in range(8):
                 for j in range(8):
                     hessian[i, j] += PRIOR[i, j]

@@ -366,8 +366,8 @@ def chance_level(pixels: int, blur_px: float) -> float:
 
 
 @compiled
-def curvatures(moving: Layer, buffers: Buffers, chance: float, floor: float) -> tuple[FloatArray, FloatArray]:
-    """Return the (8, 8) Gauss-Newton Hessian of the template, and the part that both images have in common.
+def curvatures(moving: Layer, buffers: Buffers, chance: float, floor: float) -> tuple[FloatArray, FloatArray, float]:
+    """Return the (8, 8) Gauss-Newton Hessian of the template, the part that both images have in common, and its mean share.
 
     The noise of the template has derivatives too, larger in the dark than those of the scene. The two images have only the
     scene in common. The common curvature of noise by `chance` is subtracted, and eigenvalues stay above `floor`, both relative
@@ -379,7 +379,7 @@ def curvatures(moving: Layer, buffers: Buffers, chance: float, floor: float) -> 
     # Whitened by the template's Hessian, so that all parameters have the same scale.
     root = np.zeros((8, 8))
     if not _cholesky(own, root):
-        return own, own.copy()
+        return own, own.copy(), 1.0
     _solve_lower(root, difference)
     whitened = transposed(difference)
     _solve_lower(root, whitened)
@@ -387,10 +387,13 @@ def curvatures(moving: Layer, buffers: Buffers, chance: float, floor: float) -> 
         whitened[i, i] += 1
     values, vectors = np.linalg.eigh(whitened)
     half = product(root, transposed(vectors.T))  # in C order, for which `product` is compiled
-    for i in range(8):
-        for j in range(8):
-            half[i, j] *= np.sqrt(max(values[j] - chance, floor))
-    return own, product(half, transposed(half))
+    common = 0.0
+    for j in range(8):
+        share = max(values[j] - chance, floor)
+        common += share / 8
+        for i in range(8):
+            half[i, j] *= np.sqrt(share)
+    return own, product(half, transposed(half)), common
 
 
 @compiled
@@ -441,7 +444,7 @@ def information_of(
     buffers come from `residuals_and_moments`, and all are overwritten. `noise_ratio` is the mean squared residual relative to
     that of photon noise.
     """
-    own, hessian = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
+    _, hessian, common = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
     # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights and positions
     # hardly change within the blur, so M needs only blurred gradients.
     np.multiply(buffers.weight, buffers.weight, out=buffers.weight)
@@ -449,8 +452,6 @@ def information_of(
     scatter, root = _hessian(moving.smoothed, moving.smoothed, buffers.weight), np.zeros((8, 8))
     if not _cholesky(scatter, root):
         return PRIOR.copy(), np.inf, 0.0
-    # Few rows that overlap show nothing of some directions.
-    common = float(np.trace(np.linalg.pinv(own, hermitian=True) @ hessian)) / 8
     _solve_lower(root, hessian)
     information = hessian.T @ hessian / max(1.0, noise_ratio) + PRIOR
     std_px = expected_px(information, np.eye(8), coordinates.to_corners)
