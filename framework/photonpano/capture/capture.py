@@ -233,9 +233,10 @@ class Capture(Closing):
     def colours(self) -> Mapping[str, Capture]:
         """Return a capture for each colour, see `Colours`; none for a grey capture."""
         parts = {} if self.colour is None else self.colour.parts
-        seen = {"info": self.info, "first": self.first, "light": self.light, "camera": self.camera}
-        seen |= {"masks": self.masks, "background": self.background, "copies": self.copies}
-        return {name: replace(part, **seen) for name, part in parts.items()}  # type: ignore[arg-type]  # mixed values
+        seen: dict[str, Any] = {"info": self.info, "first": self.first, "camera": self.camera, "masks": self.masks}
+        seen |= {"background": self.background, "copies": self.copies}
+        lights = [self.light and self.light.of_colour(index) for index in range(len(parts))]
+        return {name: replace(part, light=light, **seen) for (name, part), light in zip(parts.items(), lights, strict=True)}
 
     def clear_mix(self) -> FloatArray:
         """Return the flux of a clear pixel, as factors of the flux of red, green and blue ones, whose sum it is: (3,)."""

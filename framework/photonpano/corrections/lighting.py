@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 from scipy.interpolate import UnivariateSpline
 
-from photonpano.capture import in_light
+from photonpano.capture import capture_of, in_light
 from photonpano.contracts.protocols import Source, Trajectory, light_of
 from photonpano.corrections.gains import (
     SMOOTHING,
@@ -42,9 +42,20 @@ _FEWEST_PERIODS, _FEWEST_SPANS = 2.5, 32  # of the capture, for a flicker to be 
 _FINER = 16  # oversampling of frequency: steps per 1/T, for a capture of the duration T
 _LINE_SHARE = 0.6  # least share of the changes of the light, without a slow curve, that a flicker explains
 _SMALLEST = 0.01  # least root mean square of a flicker, relative to the light
+_BRIGHTEST = 0.9  # quantile of the gain from which on frames are in the brightest light
 _DARKEST = 0.02  # least gain of spans from which slow changes are fitted
 LIGHT_FILE = "light.npz"
-_ARRAYS = ("gain", "waves", "maps", "to_map", "frequency", "std", "camera_matrix")  # the last one if there is one
+_ARRAYS = (
+    "gain",
+    "waves",
+    "maps",
+    "to_map",
+    "frequency",
+    "std",
+    "camera_matrix",
+    "tints",
+    "std_tints",
+)  # the last ones if they are there
 _FLAT_SPANS, _FLAT_SPAN_PX = 128, 4.0  # most spans of frames that are compared; the image moves by no more than this in each
 _KNOTS_ACROSS = 12  # knots of the gain along the shorter side of a frame; between them, its logarithm is bilinear
 _LENGTH = 0.5  # distance over which knots are correlated, relative to the shorter side of a frame
@@ -63,8 +74,12 @@ def find_light(source: Source, trajectory: Trajectory, context: Context) -> Ligh
     """Measure the light of a capture along its motion, known to a few pixels; None if it is steady."""
     n_frames = source.info.n_frames
     longest = max(1, min(_PROBE_FRAMES, int(_SPAN_PX / max(speed_px(source, trajectory), 1e-9)), n_frames // _PROBES))
-    gains = _gains(source, trajectory, _spread(n_frames, longest), context)
-    return measure_light(source, trajectory, context) if changes(gains) or local_flicker(gains) is not None else None
+    spans = _spread(n_frames, longest)
+    gains = _gains(source, trajectory, spans, context)
+    if changes(gains) or local_flicker(gains) is not None:
+        return measure_light(source, trajectory, context)
+    coloured = any(changes(_gains(each, trajectory, spans, context)) for each in capture_of(source).colours().values())
+    return measure_light(source, trajectory, context) if coloured else None
 
 
 def changes(gains: Gains) -> bool:
@@ -82,13 +97,38 @@ def _measured(source: Source, trajectory: Trajectory, context: Context) -> Light
     n_frames = source.info.n_frames
     length = min(n_frames, max(_FEWEST_FRAMES, -(-n_frames // _MOST_SPANS)))
     bounds = np.linspace(0, n_frames, max(1, n_frames // length) + 1).astype(int).tolist()
-    gains = _gains(source, trajectory, [FrameSpan(*pair) for pair in pairwise(bounds)], context)
+    spans = [FrameSpan(*pair) for pair in pairwise(bounds)]
+    gains = _gains(source, trajectory, spans, context)
     if (flicker := local_flicker(gains)) is not None:
-        return _light_of(flicker, gains, n_frames)
+        light = _light_of(flicker, gains, n_frames)
+    else:
+        gain, std, frequency = _of_frames(gains, gains.gain, n_frames)
+        mean = float(gain.mean())
+        light = Light.of_frames(gain / mean, frequency, std / mean)
+    of_colours = [_gains(each, trajectory, spans, context) for each in capture_of(source).colours().values()]
+    return _tinted(light, of_colours) if of_colours else light
+
+
+def _tinted(light: Light, of_colours: Sequence[Gains]) -> Light:
+    """Return light in which each colour has a gain of its own, as where a lamp of one colour goes out.
+
+    The colours of the panorama are those in the brightest light, in which most lamps are on.
+    """
+    n_frames, tints, std_tints = len(light.gain), [], []
+    brightest = light.gain >= np.quantile(light.gain, _BRIGHTEST) - LEAST_CHANGE
+    for gains in of_colours:
+        of_all = np.array([light.mean(span) for span in gains.seen.spans])
+        tint, std, _ = _of_frames(gains, gains.gain / np.maximum(of_all, _DARKEST), n_frames)
+        full = float(tint[brightest].mean())
+        tints.append(tint / full)
+        std_tints.append(std / full)
+    return replace(light, tints=np.array(tints), std_tints=np.array(std_tints))
+
+
+def _of_frames(gains: Gains, of_spans: FloatArray, n_frames: int) -> tuple[FloatArray, FloatArray, float]:
+    """Return what `gain_of_frames` does of the gains of spans."""
     lengths = np.array([len(span) for span in gains.seen.spans], float)
-    gain, std, frequency = gain_of_frames(gains.seen.instants, gains.gain, gains.std, lengths, n_frames)
-    mean = float(gain.mean())
-    return Light.of_frames(gain / mean, frequency, std / mean)
+    return gain_of_frames(gains.seen.instants, of_spans, gains.std, lengths, n_frames)
 
 
 def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray, std: FloatArray) -> Light:
@@ -109,7 +149,8 @@ def corrected_light(light: Light, spans: Sequence[FrameSpan], change: FloatArray
     if bool(frequency) != bool(light.frequency):
         return light
     mean = float(found.mean())
-    return Light.of_frames(found / mean, frequency, noise / mean).leaving_out(light.shown)
+    corrected = Light.of_frames(found / mean, frequency, noise / mean).leaving_out(light.shown)
+    return replace(corrected, tints=light.tints, std_tints=light.std_tints)
 
 
 def _light_of(flicker: LocalFlicker, gains: Gains, n_frames: int) -> Light:
@@ -132,9 +173,11 @@ def _light_of(flicker: LocalFlicker, gains: Gains, n_frames: int) -> Light:
 
 def decision_of(light: Light, frame_rate_hz: float | None) -> Decision:
     """Return what was found, for the record: the depth of the changes, and the frequency of a flicker."""
-    low, high = (float(np.quantile(light.gain[light.shown], each)) for each in (0.01, 0.99))
+    gains = light.gain * (1 if light.tints is None else light.tints)
+    low, high = (float(np.quantile(gains[..., light.shown], each)) for each in (0.01, 0.99))
     depth = (high - low) / (high + low)
-    where = f"the light of the scene changes between {low:.2f} and {high:.2f} of its mean"
+    of = "scene" if light.tints is None else "scene, in each colour by itself,"
+    where = f"the light of the {of} changes between {low:.2f} and {high:.2f} of its mean"
     if light.has_lamps:
         depth = float(np.quantile(np.hypot(*light.maps), 0.9))
         where = f"lamps over parts of the scene, each at its own phase, flicker by up to {depth:.2f} of the mean light"

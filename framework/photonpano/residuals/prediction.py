@@ -190,7 +190,7 @@ class Predictions:
                 each.response,
                 trajectory=trajectory,
                 frame_shape=frame_shape,
-                light=capture.light,
+                light=each.light,
                 camera=capture.camera,
             )
 

@@ -231,6 +231,10 @@ class Light:
     std: FloatArray  # (T,) standard deviation of `gain` by photon noise; infinite for frames that are left out, whose gain is 0
     # (3, 3) of the reference camera around which `maps` lie on a sphere; None if they lie on its plane
     camera_matrix: FloatArray | None = None
+    # (C, T) of each colour, in the order of `Capture.colours`: factors of the gain, and their standard deviations; None where
+    # all colours have one gain
+    tints: FloatArray | None = None
+    std_tints: FloatArray | None = None
 
     @classmethod
     def of_frames(cls, gain: FloatArray, frequency: float = 0.0, std: FloatArray | None = None) -> Light:
@@ -253,6 +257,14 @@ class Light:
         mean = float(self.gain[shown].mean())
         return replace(self, gain=np.where(shown, self.gain / mean, 0), std=np.where(shown, self.std / mean, np.inf))
 
+    def of_colour(self, index: int) -> Light:
+        """Return the light of one colour."""
+        if self.tints is None or self.std_tints is None:
+            return self
+        tint, std_tint = self.tints[index], self.std_tints[index]
+        std = np.hypot(self.std * np.maximum(tint, 1e-9), self.gain * std_tint)  # infinite where a frame is left out
+        return replace(self, gain=self.gain * tint, std=std, tints=None, std_tints=None)
+
     def terms(self, span: FrameSpan) -> FloatArray:
         """Return the terms of the gain in each frame of a span: (1 + K, n), the first for all of the scene."""
         frames = slice(span.start, span.stop)
@@ -265,7 +277,9 @@ class Light:
     def part(self, span: FrameSpan) -> Light:
         """Return the light of some frames."""
         frames = slice(span.start, span.stop)
-        return replace(self, gain=self.gain[frames], waves=self.waves[:, frames], std=self.std[frames])
+        tints, std_tints = (None if each is None else each[:, frames] for each in (self.tints, self.std_tints))
+        cut = replace(self, gain=self.gain[frames], waves=self.waves[:, frames], std=self.std[frames])
+        return replace(cut, tints=tints, std_tints=std_tints)
 
     def classes(self) -> NDArray[np.int64]:
         """Return the class of each frame: (T,), from 0. Within a class the gain of each place hardly changes."""

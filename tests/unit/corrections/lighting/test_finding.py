@@ -2,14 +2,16 @@
 
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from photonpano import FrameSpan
-from photonpano.corrections import Vignette, divided_by
+from photonpano.capture import capture_of, in_light
+from photonpano.corrections import ColourFilter, Vignette, corrected_source, divided_by
 from photonpano.corrections.gains import SeenCells, local_flicker, solve_gains
-from photonpano.corrections.lighting import PixelGain, decision_of, find_light, measure_pixel_gain
+from photonpano.corrections.lighting import PixelGain, decision_of, find_light, in_light_of, measure_pixel_gain, write_light
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas, translation
 from photonpano.merging.accumulate import gain_image
@@ -27,7 +29,7 @@ FLICKER = 1 + 0.5 * np.cos(2 * np.pi * np.arange(N) / 90.5)
 def panned(
     light: np.ndarray, flux: tuple[float, float] = (0.05, 0.5), seed: int = 0, tremor_px: np.ndarray | None = None
 ) -> MemorySource:
-    """A pan over a scene that gets brighter along the way, with a tremor along x."""
+    """A pan over a scene that gets brighter along the way, with a tremor along x, in light (N,) or, of each pixel, (N, H, W)."""
     scene, rng = Scene(seed, flux), np.random.default_rng(seed)
     frames = np.empty((N, *SHAPE), np.uint8)
     for first in range(0, N, 8):
@@ -35,7 +37,8 @@ def panned(
         if tremor_px is not None:
             at = at @ translation(tremor_px[first + 4], 0)
         view = scene.view(at, SHAPE) * (1 + (at[0, 2] + np.arange(SHAPE[1])) / 60)
-        frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-view * light[first : first + 8, None, None])
+        gain = light[first : first + 8].reshape(8, *light.shape[1:] or (1, 1))
+        frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-view * gain)
     return MemorySource(frames)
 
 
@@ -62,6 +65,33 @@ def test_gain_of_each_frame_is_measured(light: np.ndarray, period: float | None)
     if period is not None:
         assert decision.value == pytest.approx(0.5, abs=0.03)
         assert "Hz" in decision.reason
+
+
+def test_each_colour_has_a_gain_of_its_own_where_a_red_lamp_goes_down(tmp_path: Path) -> None:
+    light = np.ones((N, *SHAPE))
+    light[N // 2 :, ::2, ::2] = 0.4  # at the red pixels of the array
+    source = corrected_source(panned(light), [ColourFilter(pattern="rggb", keep="all")])
+    found = find_light(source, MOTION, Context(threads=1))
+    assert found is not None
+    lit = capture_of(in_light(source, found)).colours()
+    for colour, after in (("red", 0.4), ("green", 1.0), ("blue", 1.0)):
+        seen = lit[colour].light
+        assert seen is not None
+        true = np.where(np.arange(N) < N // 2, 1, after)
+        # In the brightest light, all colours have one gain.
+        error = seen.gain / found.gain[: N // 2].mean() - true
+        assert float(np.sqrt(np.mean(error**2))) < 0.04, colour
+        assert 0 < seen.std.max() < 0.1
+    assert decision_of(found, None).reason.startswith("the light of the scene, in each colour by itself, changes between 0.4")
+    write_light(tmp_path, found)
+    read = capture_of(in_light_of(source, tmp_path)).colours()["red"].light
+    assert read is not None
+    assert read.gain.tolist() == lit["red"].light.gain.tolist()  # type: ignore[union-attr]
+
+
+def test_colours_in_steady_light_have_no_gains() -> None:
+    source = corrected_source(panned(STEADY), [ColourFilter(pattern="rggb", keep="all")])
+    assert find_light(source, MOTION, Context(threads=1)) is None
 
 
 def test_lamps_of_two_phases_are_told_apart() -> None:
