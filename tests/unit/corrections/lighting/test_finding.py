@@ -29,7 +29,7 @@ FLICKER = 1 + 0.5 * np.cos(2 * np.pi * np.arange(N) / 90.5)
 def panned(
     light: np.ndarray, flux: tuple[float, float] = (0.05, 0.5), seed: int = 0, tremor_px: np.ndarray | None = None
 ) -> MemorySource:
-    """A pan over a scene that gets brighter along the way, with a tremor along x, in light (N,) or, of each pixel, (N, H, W)."""
+    """A pan over a scene that gets brighter along the way, with a tremor along x; light: (N,), or of pixels (N, H, W)."""
     scene, rng = Scene(seed, flux), np.random.default_rng(seed)
     frames = np.empty((N, *SHAPE), np.uint8)
     for first in range(0, N, 8):
