@@ -125,10 +125,12 @@ def add_pixel_sums(  # noqa: PLR0917
     variance: NDArray[np.float32],
     residual: NDArray[np.float32],
     total: NDArray[np.float32],
+    slopes: NDArray[np.float32],
 ) -> None:
     """Add residuals and expected counts to the sums (H, W) of each pixel; not known are NaN counts, and those of variance 0.
 
-    `counts` are summed over `n_frames`, mean and variance are those of one.
+    `counts` are summed over `n_frames`, mean and variance are those of one. `slopes` (4, H, W) are gx gx / v, gx r / v,
+    gy gy / v and gy r / v of pixels inside the frame, see `GXX`.
     """
     n, zero = np.float32(n_frames), np.float32(0)
     for y in range(mean.shape[0]):
@@ -139,6 +141,15 @@ def add_pixel_sums(  # noqa: PLR0917
             known = r == r and q[t] > zero
             residuals[t] += r if known else zero
             totals[t] += expected if known else zero
+    for y in range(1, mean.shape[0] - 1):
+        k, m, q, up, down = counts[y], mean[y], variance[y], mean[y - 1], mean[y + 1]
+        xx, xr, yy, yr = slopes[0, y], slopes[1, y], slopes[2, y], slopes[3, y]
+        for t in range(1, len(k) - 1):
+            gx, gy, _, r, _, w = _terms(m[t], m[t + 1] - m[t - 1], down[t] - up[t], k[t], q[t], zero, n, True)
+            xx[t] += w * gx * gx
+            xr[t] += w * gx * r
+            yy[t] += w * gy * gy
+            yr[t] += w * gy * r
 
 
 class Totals(NamedTuple):
@@ -152,6 +163,7 @@ class Totals(NamedTuple):
     cell_noise: NDArray[np.float64]  # variance of the residuals, relative to the squared prediction
     pixel_residual: NDArray[np.float32]  # (H, W) residuals of each pixel: see `add_pixel_sums`
     pixel_mean: NDArray[np.float32]  # (H, W) expected counts
+    pixel_slopes: NDArray[np.float32]  # (4, H, W)
 
     @classmethod
     def zeros(cls, shape: tuple[int, int], canvas_shape: tuple[int, int]) -> Totals:
@@ -159,7 +171,7 @@ class Totals(NamedTuple):
         grid, cells = n_blocks(shape), n_blocks(canvas_shape)
         of_blocks = np.zeros((*grid, N_SUMS)), np.zeros(grid), np.zeros(grid)
         of_cells = np.zeros(cells), np.zeros(cells), np.zeros(cells)
-        return cls(*of_blocks, *of_cells, np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+        return cls(*of_blocks, *of_cells, *(np.zeros((*n, *shape), np.float32) for n in ((), (), (4,))))
 
     def plus(self, other: Totals) -> Totals:
         """Return the sums over both."""

@@ -80,6 +80,8 @@ class Residuals:
     block_chi2: FloatArray  # (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen
     pixel_gain: FluxImage  # (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted
     pixel_mean: FluxImage  # (H, W) predicted photons of each pixel, in one of four spans
+    # (4, H, W) how pixels lie beside the panorama, in these spans: see `add_pixel_sums`; None if that is not known
+    pixel_slopes: FluxImage | None = None
     # (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was seen
     cell_chi2: FloatArray
     cell_count: FloatArray  # (H', W') number of blocks that fell on each square
@@ -161,6 +163,7 @@ def measure(span: FrameSpan, predictions: Predictions, context: Context) -> Resi
             block_chi2=total.block_chi2 / total.block_count,
             pixel_gain=np.asarray(pixel_gain, np.float32),
             pixel_mean=total.pixel_mean,
+            pixel_slopes=total.pixel_slopes,
             cell_chi2=total.cell_chi2 / total.cell_count,
             cell_count=total.cell_count,
             cell_noise=total.cell_noise / total.cell_count,
@@ -380,7 +383,8 @@ def _measured(
             noise = colour.noise_beside(images[0], images[1], span)
             add_block_sums(counts, noise, float(len(span)), images[0], images[1], sums)
             if index % _PIXEL_STRIDE == 0:
-                add_pixel_sums(counts, float(len(span)), images[0], images[1], total.pixel_residual, total.pixel_mean)
+                of_pixels = total.pixel_residual, total.pixel_mean, total.pixel_slopes
+                add_pixel_sums(counts, float(len(span)), images[0], images[1], *of_pixels)
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
         own = min(0.5, len(span) / frames_seen)
         cells = first.cells(homography, middle, ideal)

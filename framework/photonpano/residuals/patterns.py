@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -10,7 +11,7 @@ from scipy import sparse
 from photonpano.filtering import SYSTEMATIC_PX
 from photonpano.geometry import corners, transform_points
 from photonpano.residuals.block_sums import BLOCK_PX
-from photonpano.values import FloatArray
+from photonpano.values import FloatArray, FluxImage
 
 _INSTANTS = 64  # instants of the motion at which the effect of a lens is computed
 _SIGNIFICANT = 4.0  # standard deviations by which the scatter must exceed that of noise
@@ -91,6 +92,39 @@ def _pattern(known: np.ndarray, homographies: FloatArray, frame_shape: tuple[int
     left -= averages @ (averages.T @ left)
     bend_px = np.linalg.norm(absorbed.reshape(len(instants), 2, -1).mean(axis=2), axis=1)
     return left.reshape(len(instants), 2, -1).mean(axis=0).T, bend_px
+
+
+class PartsApart(NamedTuple):
+    """Two parts of the sensor that see the scene at different places."""
+
+    parts: str
+    px: float
+    sigmas: float
+
+
+def parts_apart(slopes: FluxImage) -> list[PartsApart]:
+    """Return how far odd rows lie beside even ones, and one half of the sensor beside the other, the same of columns.
+
+    Each row has a shift of its own, along x and along y, by the slopes (4, H, W) of its pixels. What a cubic polynomial over
+    the rows explains, such as a rolling shutter, is no difference of parts.
+    """
+    found = []
+    for axis, (line, halves) in enumerate(
+        (("rows", "the upper and the lower half"), ("columns", "the left and the right half"))
+    ):
+        lines = np.asarray(slopes, np.float64).sum(axis=2 - axis)
+        number = lines.shape[1]
+        at, odd = np.linspace(-1, 1, number), np.arange(number) % 2 - 0.5
+        columns = np.stack([*(at**power for power in range(4)), odd, np.sign(at) / 2], axis=1)
+        for information, right in (lines[:2], lines[2:]):
+            normal = columns.T @ (information[:, None] * columns)
+            if np.linalg.matrix_rank(normal) < len(normal):
+                continue
+            covariance = np.linalg.inv(normal)
+            away, std = covariance @ columns.T @ right, np.sqrt(np.diag(covariance))
+            for part, index in ((f"odd and even {line}", -2), (halves, -1)):
+                found.append(PartsApart(part, abs(float(away[index])), abs(float(away[index] / std[index]))))
+    return found
 
 
 def deformation_px(shifts: FloatArray, information: FloatArray) -> float | None:

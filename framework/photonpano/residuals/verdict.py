@@ -18,6 +18,7 @@ from photonpano.residuals.block_sums import M, V
 from photonpano.residuals.causes import CAUSES, FIND_LENS, FREE, TestedRun, Tests, changing_places
 from photonpano.residuals.findings import NOTHING, Findings
 from photonpano.residuals.measure import FEWEST_FRAMES
+from photonpano.residuals.patterns import parts_apart
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
 from photonpano.text import listed
 from photonpano.values import Verdict
@@ -120,6 +121,22 @@ def _lens(run: TestedRun) -> Found | None:
         distortion = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
         what_to_do = f"{distortion}; or {_WITHOUT_LENS}"
     return Found(abs(found.k1), f"about {found.k1:.1%} at the corners", what_to_do=what_to_do)
+
+
+@FACTS.doubtful_above(
+    0.2,
+    "parts of the sensor see the scene at different places, so that the panorama is torn",
+    "read the frames in the order of the sensor's rows and halves, or keep one part (corrections: crop)",
+)
+def _parts(run: TestedRun) -> Found | None:
+    """As where rows take turns, or a half of the sensor is read out some frames later than the other."""
+    residuals = run.explained.residuals
+    if residuals.pixel_slopes is None:
+        return None
+    misfit = max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
+    apart = [each for each in parts_apart(residuals.pixel_slopes) if each.sigmas > _SURE_SIGMAS * misfit]
+    farthest = max(apart, key=lambda each: each.px, default=None)
+    return farthest and Found(farthest.px, f"px between {farthest.parts}")
 
 
 @FACTS.doubtful_above(
