@@ -40,6 +40,7 @@ _LEAST_MOVING = 0.01  # least share of a frame that moves, for the frame not to 
 # whose pixels differ by a few percent has less before a sky.
 _FAINT = 0.005
 _HALF = 0.5
+_VARIED = 0.1  # most share of pixels that are lit in all frames, or in none, of a line of the sensor that varies
 _SHARE_OF = "share of the frame that stands still, of the parts that show motion or rest"
 
 
@@ -98,6 +99,8 @@ def find_still(
 
     colours = [usable & part for part in alike]
     single = np.logical_or.reduce([_single_pixels(sums, n_frames, part) for part in colours])
+    lines, of_lines = _silent_lines(sums.sum(axis=0, dtype=np.int64), len(sums) * n_frames, usable)
+    single |= lines
     moving, stood = _parts(sums, n_frames, max(colours, key=np.count_nonzero) & ~single)
     standing = _continued(stood, ~moving)
     n_standing, n_moving = int(standing.sum()), int((moving & ~standing).sum())
@@ -109,7 +112,11 @@ def find_still(
         return np.zeros_like(usable), share, why
     side = 2 * (_SIDE_PX // 2 + 2) + 1  # a square that reaches over the edge of what stands shows motion
     mask = (single | (cv2.dilate(standing.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)) & usable
-    return mask, share, f"stand still in {len(sums) * n_frames} frames sampled all over the capture, while the rest moves"
+    return (
+        mask,
+        share,
+        f"stand still in {len(sums) * n_frames} frames sampled all over the capture, while the rest moves{of_lines}",
+    )
 
 
 def _single_pixels(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> BoolArray:
@@ -125,6 +132,27 @@ def _single_pixels(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) ->
     difference, more = (_beyond_neighbours(np.where(usable, image, nothing)) for image in (mean, variance - noise))
     chance = _SURE * np.sqrt(2 / (n_spans - 1)) * noise
     return np.asarray(found & (more < chance + _STEADY * difference**2) & ~_has_halo(np.nan_to_num(difference)))
+
+
+def _silent_lines(counts: NDArray[np.int64], total: int, usable: BoolArray) -> tuple[BoolArray, str]:
+    """Return the rows and columns of which each pixel is lit in all frames, or in none, beside lines that vary; and a clause.
+
+    A dark sky ends at no line of the sensor: there, the next line is dark in part.
+    """
+    from scipy import ndimage
+
+    silent, found, named = (counts == 0) | (counts == total) | ~usable, np.zeros_like(usable), []
+    for name, along in (("rows", 1), ("columns", 0)):
+        share = silent.mean(axis=along)
+        for (run,) in ndimage.find_objects(ndimage.label(share == 1)[0]):
+            beside = [share[each] for each in (run.start - 1, run.stop) if 0 <= each < len(share)]
+            part = (slice(None), run) if along == 0 else run
+            if beside and max(beside) < _VARIED and usable[part].any():
+                found[part] = usable[part]
+                named.append(f"{name} {run.start} to {run.stop - 1}")
+                if name == "columns" and run.stop == len(share) and len(share) % 8 == 0 and run.stop - run.start < 8:
+                    named[-1] += f", as where `width: {run.start}` is missing"
+    return found, f"; all pixels are lit in all of them, or in none, of {'; '.join(named)}" if named else ""
 
 
 def _beyond_neighbours(image: FluxImage) -> FluxImage:

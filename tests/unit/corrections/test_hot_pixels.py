@@ -124,6 +124,24 @@ def test_still_pixels_masks_hot_and_dead_pixels_in_the_dark(
     assert source.valid[~hot].mean() > 0.999
 
 
+def test_lines_of_the_sensor_that_never_vary_are_masked_and_named(panned: Callable, corrections: Callable) -> None:
+    chances = panned(0.15)
+    chances[:, 20:23], chances[:, :, -3:] = 1, 0
+    source = found_in(chances, corrections)
+    assert not source.valid[20:23].any()
+    assert not source.valid[:, -3:].any()
+    assert source.valid.sum() == source.valid.size - 3 * FRAME[1] - 3 * (FRAME[0] - 3)
+    named = "of rows 20 to 22; columns 125 to 127, as where `width: 125` is missing"
+    assert source.decisions[0].reason.endswith(f"all pixels are lit in all of them, or in none, {named}")
+
+
+def test_dark_sky_above_the_scene_is_not_masked(panned: Callable, corrections: Callable) -> None:
+    chances = panned(0.15)
+    roofs = 20 + 6 * np.sin(np.arange(FRAME[1]) / 9)
+    chances[:, np.arange(FRAME[0])[:, None] < roofs] = 0
+    assert found_in(chances, corrections).valid.all()
+
+
 @pytest.mark.parametrize("flux", [0.5, 0.02])
 def test_still_pixels_masks_nothing_of_moving_scene(flux: float, panned: Callable, corrections: Callable) -> None:
     source = found_in(panned(0.15, flux), corrections)
