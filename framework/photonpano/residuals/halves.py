@@ -33,7 +33,8 @@ _TOLERANCE_PX = 1.0  # motion within which frames are summed: pictures are smoot
 # mostly noise.
 _BLURS_PX = 1.0, 2.0, 4.0
 _MARGIN_PX = 4  # around the places of frames that were looked at, for those between them
-_FEWEST_FRAMES = 4  # of a picture, that saw a pixel
+_FEWEST_FRAMES = 4  # of a block
+_LEAST_LIGHT = 0.5  # of each picture, in frames of the mean light that saw a pixel: where the light falls, frames count less
 _MOST_PIXELS = 4e6  # of the canvas; a larger one is reduced
 _SAMPLED = 5  # frames of a block at which it is looked where they lie
 _SQUARE_PX = 16  # squares whose noise is independent, for each pixel by which pictures are smoothed
@@ -207,7 +208,7 @@ def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreeme
     Where noise hides what fine structure ties, as before a scene that is blurred, coarser structure is compared.
     """
     found = _Agreement(np.nan, np.nan, (widest_px, widest_px), np.nan)
-    seen = np.asarray((sums[:, 1] >= _FEWEST_FRAMES / 2).all(axis=0))
+    seen = np.asarray((sums[:, 1] >= _LEAST_LIGHT).all(axis=0))
     if not seen.any():
         return found
     (top, bottom), (left, right) = (np.flatnonzero(seen.any(axis=(axis, 2)))[[0, -1]] for axis in (1, 0))
