@@ -18,6 +18,7 @@ from photonpano.values import FloatArray, FluxImage, FrameSpan, Homography, Ligh
 
 _BLUR_PX = 0.7  # standard deviation of the Gaussian that smooths the panorama: its noise must not pass for texture
 _INTERPOLATION_PX2 = 1 / 6  # variance of the kernel of one linear interpolation, averaged over the fractions of a pixel
+_SATURATED, _BESIDE_PX = 0.98, 9  # share of the highest count from which on a place, and the square around it, tell nothing
 _MANY_FRAMES = 1e4  # of a mean count that is exact
 _NODES_ERROR_PX = 0.005  # error of places that are interpolated between exact ones
 _MARGIN = 4  # columns with which a full turn is continued on each side: more than the smoothing reaches
@@ -78,6 +79,10 @@ class Prediction:
         known = cv2.erode(
             inside.astype(np.uint8), np.ones((5, 5), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0
         ).astype(np.bool_)
+        # Beside what saturates a pixel, the panorama is smoothed, and its counts are interpolated, over a hundredfold contrast.
+        highest = response.mean_count(np.array([np.inf], np.float32))
+        saturated = (mean > _SATURATED * highest).astype(np.uint8)
+        known &= cv2.dilate(saturated, np.ones((_BESIDE_PX, _BESIDE_PX), np.uint8)) == 0
         variance = np.where(known, frame_variance(flux, response, response.mean_count), np.float32(0))
         variance = np.pad(variance.astype(np.float32, copy=False), ((1, 1), (1, 0)))
         frames_seen = float(np.median(panorama.weight[seen])) if seen.any() else 0.0
