@@ -164,7 +164,16 @@ def _hot_pixels(run: TestedRun) -> Found:
     known = predicted > 0
     excess = np.abs(run.explained.residuals.pixel_gain - 1) * predicted
     outlier = known & (excess > _STANDARD_DEVIATIONS * np.sqrt(predicted) + 5) & (excess > 0.5 * predicted)
-    return Found(float(outlier.sum() / max(known.sum(), 1)), f"{int(outlier.sum())} pixels")
+    number = int(outlier.sum())
+    where, what_to_do, share = f"{number} pixels", "", number / max(int(known.sum()), 1)
+    for how, turned in (("upside down", known[::-1]), ("left to right", known[:, ::-1]), ("by 180 degrees", known[::-1, ::-1])):
+        there = int((outlier & ~turned).sum()) / max(number, 1)
+        if there > 0.5 + (~turned[known]).mean():  # more than half, beside those that any mask would hold
+            where, what_to_do = (
+                f"{where}; {there:.0%} of them lie where a mask turned {how} has its pixels",
+                f"turn the mask {how}",
+            )
+    return Found(share, where, what_to_do=what_to_do)
 
 
 @CAUSES.doubtful_above(

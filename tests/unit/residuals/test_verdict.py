@@ -144,6 +144,26 @@ def test_what_residuals_show_is_a_note_and_the_cause_of_a_doubt(
     assert (doubted.status, doubted.notes) == ("doubtful", ())
 
 
+@pytest.mark.parametrize(
+    ("apart_px", "where"),
+    [
+        (lambda y, _: 0.5 * (y % 2), "0.5 px between odd and even rows"),
+        (lambda _, x: 0.5 * (x % 2), "0.5 px between odd and even columns"),
+        (lambda y, _: 0.5 * (y >= 64), "0.5 px between the upper and the lower half"),
+        (lambda _, x: 0.5 * (x < 96), "0.5 px between the left and the right half"),
+        (lambda y, _: y / 20 - (y / 40) ** 2, ""),  # a rolling shutter
+        (lambda y, _: 0.1 * (y % 2), ""),
+    ],
+)
+def test_parts_of_the_sensor_that_lie_apart_are_doubtful(
+    explained: Explained, apart_px: Callable[[np.ndarray, np.ndarray], np.ndarray], where: str
+) -> None:
+    shifts = apart_px(*np.indices((128, 192))) + np.random.default_rng(0).standard_normal((128, 192)) / 10
+    slopes = 100 * np.stack([np.ones_like(shifts), shifts, np.ones_like(shifts), np.zeros_like(shifts)]).astype(np.float32)
+    verdict = judge(replace(explained, residuals=replace(explained.residuals, pixel_slopes=slopes)), ())
+    assert [f"{reason.figure:.1f} {reason.where}" for reason in verdict.reasons] == [where] * bool(where)
+
+
 def test_photons_that_the_panorama_does_not_explain_are_doubtful(explained: Explained) -> None:
     """2 variances of 100 photons beyond the noise are sqrt(200) of 100 photons."""
     residuals = replace(explained.residuals, reduced_chi2=explained.residuals.reduced_chi2 + 2)
@@ -283,6 +303,18 @@ def test_advice_is_not_what_the_run_does_already(explained: Explained, camera: C
     run = replace(explained, motion=replace(explained.motion, camera=camera), lens=bent)
     found = {reason.what: reason.what_to_do for reason in judge(run, [level_with(object(), rivals)]).reasons}
     assert found == {"the lens distorts the frames, which bends the motion": lens, NARROW: turn}
+
+
+@pytest.mark.parametrize(("turn", "how"), [(np.flipud, "upside down"), (np.fliplr, "left to right"), (None, "")])
+def test_hot_pixels_that_lie_where_a_turned_mask_would_be_say_so(
+    explained: Explained, turn: Callable[[np.ndarray], np.ndarray] | None, how: str
+) -> None:
+    masked, hot = (np.random.default_rng(seed).random(explained.residuals.frame_shape) < 0.02 for seed in (3, 4))
+    hot = hot if turn is None else turn(masked)
+    mean, gain = np.where(masked, 0, 1000).astype(np.float32), np.where(hot, 5, 1).astype(np.float32)
+    verdict = judge(replace(explained, residuals=replace(explained.residuals, pixel_mean=mean, pixel_gain=gain)), ())
+    said = next(reason for reason in (*verdict.reasons, *verdict.notes) if "single pixels" in reason.what)
+    assert said.what_to_do == (f"turn the mask {how}" if how else "mask them (corrections: hot-pixels)")
 
 
 @pytest.mark.parametrize(("lacks", "doubtful"), [(2.5, False), (3.5, True)])
