@@ -213,6 +213,39 @@ TestSpad512 = of(BinConformance, "spad512")
 TestSpad512Sparse = of(BinConformance, "spad512-sparse")
 
 
+class EventsConformance(SourceConformance):
+    """A list of the photons of all frames."""
+
+    contribution = CATALOG.find("source", "events").contribution
+    wrong = (NO_FILE, {"columns": {"when": "frame", "x": "x", "y": "z"}}, {"frame_shape": [9, 27]})
+    grows = False
+    columns: tuple[str, ...] = ("frame", "x", "y")
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        frame, y, x = np.nonzero(frames)
+        path = self.save(folder / "events", dict(zip(self.columns, (frame, x, y), strict=True)))
+        return {"path": path, "start": 0, "n_frames": len(frames), "frame_shape": list(self.frame_shape)}
+
+    def save(self, stem: Path, columns: dict[str, np.ndarray]) -> Path:
+        np.savez(stem.with_suffix(".npz"), **columns)
+        return stem.with_suffix(".npz")
+
+
+class TestEvents(EventsConformance):
+    pass
+
+
+class TestEventsInFits(EventsConformance):
+    columns = "EXPNO", "CHIPX", "CHIPY"
+    wrong = (NO_FILE,)
+
+    def save(self, stem: Path, columns: dict[str, np.ndarray]) -> Path:
+        fits = pytest.importorskip("astropy.io.fits", reason="FITS needs photonpano[fits]")
+        table = [fits.Column(name=name, format="J", array=column) for name, column in columns.items()]
+        fits.BinTableHDU.from_columns(table, name="EVENTS").writeto(stem.with_suffix(".fits"))
+        return stem.with_suffix(".fits")
+
+
 class TestMatParts(SourceConformance):
     contribution = CATALOG.find("source", "mat-parts").contribution
     wrong = (NO_FILE,)

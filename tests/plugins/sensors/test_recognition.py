@@ -19,7 +19,7 @@ from photonpano.photometry import BinaryResponse
 
 NAMES = (
     "packed-npy npy zarr swissspad-half swissspad-full spad512 spad512-sparse mat-parts visionsim ubicept-h5 "
-    "spike-dat video fastcam-mraw image-folder"
+    "spike-dat video fastcam-mraw image-folder events"
 )
 SOURCES = {name: discover().find("source", name).contribution for name in NAMES.split()}
 PHOTRON = Path(__file__).parents[2] / "data" / "photron"
