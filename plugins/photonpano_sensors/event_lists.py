@@ -75,7 +75,7 @@ class _Photons(NamedTuple):
     """The photons that lie in the frames, in order."""
 
     frames: NDArray[np.int64]  # (N,) number of the frame of each
-    pixels: NDArray[np.int64]  # (N, 2) x and y
+    places: FloatArray  # (N, 2) x and y, in px
     shape: tuple[int, int]  # (height, width) of a frame
     n_frames: int
     sky: FloatArray | None  # (N, 2) where they come from, if that is known
@@ -88,7 +88,7 @@ class EventsSource(BinarySource):
         height, width = photons.shape
         super().__init__(photons.n_frames, FrameLayout(photons.shape, (height, -(-width // 8))), frame_rate_hz)
         self._photons = photons
-        self._lit = photons.pixels[:, 1] * width + photons.pixels[:, 0]
+        self._lit = np.floor(photons.places).astype(np.int64) @ [1, width]
         self._ends = np.searchsorted(photons.frames, np.arange(photons.n_frames + 1))
 
     def counts(self, span: FrameSpan) -> NDArray[np.uint32]:
@@ -118,7 +118,7 @@ class SkyEventsSource(EventsSource):
 
     def truth(self) -> Mapping[str, NDArray[np.generic]]:
         """Return the motion, by least squares: the sky is an affine map of the pixel, which shifts from frame to frame."""
-        frames, pixels, shape, n_frames, sky = self._photons
+        frames, places, shape, n_frames, sky = self._photons
         assert sky is not None
         number = np.bincount(frames, minlength=n_frames)[:, None]
         seen = np.flatnonzero(number)
@@ -127,9 +127,9 @@ class SkyEventsSource(EventsSource):
             sums = np.stack([np.bincount(frames, each, n_frames) for each in values.T], axis=1)
             return np.asarray(sums / np.maximum(number, 1))
 
-        places, there = of_frames(pixels.astype(float)), of_frames(sky)
-        to_sky = np.linalg.lstsq(pixels - places[frames], sky - there[frames])[0]
-        shifts = np.linalg.solve(to_sky.T, there.T).T - places
+        here, there = of_frames(places), of_frames(sky)
+        to_sky = np.linalg.lstsq(places - here[frames], sky - there[frames])[0]
+        shifts = np.linalg.solve(to_sky.T, there.T).T - here
         shifts -= shifts[seen[0]]
         motion = np.tile(np.eye(3), (n_frames, 1, 1))
         motion[:, :2, 2] = np.stack([np.interp(np.arange(n_frames), seen, each[seen]) for each in shifts.T], axis=1)
@@ -152,13 +152,13 @@ def _placed(config: EventsConfig) -> _Photons:
     if names.chip:
         places += _of_chips(config, values[names.chip])
     least = (0, 0) if config.frame_shape else tuple(np.floor(places.min(axis=0)).astype(int).tolist())
-    pixels = np.floor((places - np.array(config.origin or least)) / config.bin).astype(np.int64)
-    height, width = config.frame_shape or (pixels[:, ::-1].max(axis=0) + 1).tolist()
+    places = (places - np.array(config.origin or least)) / config.bin
+    height, width = config.frame_shape or (np.floor(places[:, ::-1].max(axis=0)).astype(int) + 1).tolist()
     if not 0 < max(height, width) <= _MOST_PX:
         raise InputError(f"{path}: the photons lie in {height}x{width} px; give frame_shape and origin, or a larger bin")
-    outside = ((pixels < 0) | (pixels >= (width, height))).any(axis=1)
+    outside = ((places < 0) | (places >= (width, height))).any(axis=1)
     if outside.any():
-        x, y = places[outside][0]
+        x, y = values[names.x][outside][0], values[names.y][outside][0]
         raise InputError(
             f"{path}: {outside.sum():,} of {len(outside):,} photons lie outside of the {height}x{width} px, the first at "
             f"({x:g}, {y:g}); correct origin, bin or frame_shape, or leave them out"
@@ -169,7 +169,7 @@ def _placed(config: EventsConfig) -> _Photons:
         raise InputError(f"{path}: no photon lies in the frames; correct start, n_frames or frame_duration")
     frames = frames[shown]
     n_frames = config.n_frames or int(frames[-1]) + 1
-    return _Photons(frames, pixels[shown], (height, width), n_frames, None if sky is None else sky[shown])
+    return _Photons(frames, places[shown], (height, width), n_frames, None if sky is None else sky[shown])
 
 
 def _open(config: EventsConfig) -> EventsSource:
