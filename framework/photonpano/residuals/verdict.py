@@ -238,6 +238,22 @@ def _grain(run: TestedRun) -> Found | None:
 
 
 @FACTS.doubtful_above(
+    0.1,
+    "pixels that take turns count differently, as behind a colour filter that is not known, or shifted by a pixel",
+    "name the pattern of the filter, from the first pixel of a frame on (corrections: colour-filter)",
+)
+def _alternating(run: TestedRun) -> Found | None:
+    residuals = run.explained.residuals
+    counts, phases = np.nan_to_num(residuals.pixel_gain * residuals.pixel_mean), [(y, x) for y in (0, 1) for x in (0, 1)]
+    seen = [float(residuals.pixel_mean[y::2, x::2].sum()) for y, x in phases]
+    if not all(seen):
+        return None
+    gains = [float(counts[y::2, x::2].sum()) / there for (y, x), there in zip(phases, seen, strict=True)]
+    (x, y), (other_x, other_y) = (phases[index(gains)][::-1] for index in (np.argmax, np.argmin))
+    return Found(max(gains) - min(gains), f"of the light, from pixel ({x}, {y}) of each 2x2 to pixel ({other_x}, {other_y})")
+
+
+@FACTS.doubtful_above(
     0.5,
     "more than half of the frame stands still while the rest moves",
     "mask what stands in the frame (corrections: mask); the motion may be that of either part",

@@ -164,6 +164,17 @@ def test_parts_of_the_sensor_that_lie_apart_are_doubtful(
     assert [f"{reason.figure:.1f} {reason.where}" for reason in verdict.reasons] == [where] * bool(where)
 
 
+@pytest.mark.parametrize(("filtered", "doubtful"), [(0.2, True), (0.05, False)])
+def test_pixels_behind_a_colour_filter_that_is_not_known_are_doubtful(
+    explained: Explained, filtered: float, doubtful: bool
+) -> None:
+    gain = np.ones((128, 192), np.float32)
+    gain[1::2, ::2] -= np.float32(filtered)
+    verdict = judge(replace(explained, residuals=replace(explained.residuals, pixel_gain=gain)), ())
+    said = "of the light, from pixel (0, 0) of each 2x2 to pixel (0, 1)"
+    assert [(reason.figure, reason.where) for reason in verdict.reasons] == [(pytest.approx(filtered), said)] * doubtful
+
+
 def test_photons_that_the_panorama_does_not_explain_are_doubtful(explained: Explained) -> None:
     """2 variances of 100 photons beyond the noise are sqrt(200) of 100 photons."""
     residuals = replace(explained.residuals, reduced_chi2=explained.residuals.reduced_chi2 + 2)
