@@ -172,7 +172,8 @@ def test_pixels_behind_a_colour_filter_that_is_not_known_are_doubtful(
     gain[1::2, ::2] -= np.float32(filtered)
     verdict = judge(replace(explained, residuals=replace(explained.residuals, pixel_gain=gain)), ())
     said = "of the light, from pixel (0, 0) of each 2x2 to pixel (0, 1)"
-    assert [(reason.figure, reason.where) for reason in verdict.reasons] == [(pytest.approx(filtered), said)] * doubtful
+    found = [reason for reason in verdict.reasons if reason.what.startswith("pixels that take turns")]
+    assert [(reason.figure, reason.where) for reason in found] == [(pytest.approx(filtered), said)] * doubtful
 
 
 def test_photons_that_the_panorama_does_not_explain_are_doubtful(explained: Explained) -> None:
