@@ -17,6 +17,10 @@ _DARK, _DARK_SHARE = 10.0, 0.05
 _SMOOTH_SPANS = 16.0  # standard deviation of the Gaussian that smooths a trajectory, in spans
 _NAMED_LINES = 3  # most frequencies named in a summary
 _NAMED_SHARE = 0.003  # a frequency is named if its peak has at least this fraction of the power
+# and if it exceeds the median of those about it so many times, as some hundred do by chance once in a hundred captures
+_LINE = 15.0
+_FEWEST_PERIODS = 6  # of a tremor in a capture; slower motion is the path
+_SPEEDS = 0.15  # by how much the speed of the image may differ from the usual one
 _ROUNDS = 6  # steps of expectation maximisation; more change the motion by less than its noise
 _UNKNOWN = 1e6  # variance of an unknown value, relative to the median of the others
 _NEIGHBOURS = 3, 5  # windows and frequencies over which the power is averaged to test it
@@ -62,7 +66,7 @@ class ShortSpansRefiner:
         return Refined(
             self._corrected(trajectory, len(std_px), corrections, instants),
             np.hypot(std_px, noise_px),
-            f"motion of {shift_px:.2g} px within groups was corrected{self._frequencies(tremor, instants)}",
+            f"motion of {shift_px:.2g} px within groups was corrected{self._frequencies(tremor, trajectory, instants)}",
         )
 
     def _corrected(self, trajectory: Trajectory, n_frames: int, corrections: CubicSpline, instants: FloatArray) -> FloatArray:
@@ -79,25 +83,34 @@ class ShortSpansRefiner:
             refined[block] = normalised(to_reference @ refined[block])
         return refined
 
-    def _frequencies(self, tremor: FloatArray, instants: FloatArray) -> str:
+    def _frequencies(self, tremor: FloatArray, trajectory: Trajectory, instants: FloatArray) -> str:
         """Return the strongest frequencies of a tremor, (S, 2) in px, as the end of a sentence.
 
-        Most of a slow tremor is known before, so that the correction alone would name what is left of it.
+        Most of a slow tremor is known before, so that the correction alone would name what is left of it. A line stands out
+        from the spectrum about it; it is neither a period of the path, nor that at which the image passes pixel after pixel.
         """
+        spacing = float(np.median(np.diff(instants)))
         spectrum = np.fft.rfft(tremor * np.hanning(len(tremor))[:, None], axis=0)
         power = (np.abs(spectrum) ** 2).sum(axis=1)
-        found: list[int] = []
-        total = power.sum()
-        while len(found) < _NAMED_LINES and power.max() > _NAMED_SHARE * total:
-            peak = int(power.argmax())
-            found.append(peak)
-            power[max(0, int(peak * 0.8) - 2) : int(peak * 1.25) + 3] = 0
-        cycles = np.array(sorted(peak for peak in found if peak > 1)) / (len(tremor) * float(np.median(np.diff(instants))))
-        if not len(cycles):
+        cycles = np.arange(len(power)) / (len(tremor) * spacing)
+        place = transform_points(trajectory.at(instants), corners(self._shape).mean(axis=0)[None])[:, 0]
+        passed = np.abs(np.diff(place, axis=0))  # pixels a span, whose fraction is what the spans show of their passing
+        passing = np.median(np.abs(passed - np.round(passed)), axis=0) / spacing
+        left, found = np.where(power > _NAMED_SHARE * power.sum(), power, 0), list[float]()
+        left[:_FEWEST_PERIODS] = 0
+        while len(found) < _NAMED_LINES and left.any():
+            peak = int(left.argmax())
+            about = np.r_[peak // 2 : peak - 2, peak + 3 : min(2 * peak, len(power))]
+            passes = (np.abs(cycles[peak] - passing) < _SPEEDS * passing).any()
+            if not passes and power[peak] > _LINE * np.median(power[about]):
+                found.append(float(cycles[peak]))
+            left[max(0, int(peak * 0.8) - 2) : int(peak * 1.25) + 3] = 0
+        found.sort()
+        if not found:
             return ""
         if self._rate is None:
-            return f"; the image trembles with periods of {' and '.join(f'{1 / each:.0f}' for each in cycles)} frames"
-        return f"; the image trembles at {' and '.join(f'{self._rate * each:,.0f}' for each in cycles)} Hz"
+            return f"; the image trembles with periods of {' and '.join(f'{1 / each:.0f}' for each in found)} frames"
+        return f"; the image trembles at {' and '.join(f'{self._rate * each:,.0f}' for each in found)} Hz"
 
 
 def _through_the_dark(steps: FloatArray, wiggles: FloatArray, variances: FloatArray) -> Filtered:

@@ -72,3 +72,10 @@ def test_refine_names_frequencies() -> None:
     corrected = "motion of 0.5 px within groups was corrected; the image trembles"
     assert refine(residuals(0, 0.5), 96_800).summary == f"{corrected} at 1,276 Hz"
     assert refine(residuals(0, 0.5)).summary == f"{corrected} with periods of 76 frames"
+
+
+def test_neither_the_path_nor_pixels_that_pass_are_named_as_a_tremor() -> None:
+    assert "trembles" not in refine(residuals(0, 0.5, period=N_FRAMES / 4)).summary
+    passing = STILL.copy()
+    passing[:, 0, 2] = np.arange(N_FRAMES) / 76  # a pixel every 76 frames
+    assert "trembles" not in refine(residuals(0, 0.5), known=passing).summary
