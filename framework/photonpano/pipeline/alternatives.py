@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from photonpano.capture import with_background
 from photonpano.geometry import corners, inverse, transform_points
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.graph import Rival
 from photonpano.motion.tracking import starting_motion
 from photonpano.pipeline.state import State
 from photonpano.residuals.causes import TestedRun, changing_places
@@ -27,7 +29,7 @@ def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, 
     """Let the expected error of a motion contain the distance to others, where the frames do not tell which one is right.
 
     These are a motion that jumps where the image seems to, one that a lens does not bend, one along a second place of a scene
-    that repeats, homographies that are likelier than the model of the spec, and that of parts of the frame which the motion
+    that repeats, those by models that are as likely as the one taken, and that of parts of the frame which the motion
     does not explain. Where such a part is large and its motion is not found, the error is infinite: not known.
     """
     findings = state.found()
@@ -35,7 +37,7 @@ def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, 
     n_frames, located = len(explained.motion.std_px), np.flatnonzero(explained.motion.located)
     jumps_px = 0.0 if findings.uncut_jump is None else findings.uncut_jump.px
     last = state.results[-1]
-    freer_px = last.located.rivals["homography"].apart_px if last.narrow else 0.0
+    freer_px = last.located.rivals["homography"].apart_px if last.narrow else of_models_px(last.located.rivals)
     explained = _apart(explained, np.full(n_frames, np.linalg.norm([jumps_px, second_place_px(run), freer_px])))
     if (lens := explained.lens) is not None:
         frames = np.linspace(located[0], located[-1], len(lens.bend_px))
@@ -44,6 +46,15 @@ def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, 
     if rival is None and of_either_part(run):
         beside = _apart(beside, np.full(n_frames, np.inf))
     return beside, replace(findings, rival_motion=rival)
+
+
+def of_models_px(rivals: Mapping[str, Rival]) -> float:
+    """Return the root mean square distance to the motions by other models, each as likely as its marginal likelihood says."""
+    if not rivals:
+        return 0.0
+    deviances, apart_px = np.array([(each.deviance, each.apart_px) for each in rivals.values()]).T
+    weights = np.exp(-(deviances - deviances.min()) / 2)
+    return float(np.sqrt(weights @ apart_px**2 / weights.sum()))
 
 
 def _apart(explained: Explained, distances_px: FloatArray) -> Explained:

@@ -10,6 +10,8 @@ import pytest
 from photonpano import parse_spec, run, simulate
 from photonpano.capture.writing import truth_path
 from photonpano.evaluation import corner_errors, load_truth
+from photonpano.motion.graph import Rival
+from photonpano.pipeline.alternatives import of_models_px
 
 SMALL, LARGE = ((96, 144), 600, 100), ((128, 192), 1000, 150)  # frame shape, frames, length of the pan in px
 MOVES_PX = (0.02, 0.006)
@@ -50,6 +52,12 @@ def test_motion_of_a_thing_that_fills_half_of_the_frame_has_a_rival(run_with: Ca
     assert result.verdict.reasons[0].what == "parts of the frame follow another motion than the one that was found"
     assert [each["what"] for each in result.record["decisions"]].count("rival_motion") == 1
     assert (errors_px <= 3 * std_px).mean() > 0.9
+
+
+@pytest.mark.parametrize(("deviance", "share"), [(0.0, 1 / 2), (2.0, 1 / (1 + np.e)), (30.0, 0.0)])
+def test_distance_to_another_model_counts_by_its_likelihood(deviance: float, share: float) -> None:
+    rivals = {"rotation": Rival(1.0, 50, 7.0), "rotation with a lens": Rival(1.0, 52, 7.0 + deviance, 0.4)}
+    assert of_models_px(rivals) == pytest.approx(0.4 * np.sqrt(share), abs=1e-6)
 
 
 def test_error_is_not_known_where_most_of_the_frame_stands_still(run_with: Callable) -> None:
