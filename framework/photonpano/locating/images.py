@@ -15,7 +15,7 @@ from scipy import fft
 
 from photonpano.geometry import corners, generators, jacobian, rescaled, slopes, unit_coordinates, why_implausible
 from photonpano.locating.configs import BlurPx, ImageLimits
-from photonpano.photometry import Similarity, autocorrelation, signal_to_noise, similarity_of, without_local_mean
+from photonpano.photometry import Similarity, autocorrelation, signal_to_noise, similarity_of, stabilised, without_local_mean
 from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLocated, VirtualExposure
 
 # Fraction of pixels clipped to black and to white, so that single hot pixels do not reduce the contrast of the rest.
@@ -107,7 +107,9 @@ def view_of(exposure: VirtualExposure, blur_px: float) -> View:
     std = exposure.response.stabilised_std(np.where(known, exposure.weight, np.float32(1)))
     # A pixel at a smaller scale averages those of the frames that it covers.
     variance = np.where(known, std * std, np.float32(0)) * np.float32(min(1.0, exposure.scale) ** 2)
-    image, noise, near = _blurred(_stabilised(exposure), variance, known.astype(np.float32), blur_px=blur_px)
+    image, noise, near = _blurred(
+        stabilised(exposure.flux, exposure.weight, exposure.response), variance, known.astype(np.float32), blur_px=blur_px
+    )
     bridged = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     border = math.ceil(_BORDER * blur_px)
     square = np.ones((2 * border + 1, 2 * border + 1), np.uint8)
@@ -153,7 +155,8 @@ def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray
     """
     known = exposure.weight > 0
     # Masked pixels have no weight; all others have the same, since weights by numbers of frames would shift structures.
-    weighted, weight = _blurred(_stabilised(exposure), known.astype(np.float32), blur_px=blur_px)
+    values = stabilised(exposure.flux, exposure.weight, exposure.response)
+    weighted, weight = _blurred(values, known.astype(np.float32), blur_px=blur_px)
     image = weighted / np.maximum(weight, 1e-6)
     mask = np.where(known, np.uint8(255), np.uint8(0))
     if not known.any():
@@ -161,12 +164,6 @@ def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray
     low, high = np.quantile(image[known], (_CLIPPED, 1 - _CLIPPED))
     stretched = (image - low) * (255 / max(high - low, 1e-6))
     return np.clip(np.rint(stretched), 0, 255).astype(np.uint8), mask
-
-
-def _stabilised(exposure: VirtualExposure) -> NDArray[np.float32]:
-    """Return the flux on the scale on which its noise is uniform, 0 at masked pixels."""
-    stabilised = exposure.response.stabilised(exposure.flux, exposure.weight)
-    return np.where(exposure.weight > 0, stabilised, np.float32(0))
 
 
 def _blurred(*images: NDArray[np.float32], blur_px: float) -> tuple[NDArray[np.float32], ...]:
