@@ -30,6 +30,7 @@ _AFFINE = (0, 1, 2, 3, 4, 5)
 PRIOR_STD = 0.03
 MIN_COMMON_CURVATURE = 1e-3  # floor on the eigenvalues of the curvature that two images have in common, relative to their own
 SMALLEST_SIDE = 24  # images are not halved to fewer pixels than this along a side
+_INTERPOLATED = 13 / 18  # share of the noise of two aligned images that is left where one of them is interpolated linearly
 _COMPARED_PIXEL = 4  # images are compared in pixels 4 times as large, where noise is small and motion blur hardly matters
 
 # Reasons of `NotLocated`.
@@ -173,6 +174,18 @@ def _blurred(*images: NDArray[np.float32], blur_px: float) -> tuple[NDArray[np.f
     return tuple(np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px), np.float32) for image in images)
 
 
+def noise_of(noise_ratio: float) -> float:
+    """Return the variance of the noise of two aligned images, relative to what is expected of photons, from their residuals.
+
+    It is below 1 in the dark, where pixels hold less than a photon and no scale makes noise uniform, and for sensors whose
+    counts scatter less than those of photons. Interpolation alone makes residuals smaller, but not the noise.
+
+    Args:
+        noise_ratio: mean squared residual relative to the expected variance.
+    """
+    return max(noise_ratio, min(1.0, noise_ratio / _INTERPOLATED), 1e-6)
+
+
 def free_parameters(depth: int, layers: int) -> tuple[int, ...]:
     """Return which of p1..p8 to estimate on a layer of a pyramid.
 
@@ -271,7 +284,7 @@ def motion_from_images(
     curvature = _common_curvature(_derivatives(moving, both), _derivatives(there, both), weight)
     if curvature is None:
         return NotLocated("where the images overlap after alignment, there is no texture", found)
-    curvature, estimated = curvature * efficiency / max(1.0, found["noise_ratio"]), list(free)
+    curvature, estimated = curvature * efficiency / noise_of(found["noise_ratio"]), list(free)
     # Errors of the parameters that are held bias those that are estimated.
     rows = curvature[estimated]
     information = rows.T @ np.linalg.solve(curvature[np.ix_(estimated, estimated)], rows)
