@@ -23,6 +23,7 @@ _MIN_GROUPS = 8  # fewest groups at level 1 that are lengthened for more light, 
 _SLOW_GROUPS = 16  # fewest groups of a long capture, however slow: between their instants, the motion is interpolated
 _NEARLY_WHOLE = 0.1  # a group that exceeds whole periods by less than this fraction of one is shortened to them
 _MOST_LENGTHENED = 4  # longest period of the light that a group is lengthened to, in groups
+_AWAY = 0.5  # longest group as a share of the frames after which an image that returns is farthest away
 _EPSILON = 1e-9  # floor on flux and speed in divisions
 _DEFAULT_SIZE = 500  # frames of a group if the speed of the image is unknown
 
@@ -175,10 +176,11 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
 
     A group of m frames is blurred by m v px at v px per frame. The blur may be 0.15 of the shorter side of a frame; up to twice
     that while a pixel collects fewer than 3 photons; down to 0.04 while it collects more than 1000. A group has at least
-    `shortest` frames, and the capture at least 16 groups.
+    `shortest` frames, and the capture at least 16 groups. A motion that returns averages away in longer groups than a quarter
+    of its period.
     """
     if capture.speed_px is None:
-        size, bound = _bounded(_DEFAULT_SIZE, n_frames, shortest)
+        size, bound = _bounded(_DEFAULT_SIZE, n_frames, shortest, capture.away_frames)
         return size, f"{capture.how}, so {_DEFAULT_SIZE} frames are assumed{bound}"
     longest = _BLUR * shorter_side_px / max(capture.speed_px, _EPSILON)
     flux = max(capture.flux, _EPSILON)
@@ -187,7 +189,7 @@ def choose_group_size(capture: CaptureSummary, n_frames: int, shorter_side_px: i
         wanted, light = min(_DARK_PHOTONS / flux, _DARK_BLUR * longest), ", so few that more blur is allowed"
     elif longest * flux > _BRIGHT_PHOTONS:
         wanted, light = max(_BRIGHT_PHOTONS / flux, longest * _BRIGHT_BLUR / _BLUR), ", enough to shorten groups for less blur"
-    size, bound = _bounded(wanted, n_frames, shortest)
+    size, bound = _bounded(wanted, n_frames, shortest, capture.away_frames)
     blur_px = size * capture.speed_px
     return size, (
         f"at {capture.speed_px:.2g} px per frame ({capture.how}) groups of {size} frame{'s' * (size > 1)} are blurred by "
@@ -207,11 +209,17 @@ def whole_periods(size: int, period_frames: float | None, n_frames: int) -> int:
     return lengthened if lengthened <= n_frames // _MIN_GROUPS else size
 
 
-def _bounded(wanted: float, n_frames: int, shortest: int) -> tuple[int, str]:
+def _bounded(wanted: float, n_frames: int, shortest: int, away_frames: float | None) -> tuple[int, str]:
     """Return the nearest size that suits the capture, and a clause with the reason if it is not the wanted one."""
-    longest = max(shortest, n_frames // _SLOW_GROUPS)
+    longest, bound = n_frames // _SLOW_GROUPS, f"; of longer groups there would be fewer than {_SLOW_GROUPS}"
+    if away_frames is not None and _AWAY * away_frames < longest:
+        longest = int(_AWAY * away_frames)
+        bound = (
+            f"; in longer ones the motion averages away, since the image is farthest after {away_frames:.0f} frames and returns"
+        )
+    longest = max(shortest, longest)
     if wanted > longest:
-        return longest, f"; of longer groups there would be fewer than {_SLOW_GROUPS}"
+        return longest, bound
     if wanted < shortest:
         return shortest, "; shorter groups would be mostly noise" if shortest > 1 else ""
     return round(wanted), ""

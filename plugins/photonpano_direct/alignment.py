@@ -25,7 +25,7 @@ from photonpano.geometry import (
     violation,
     why_implausible,
 )
-from photonpano.locating import NO_TEXTURE, information_on_turn
+from photonpano.locating import NO_TEXTURE, information_on_turn, noise_of
 from photonpano_direct.normal_equations import (
     MOMENTS_X,
     MOMENTS_Y,
@@ -317,7 +317,7 @@ def _patches_of(sums: FloatArray, homography: Homography, shape: tuple[int, int]
     hessian = vectors @ (values[..., None] * np.swapaxes(vectors, -1, -2))
     steps = np.linalg.solve(hessian, sums[:, 3:5, None])[..., 0]
     # As for the whole template, the blur correlates the noise of neighbours: the step scatters by H^-1 M H^-1.
-    information = hessian @ np.linalg.pinv(scatter, hermitian=True) @ hessian / max(1.0, noise_ratio)
+    information = hessian @ np.linalg.pinv(scatter, hermitian=True) @ hessian / noise_of(noise_ratio)
     usable = (seen >= _LEAST_SEEN * shape[0] * shape[1] / len(sums)) & (np.linalg.norm(steps, axis=1) < _LARGEST_PX)
 
     # A patch that is seen at x + step of the template is where the homography maps x; so its middle lies a step before.

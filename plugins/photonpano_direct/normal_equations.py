@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from photonpano import FloatArray, Homography
 from photonpano.compiling import compiled
 from photonpano.geometry import run_from, sample_run, visible_columns
-from photonpano.locating import MIN_COMMON_CURVATURE, PRIOR_STD
+from photonpano.locating import MIN_COMMON_CURVATURE, PRIOR_STD, noise_of
 
 
 @compiled
@@ -453,7 +453,7 @@ def information_of(
     if not _cholesky(scatter, root):
         return PRIOR.copy(), np.inf, 0.0
     _solve_lower(root, hessian)
-    information = hessian.T @ hessian / max(1.0, noise_ratio) + PRIOR
+    information = hessian.T @ hessian / noise_of(noise_ratio) + PRIOR
     std_px = expected_px(information, np.eye(8), coordinates.to_corners)
     # From steps in unit coordinates of the template to p1..p8 of the homography, with h33 = 1.
     changed = homography @ coordinates.generators

@@ -22,6 +22,7 @@ from .images import correlation_surface as correlation_surface
 from .images import follows as follows
 from .images import free_parameters as free_parameters
 from .images import motion_from_images as motion_from_images
+from .images import noise_of as noise_of
 from .images import shift_between as shift_between
 from .images import shift_of_spectra as shift_of_spectra
 from .images import stabilised_8_bit as stabilised_8_bit

@@ -15,7 +15,7 @@ from scipy import fft
 
 from photonpano.geometry import corners, generators, jacobian, rescaled, slopes, unit_coordinates, why_implausible
 from photonpano.locating.configs import BlurPx, ImageLimits
-from photonpano.photometry import Similarity, autocorrelation, signal_to_noise, similarity_of, without_local_mean
+from photonpano.photometry import Similarity, autocorrelation, signal_to_noise, similarity_of, stabilised, without_local_mean
 from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLocated, VirtualExposure
 
 # Fraction of pixels clipped to black and to white, so that single hot pixels do not reduce the contrast of the rest.
@@ -30,6 +30,7 @@ _AFFINE = (0, 1, 2, 3, 4, 5)
 PRIOR_STD = 0.03
 MIN_COMMON_CURVATURE = 1e-3  # floor on the eigenvalues of the curvature that two images have in common, relative to their own
 SMALLEST_SIDE = 24  # images are not halved to fewer pixels than this along a side
+_INTERPOLATED = 13 / 18  # share of the noise of two aligned images that is left where one of them is interpolated linearly
 _COMPARED_PIXEL = 4  # images are compared in pixels 4 times as large, where noise is small and motion blur hardly matters
 
 # Reasons of `NotLocated`.
@@ -107,7 +108,9 @@ def view_of(exposure: VirtualExposure, blur_px: float) -> View:
     std = exposure.response.stabilised_std(np.where(known, exposure.weight, np.float32(1)))
     # A pixel at a smaller scale averages those of the frames that it covers.
     variance = np.where(known, std * std, np.float32(0)) * np.float32(min(1.0, exposure.scale) ** 2)
-    image, noise, near = _blurred(_stabilised(exposure), variance, known.astype(np.float32), blur_px=blur_px)
+    image, noise, near = _blurred(
+        stabilised(exposure.flux, exposure.weight, exposure.response), variance, known.astype(np.float32), blur_px=blur_px
+    )
     bridged = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     border = math.ceil(_BORDER * blur_px)
     square = np.ones((2 * border + 1, 2 * border + 1), np.uint8)
@@ -153,7 +156,8 @@ def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray
     """
     known = exposure.weight > 0
     # Masked pixels have no weight; all others have the same, since weights by numbers of frames would shift structures.
-    weighted, weight = _blurred(_stabilised(exposure), known.astype(np.float32), blur_px=blur_px)
+    values = stabilised(exposure.flux, exposure.weight, exposure.response)
+    weighted, weight = _blurred(values, known.astype(np.float32), blur_px=blur_px)
     image = weighted / np.maximum(weight, 1e-6)
     mask = np.where(known, np.uint8(255), np.uint8(0))
     if not known.any():
@@ -163,17 +167,23 @@ def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray
     return np.clip(np.rint(stretched), 0, 255).astype(np.uint8), mask
 
 
-def _stabilised(exposure: VirtualExposure) -> NDArray[np.float32]:
-    """Return the flux on the scale on which its noise is uniform, 0 at masked pixels."""
-    stabilised = exposure.response.stabilised(exposure.flux, exposure.weight)
-    return np.where(exposure.weight > 0, stabilised, np.float32(0))
-
-
 def _blurred(*images: NDArray[np.float32], blur_px: float) -> tuple[NDArray[np.float32], ...]:
     """Return images blurred by a Gaussian of this standard deviation."""
     if blur_px == 0:
         return images
     return tuple(np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px), np.float32) for image in images)
+
+
+def noise_of(noise_ratio: float) -> float:
+    """Return the variance of the noise of two aligned images, relative to what is expected of photons, from their residuals.
+
+    It is below 1 in the dark, where pixels hold less than a photon and no scale makes noise uniform, and for sensors whose
+    counts scatter less than those of photons. Interpolation alone makes residuals smaller, but not the noise.
+
+    Args:
+        noise_ratio: mean squared residual relative to the expected variance.
+    """
+    return max(noise_ratio, min(1.0, noise_ratio / _INTERPOLATED), 1e-6)
 
 
 def free_parameters(depth: int, layers: int) -> tuple[int, ...]:
@@ -274,7 +284,7 @@ def motion_from_images(
     curvature = _common_curvature(_derivatives(moving, both), _derivatives(there, both), weight)
     if curvature is None:
         return NotLocated("where the images overlap after alignment, there is no texture", found)
-    curvature, estimated = curvature * efficiency / max(1.0, found["noise_ratio"]), list(free)
+    curvature, estimated = curvature * efficiency / noise_of(found["noise_ratio"]), list(free)
     # Errors of the parameters that are held bias those that are estimated.
     rows = curvature[estimated]
     information = rows.T @ np.linalg.solve(curvature[np.ix_(estimated, estimated)], rows)

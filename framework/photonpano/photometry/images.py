@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.values import BoolArray, FloatArray, VirtualExposure
+from photonpano.values import BoolArray, FloatArray, Response, VirtualExposure
 
 # Factors of red, green and blue in a picture: all 1, those that make the mean grey, or given ones.
 WhiteBalance: TypeAlias = Literal["none", "grey-world"] | tuple[float, float, float]
@@ -298,6 +298,20 @@ def similarity_of(
     return Similarity(noise_free_correlation(covariance, noise, independent), structures, score)
 
 
+def stabilised(flux: NDArray[np.float32], weight: NDArray[np.float32], response: Response) -> NDArray[np.float32]:
+    """Return the flux of an exposure on the scale on which its noise is uniform, 0 where nothing was seen.
+
+    Where pixels hold less than a photon, values on that scale depend on the number of frames. Those that a mask covers in part
+    would be brighter, and stand still while the scene moves: there, all pixels are taken as of the mean number of frames.
+    """
+    seen = weight > 0
+    if not seen.any():
+        return np.zeros_like(flux)
+    frames, mean = float(weight[seen].mean()), float(flux[seen].mean())
+    values = response.stabilised(flux, weight if frames * mean >= 1 else np.full_like(weight, frames))
+    return np.where(seen, values, np.float32(0))
+
+
 def signal_to_noise(exposure: VirtualExposure) -> float:
     """Return the standard deviation of the scene over that of a pixel's noise, on the scale where noise is uniform.
 
@@ -307,7 +321,7 @@ def signal_to_noise(exposure: VirtualExposure) -> float:
     seen = weight > 0
     if not seen.any():
         return 0.0
-    values = np.where(seen, exposure.response.stabilised(flux, weight), np.float32(0))
+    values = stabilised(flux, weight, exposure.response)
     sums, counts = sums_of_blocks(values, _BLOCK), sums_of_blocks(seen.astype(np.float32), _BLOCK)
     full = counts == _BLOCK**2
     if np.count_nonzero(full) < 2:

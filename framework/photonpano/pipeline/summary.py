@@ -1,7 +1,8 @@
-"""Summarise a capture before any motion is known: its flux, and how fast its image moves."""
+"""Summarise a capture before any motion is known: its flux, how fast its image moves, and when it is back where it was."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from photonpano.motion.tracking import (
     noise_of_difference,
     shifted,
     shifts_between,
+    span_image,
     spectra_of,
     stabilised,
 )
@@ -32,6 +34,13 @@ _LARGE_SHIFT_PX = 2.0  # shift that is exact enough, in binned pixels
 _TOLERANCE_PX = 1.5
 # To find a capture without light, or a saturated one, 16 frames at each of 16 places are summed.
 _CHECKED_PLACES, _CHECKED_FRAMES = 16, 16
+# Whether the image returns is read from this many sums all over the capture, of this many frames at most. They are shorter in
+# light: this many photons in a binned pixel are enough.
+_SUMS, _LONGEST_SUM, _SUMMED_PHOTONS = 256, 16, 2.0
+_LEAST_LAGS = 8  # sums in a quarter of the capture, within which a return is looked for
+_PARTS = 9  # the likeness of sums is averaged over each of this many parts of the capture, to know its scatter
+_RETURNED = 6.0  # least rise of the likeness, in standard errors over the parts: that of photon noise is below 5
+_RETURN_PX = 1.0  # the image returns from farther away than this
 
 
 class _Speed(NamedTuple):
@@ -57,10 +66,44 @@ def summarise(source: Source, threads: int = 1) -> CaptureSummary:
     places = list(in_order(lambda centre: _measure(source, centre, lengths), centres, threads))
     flux = float(np.mean([flux for flux, _ in places]))
     speeds = sorted((speed for _, speed in places if speed is not None), key=lambda speed: -speed.px)
+    away_frames = _away_frames(source, flux, threads)
     if len(speeds) < 2:  # one may agree by chance
-        return CaptureSummary(flux, None, f"no motion was found at any of {_PLACES} places")
+        return CaptureSummary(flux, None, f"no motion was found at any of {_PLACES} places", away_frames=away_frames)
     how = f"the second fastest of {len(speeds)} places, from sums of {speeds[1].frames} frames"
-    return CaptureSummary(flux, speeds[1].px, how)
+    return CaptureSummary(flux, speeds[1].px, how, away_frames=away_frames)
+
+
+def _away_frames(source: Source, flux: float, threads: int) -> float | None:
+    """Return after how many frames an image that returns is farthest from where it was; None if it does not return.
+
+    The likeness of two sums is the product of their spectra. Averaged over all sums that are some frames apart, it shows what
+    moves in the dark, where no two sums do: it falls while the image moves away, and rises again as it comes back. An image
+    that moves on never makes it rise.
+    """
+    n_frames, binning = source.info.n_frames, binning_of(source)
+    step = max(1.0, n_frames / _SUMS)
+    enough = math.ceil(_SUMMED_PHOTONS / max(flux * binning**2, 1e-9))
+    length = max(1, min(int(step), _LONGEST_SUM, enough))
+    starts = np.arange(0, n_frames - length + 1, step).astype(int).tolist()
+    if len(starts) // 4 < _LEAST_LAGS:
+        return None
+    images = list(in_order(lambda start: span_image(source, FrameSpan(start, start + length)), starts, threads))
+    spectra = spectra_of([image / max(float(image.mean()), 1e-9) for image in images])
+    flat = spectra.reshape(len(spectra), -1)
+    products = (flat @ flat.conj().T).real
+    first, lags = np.arange(len(flat) * 3 // 4), np.arange(1, len(flat) // 4)
+    likeness = np.array([products[part[:, None], part[:, None] + lags].mean(axis=0) for part in np.array_split(first, _PARTS)])
+    # What a shift along x or y would take from it.
+    height, width = images[0].shape
+    cycles = _RETURN_PX / binning * np.fft.fftfreq(height)[:, None], _RETURN_PX / binning * np.fft.rfftfreq(width)
+    lost = 1 - sum(np.cos(2 * np.pi * each) for each in cycles) / 2
+    least = max(float((lost * (spectra[:-1] * spectra[1:].conj()).real).sum(axis=(1, 2)).mean()), 0.0)
+    rises = likeness[:, None, :] - likeness[:, :, None] - least
+    errors = rises.std(axis=0, ddof=1) / math.sqrt(_PARTS)
+    # Few parts know their scatter badly, and that of photon noise is the same at all lags.
+    errors = np.maximum(errors, np.median(errors))
+    returned = np.flatnonzero(np.triu(rises.mean(axis=0) > _RETURNED * errors, 1).any(axis=0))
+    return float(step * lags[likeness.mean(axis=0)[: returned[0]].argmin()]) if len(returned) else None
 
 
 def _measure(source: Source, centre: float, lengths: Sequence[int]) -> tuple[float, _Speed | None]:

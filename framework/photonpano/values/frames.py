@@ -145,6 +145,8 @@ class CaptureSummary:
     how: str  # a clause that says how the speed was measured, for the reasons of decisions
     # period of light that flickers, in frames; None in steady light, or before the light is known
     period_frames: float | None = None
+    # frames after which an image that returns is farthest from where it was; None if it does not return
+    away_frames: float | None = None
     shortened: int = 1  # groups are to be chosen this many times shorter, since exposures of longer ones could not be located
 
 

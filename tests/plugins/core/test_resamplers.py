@@ -122,8 +122,15 @@ def test_stratified_depends_on_seed_and_level_only() -> None:
 HOW = "the second fastest of 12 places, from sums of 64 frames"
 
 
-def choice(flux: float, speed_px: float | None, n_frames: int = 10_000, how: str = HOW, shortest: int = 16) -> tuple[int, str]:
-    return choose_group_size(CaptureSummary(flux, speed_px, how), n_frames, 254, shortest)
+def choice(
+    flux: float,
+    speed_px: float | None,
+    n_frames: int = 10_000,
+    how: str = HOW,
+    shortest: int = 16,
+    away_frames: float | None = None,
+) -> tuple[int, str]:
+    return choose_group_size(CaptureSummary(flux, speed_px, how, away_frames=away_frames), n_frames, 254, shortest)
 
 
 def built(stream: StreamInfo, name: str = "midpoint", **context: Any) -> Any:
@@ -159,6 +166,14 @@ NO_SPEED = "no motion was found at any of 12 places"
         ((0.5, 0.07), 544, "photons per pixel"),  # which are too few
         ((0.01, None, 10_000, NO_SPEED), 500, f"{NO_SPEED}, so 500 frames are assumed"),
         ((0.01, None, 2000, NO_SPEED), 125, "so 500 frames are assumed; of longer groups there would be fewer than 16"),
+        ((0.5, 0.15, 10_000, HOW, 16, 600.0), 254, "hold 127 photons per pixel"),
+        (
+            (1e-4, 0.003, 5919, HOW, 16, 116.3),
+            58,
+            "; in longer ones the motion averages away, since the image is farthest after 116 frames and returns",
+        ),
+        ((0.01, None, 10_000, NO_SPEED, 16, 300.0), 150, "the image is farthest after 300 frames and returns"),
+        ((0.5, 0.001, 10_000, HOW, 16, 20.0), 16, "the image is farthest after 20 frames and returns"),
         # At 500 frames per second the image may move by tens of px per frame.
         ((20, 10.0, 10_000, HOW, 1), 4, "photons per pixel"),
         (

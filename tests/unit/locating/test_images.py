@@ -57,6 +57,24 @@ def test_view_interpolates_single_pixels_and_masks_borders(photograph: Callable)
     assert seen[5:155, 105:235].all()
 
 
+def half_seen(exposure: VirtualExposure, rows: slice, seed: int) -> VirtualExposure:
+    """Leave half of the frames of some rows, as a mask of dead rows does at half the scale."""
+    counts = np.rint(-np.expm1(-exposure.flux) * exposure.weight).astype(int)
+    counts[rows] = np.random.default_rng(seed).binomial(counts[rows], 0.5)
+    exposure.weight[rows] /= 2
+    flux = exposure.response.flux((counts / exposure.weight).astype(np.float32), exposure.weight)
+    return replace(exposure, flux=flux)
+
+
+@pytest.mark.parametrize("flux", [3e-4, 0.05])
+def test_rows_that_a_mask_covers_in_part_do_not_stand_out_from_noise(photograph: Callable, flux: float) -> None:
+    rows = slice(20, None, 10)
+    view = view_of(half_seen(photograph(np.full(SHAPE, flux)), rows, seed=1), 1.0)
+    inside = np.where(view.seen, view.image, np.nan)[:, 10:-10]
+    excess = np.nanmean(inside[rows]) - np.nanmean(inside[15::10])
+    assert abs(excess) < 0.3 * np.nanstd(inside[15::10])
+
+
 STILL = np.eye(3)
 
 

@@ -82,3 +82,27 @@ def test_summary_has_no_speed_in_the_dark_or_without_texture(flux: float, contra
 def test_preview_spans_are_a_step_apart_within_the_capture(group_size: int, step: int, starts: list[int]) -> None:
     spans = preview_spans(StreamInfo(100, 4, 8, None), group_size, step)
     assert spans == [FrameSpan(start, start + group_size) for start in starts]
+
+
+def swaying(amplitude_px: float, period: float, flux: float, drift_px: float = 0.0, n_frames: int = 800) -> Film:
+    return Film(lambda frame: 20 + drift_px * frame + amplitude_px * np.sin(2 * np.pi * frame / period), n_frames, flux)
+
+
+@pytest.mark.parametrize(("period", "flux"), [(80.0, 0.05), (160.0, 0.05), (80.0, 0.3)])
+def test_summary_finds_after_how_many_frames_an_image_that_returns_is_farthest(period: float, flux: float) -> None:
+    """Sums of 80 frames or more, which are exact in the dark, average it away."""
+    assert summarise(swaying(4.0, period, flux)).away_frames == pytest.approx(period / 2, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "film",
+    [
+        swaying(0, 80, 0.3),  # stands still
+        swaying(0, 80, 0.02, drift_px=0.1),
+        swaying(2, 80, 0.3, drift_px=0.2),  # moves on while it trembles
+        swaying(0.5, 80, 0.3),  # within a pixel
+        swaying(0, 80, 0.3, n_frames=20),
+    ],
+)
+def test_an_image_that_stands_still_or_moves_on_does_not_return(film: Film) -> None:
+    assert summarise(film).away_frames is None
