@@ -318,5 +318,5 @@ EVENTS = SourceContribution(
     build=lambda config, _: _open(config),
     check=lambda config: objections(_placed, config),
     recognise=_recognise,
-    suffixes=(".npy", ".npz", ".csv", *_SUFFIXES),
+    suffixes=(".npz", ".csv", *_SUFFIXES),
 )

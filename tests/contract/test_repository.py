@@ -92,7 +92,7 @@ def test_every_extra_is_what_a_component_asks_for() -> None:
     rows = [entry for entry in photonpano.discover().rows if entry.origin.plugin == "photonpano"]
     asked = {requirement.install for entry in rows for requirement in entry.contribution.requires}
     asked |= {install for _, install in LIBRARIES.values() if install.startswith("photonpano[")}
-    asked.add("photonpano[xarray]")  # for load_xarray alone
+    asked |= {"photonpano[xarray]", "photonpano[fits]"}  # for load_xarray alone, and for some of the lists of photons
     extras = {
         f"photonpano[{name}]" for name in PROJECT["project"]["optional-dependencies"] if name not in ("dev", "docs", "testing")
     }

@@ -121,7 +121,11 @@ def parts_apart(slopes: FluxImage) -> list[PartsApart]:
             if np.linalg.matrix_rank(normal) < len(normal):
                 continue
             covariance = np.linalg.inv(normal)
-            away, std = covariance @ columns.T @ right, np.sqrt(np.diag(covariance))
+            away = covariance @ columns.T @ right
+            shifts = np.divide(right, information, out=np.zeros(number), where=information > 0)
+            # Along a pan, a row sees the same edges all the time, at the same fraction of a pixel: rows scatter beyond noise.
+            scatter = (information * (shifts - columns @ away) ** 2).sum() / max(np.count_nonzero(information) - len(away), 1)
+            std = np.sqrt(np.diag(covariance) * max(1.0, float(scatter)))
             for part, index in ((f"odd and even {line}", -2), (halves, -1)):
                 found.append(PartsApart(part, abs(float(away[index])), abs(float(away[index] / std[index]))))
     return found
