@@ -29,6 +29,7 @@ PICTURES = {
     "room": scenes.room,
     "mandrill": scan.mandrill,
     "usaf usaf-contrast": gallery.usaf,
+    "nebula": gallery.nebula,
     "super-resolution": scenes.super_resolution,
     "high-speed": scenes.high_speed,
 }

@@ -1,4 +1,4 @@
-"""Pictures of real captures: a resolution chart that turns on a fan, and how much of its bars is left."""
+"""Pictures of real captures: a resolution chart that turns on a fan, how much of its bars is left, and a nebula in X-rays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import picture_parts as draw
 from harness import EXAMPLES, Study
 from numpy.typing import NDArray
 
-from photonpano import load_panorama, load_spec, load_trajectory, open_source, run, warp
+from photonpano import FrameSpan, load_panorama, load_spec, load_trajectory, open_source, parse_spec, run, warp
+from photonpano.capture import Capture
 from photonpano.geometry import transform_points, translation
 
 # From pixels of the middle frame of usaf.yaml to the chart, upright, 4 px for each.
@@ -26,6 +27,8 @@ _BARS = (
 _PERIOD = 57.7  # of the bars of the first element; that of the next is shorter by the sixth root of 2
 _REACH = 8  # px of the upright chart by which bars may lie beside their places
 _FRAMES = (5, 10, 20, 40, 70, 100)
+_PULSAR, _AROUND, _STEP = (272, 295), 60, 0.5  # x and y of the pulsar, and what is shown around it, in px of 4x4 pixels
+_BLOCK = 500  # frames read at once
 _KNOWN_DEG, _KNOWN_CENTRE = -3.40, (231.0, 233.0)  # turn of the fan by frame, and its axis: where merged frames vary most
 
 
@@ -57,6 +60,41 @@ def usaf(study: Study) -> Iterator[tuple[str, draw.Picture]]:
     for name, of_frames in contrasts.items():
         for n, values in of_frames.items():
             print(name, n, " ".join(f"{value:.2f}" for value in values))
+
+
+def nebula(study: Study) -> Iterator[tuple[str, draw.Picture]]:
+    """Yield the photons of a nebula as they fell on the sensor, along the motion, and along that of the star tracker.
+
+    The file is as `tests/benchmarks/gallery.py` downloads it, in the folder of the study.
+    """
+    source = {"use": "events", "with": {"path": str(study.folder / "msh1552_acis_evt2_filtered.fits"), "bin": 4}}
+    folder = study.folder / "nebula"
+    plan = parse_spec({"version": 1, "source": source}, output=folder)
+    if not (folder / "run.json").exists():
+        run(plan)
+    found = load_trajectory(folder).homographies
+    with open_source(plan) as opened:
+        assert isinstance(opened, Capture)
+        truth, info = opened.truth(), opened.info
+        spans = [FrameSpan(start, min(start + _BLOCK, info.n_frames)) for start in range(0, info.n_frames, _BLOCK)]
+        photons = [np.argwhere(opened.frames(span)) + np.array([span.start, 0, 0]) for span in spans]
+    assert truth is not None
+    known = np.asarray(truth["homographies"], np.float64)
+    frame, y, x = np.concatenate(photons).T
+    motions = {
+        "as they fell on the sensor": np.broadcast_to(np.eye(3), found.shape),
+        "along the motion that was found": found,
+        "along that of the star tracker": np.linalg.inv(known[len(known) // 2]) @ known,
+    }
+    shown = {}
+    for name, motion in motions.items():
+        # The motion is a shift to 0.1 px over the part that is shown.
+        move = transform_points(motion, np.array([_PULSAR], float))[:, 0] - _PULSAR
+        edges = [np.arange(middle - _AROUND, middle + _AROUND, _STEP) for middle in _PULSAR[::-1]]
+        image, _, _ = np.histogram2d(y + move[frame, 1], x + move[frame, 0], edges)
+        smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.5)
+        shown[name] = draw.picture(cv2.resize(np.sqrt(smooth), None, fx=1.5, fy=1.5, interpolation=cv2.INTER_CUBIC))
+    yield "nebula.png", draw.beside(draw.all_labelled(shown))
 
 
 def _turned(frames: int) -> NDArray[np.float64]:
