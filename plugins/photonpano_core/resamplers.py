@@ -155,7 +155,9 @@ class AutoResampler:
             if (lengthened := whole_periods(size, capture.period_frames, n_frames)) != size:
                 reason += f"; {lengthened} are whole periods of the light, which each group then sees alike"
                 size = lengthened
-            self._doubled = self._densifies and capture.flux * size < _DIM_PHOTONS and n_frames // (2 * size) >= _MIN_GROUPS
+            # At both ends, half of a group is extrapolated, which fails where the motion returns within it.
+            longest = n_frames // _MIN_GROUPS if capture.away_frames is None else _AWAY * capture.away_frames
+            self._doubled = self._densifies and capture.flux * size < _DIM_PHOTONS and 2 * size <= longest
             if self._doubled:
                 reason += f"; from level {_DOUBLED_FROM} on, where the motion is known, groups are twice as long for more light"
             self._context.decide("group_size", size, reason)
