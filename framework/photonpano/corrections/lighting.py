@@ -55,7 +55,7 @@ _ARRAYS = (
     "camera_matrix",
     "tints",
     "std_tints",
-)  # the last ones if they are there
+)  # the last three if known
 _FLAT_SPANS, _FLAT_SPAN_PX = 128, 4.0  # most spans of frames that are compared; the image moves by no more than this in each
 _KNOTS_ACROSS = 12  # knots of the gain along the shorter side of a frame; between them, its logarithm is bilinear
 _LENGTH = 0.5  # distance over which knots are correlated, relative to the shorter side of a frame

@@ -112,11 +112,8 @@ def find_still(
         return np.zeros_like(usable), share, why
     side = 2 * (_SIDE_PX // 2 + 2) + 1  # a square that reaches over the edge of what stands shows motion
     mask = (single | (cv2.dilate(standing.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)) & usable
-    return (
-        mask,
-        share,
-        f"stand still in {len(sums) * n_frames} frames sampled all over the capture, while the rest moves{of_lines}",
-    )
+    where = f"in {len(sums) * n_frames} frames sampled all over the capture"
+    return mask, share, f"stand still {where}, while the rest moves{of_lines}"
 
 
 def _single_pixels(sums: NDArray[np.uint8], n_frames: int, usable: BoolArray) -> BoolArray:

@@ -169,10 +169,8 @@ def _hot_pixels(run: TestedRun) -> Found:
     for how, turned in (("upside down", known[::-1]), ("left to right", known[:, ::-1]), ("by 180 degrees", known[::-1, ::-1])):
         there = int((outlier & ~turned).sum()) / max(number, 1)
         if there > 0.5 + (~turned[known]).mean():  # more than half, beside those that any mask would hold
-            where, what_to_do = (
-                f"{where}; {there:.0%} of them lie where a mask turned {how} has its pixels",
-                f"turn the mask {how}",
-            )
+            where += f"; {there:.0%} of them lie where a mask turned {how} has its pixels"
+            what_to_do = f"turn the mask {how}"
     return Found(share, where, what_to_do=what_to_do)
 
 
