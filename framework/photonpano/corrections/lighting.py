@@ -45,17 +45,8 @@ _SMALLEST = 0.01  # least root mean square of a flicker, relative to the light
 _BRIGHTEST = 0.9  # quantile of the gain from which on frames are in the brightest light
 _DARKEST = 0.02  # least gain of spans from which slow changes are fitted
 LIGHT_FILE = "light.npz"
-_ARRAYS = (
-    "gain",
-    "waves",
-    "maps",
-    "to_map",
-    "frequency",
-    "std",
-    "camera_matrix",
-    "tints",
-    "std_tints",
-)  # the last three if known
+# The last three only where they are known.
+_ARRAYS = "gain", "waves", "maps", "to_map", "frequency", "std", "camera_matrix", "tints", "std_tints"
 _FLAT_SPANS, _FLAT_SPAN_PX = 128, 4.0  # most spans of frames that are compared; the image moves by no more than this in each
 _KNOTS_ACROSS = 12  # knots of the gain along the shorter side of a frame; between them, its logarithm is bilinear
 _LENGTH = 0.5  # distance over which knots are correlated, relative to the shorter side of a frame
