@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from photonpano.capture import part_of
 from photonpano.contracts.protocols import Source, camera_of_motion
+from photonpano.errors import PhotonpanoError
 from photonpano.execution.context import Context
 from photonpano.execution.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import View, box_of, plan_canvas, render
-from photonpano.motion.level import Timeline
-from photonpano.motion.loop import LevelResult, resample
+from photonpano.motion.frame_motion import FrameMotion
+from photonpano.motion.loop import resample
 from photonpano.pipeline.components import build_levels
+from photonpano.pipeline.estimate import estimate
+from photonpano.pipeline.passes import build_refiners, refine
 from photonpano.pipeline.rendering import build_renderer
-from photonpano.pipeline.state import State, model_of
+from photonpano.pipeline.state import State
 from photonpano.record.run_json import peak_memory_bytes
 from photonpano.specs.plan import Plan
 from photonpano.values import FrameSpan
@@ -35,7 +39,7 @@ class Forecast:
     Attributes:
         tried: the frames of the trial.
         threads: the number of threads of the trial.
-        seconds: expected time of each level, and of the panorama.
+        seconds: expected time of each level, of what corrects the capture between them, of the residuals, and of the panorama.
         memory_bytes: expected peak memory of the process.
         canvas: (height, width) of the panorama if the camera keeps moving as in the trial and never returns; of a part of it
             (`render.extent`), that of the part.
@@ -49,34 +53,39 @@ class Forecast:
 
 
 def forecast(plan: Plan, source: Source) -> Forecast:
-    """Run all levels on a part of the capture, and extrapolate: time is proportional to the number of frames.
+    """Run all of the pipeline on a part of the capture, and extrapolate: time is proportional to the number of frames.
 
     Raises:
         PhotonpanoError: the trial failed, as the run would.
     """
     threads, n_frames = thread_count(plan.run.threads), source.info.n_frames
+    context = Context(threads=threads)
     groups = resample(build_levels(plan, source, [])[0], n_frames, Stopwatch())
     length = float(np.median([len(group.span) for group in groups]))
-    _tried(plan, part_of(source, _middle(n_frames, round(_WARM_UP_GROUPS * length))), threads)
+    with suppress(PhotonpanoError):
+        _tried(plan, part_of(source, _middle(n_frames, round(_WARM_UP_GROUPS * length))), context)
     span = _middle(n_frames, round(TRIAL_GROUPS * length))
     part, more = part_of(source, span), n_frames / len(span)
-    results = _tried(plan, part, threads)
-    seconds = {f"level {result.level.number}": sum(result.seconds.values()) * more for result in results}
+    state, motion, elapsed = _tried(plan, part, context)
+    seconds = {f"level {result.level.number}": sum(result.seconds.values()) * more for result in state.results}
+    seconds["corrections"] = max(elapsed[0] * more - sum(seconds.values()), 0.0)
+    seconds["residuals"] = elapsed[1] * more
     start = time.perf_counter()
-    renderer, trajectory, scale = build_renderer(plan, part, []), results[-1].trajectory, plan.render.scale
-    bytes_per_pixel = renderer.bytes_per_pixel * channels_of(part)
+    seen, trajectory, scale = state.view.source, motion.trajectory, plan.render.scale
+    renderer = build_renderer(plan, seen, [])
+    bytes_per_pixel = renderer.bytes_per_pixel * channels_of(seen)
     camera = camera_of_motion(trajectory)
     view = View(plan.render.projection, plan.render.horizon == "level", camera, turns=camera is not None)
     memory = int(plan.run.memory)
     canvas = plan_canvas(trajectory, part.info.span, part.info.frame_shape, scale, memory, bytes_per_pixel, view=view)
     with one_thread_inside():
         render(
-            part,
+            seen,
             trajectory,
             part.info.span,
             canvas,
             tolerance_px=plan.render.tolerance_px,
-            context=Context(threads=threads),
+            context=context,
             renderer=renderer,
         )
     seconds["panorama"] = (time.perf_counter() - start) * more
@@ -100,19 +109,14 @@ def _expected_shape(plan: Plan, frame_shape: tuple[int, int], tried: Canvas, mor
     return (height, width) if tried.period_px is None else (tried.height, min(width, round(tried.period_px)))
 
 
-def _tried(plan: Plan, part: Source, threads: int) -> tuple[LevelResult, ...]:
-    levels, n_frames = build_levels(plan, part, []), part.info.n_frames
-    state = State(
-        plan=plan,
-        source=part,
-        context=Context(threads=threads),
-        reference=n_frames // 2,
-        levels=levels,
-        timeline=Timeline.regular(n_frames),
-        model=model_of(plan),
-    )
+def _tried(plan: Plan, part: Source, context: Context) -> tuple[State, FrameMotion, tuple[float, float]]:
+    """Estimate and refine the motion of a part, as a run does; also return the seconds that both took."""
+    start = time.perf_counter()
     with one_thread_inside():
-        return state.located(levels, None).results
+        state = estimate(plan, part, [], context)
+        estimated = time.perf_counter()
+        state, explained = refine(state, build_refiners(plan, state.view.source, []))
+    return state, explained.motion, (estimated - start, time.perf_counter() - estimated)
 
 
 def _middle(n_frames: int, length: int) -> FrameSpan:

@@ -135,7 +135,7 @@ def test_forecast_predicts_time_memory_and_canvas(small_spec: dict[str, Any]) ->
         n_frames = source.info.n_frames
     assert len(found.tried) == 20 * TRIAL_GROUPS < n_frames
     assert abs(found.tried.centre - (n_frames - 1) / 2) <= 1
-    assert set(found.seconds) == {"level 1", "level 2", "panorama"}
+    assert set(found.seconds) == {"level 1", "level 2", "corrections", "residuals", "panorama"}
     assert min(found.seconds.values()) > 0
     assert found.memory_bytes > 30 * 2**20
     # The camera pans by 60 px over the capture, and trembles.
