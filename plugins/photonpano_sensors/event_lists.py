@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import gzip
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
-from photonpano.reading import BinarySource, FrameLayout, as_written, objections, read_start, reading, require_readable
+from photonpano.reading import BinarySource, FrameLayout, as_written, library, objections, read_start, reading, require_readable
 from photonpano.text import listed
 from photonpano.values import FloatArray
 
@@ -21,15 +21,13 @@ _FRAMES, _TIMES = ("frame", "frame_number", "expno"), ("time", "timestamp", "t",
 # Columns of the pixel, the likeliest first: in lists of telescopes, x and y lie on the sky.
 _PLACES = (("detx", "dety"), ("rawx", "rawy"), ("chipx", "chipy"), ("x", "y"), ("col", "row"), ("column", "row"))
 _SKY = ("x", "y")
-_SUFFIXES = (".fits", ".fit", ".evt", ".fits.gz", ".evt.gz")
+_SUFFIXES = (".npz", ".csv", ".fits", ".fit", ".evt", ".fits.gz", ".evt.gz")
 _LEAST_SHARE = 1e-3  # of frames that hold a photon: fewer, and times were taken for the numbers of frames
 _MOST_PX = 65535  # rows or columns
 _MOST_FRAMES = 32  # frames unpacked at once
 _FEWEST = 3  # columns of a list
 _NAME_THEM = "write columns: {when: ..., x: ..., y: ...}"
 _DAMAGED = "cannot be read as a list of photons: it is damaged or something else"
-
-Columns = Mapping[str, FloatArray]
 
 
 class ColumnsConfig(Config):
@@ -138,15 +136,21 @@ class SkyEventsSource(EventsSource):
 
 def _placed(config: EventsConfig) -> _Photons:
     """Read the photons of a list."""
-    path, columns = config.path, _columns(config.path)
-    names = config.columns or _named(path, list(columns), timed=config.frame_duration is not None)
+    path, table = config.path, _table(config.path)
+    names = config.columns or _named(path, table.names, timed=config.frame_duration is not None)
     used = [names.when, names.x, names.y, *([names.chip] if names.chip else []), *(names.sky or ())]
-    if missing := [name for name in used if name not in columns]:
-        raise InputError(f"{path} has no column {missing[0]!r}; its columns are {listed(list(columns))}")
-    values = {name: np.asarray(columns[name], float) for name in used}
+    if missing := [name for name in used if name not in table.names]:
+        raise InputError(f"{path} has no column {missing[0]!r}; its columns are {listed(table.names)}")
+    with reading(path, _DAMAGED):
+        values = {name: np.asarray(column, float) for name, column in table.read(used).items()}
+    lengths = [column.shape for column in values.values()]
+    if len(set(lengths)) > 1 or len(lengths[0]) != 1:
+        raise InputError(f"{path} has arrays of the shapes {listed(map(str, lengths))}; all columns have one length")
+    if not lengths[0][0]:
+        raise InputError(f"{path} holds no photon")
     for name, each in values.items():
         if (wrong := np.flatnonzero(~np.isfinite(each))).size:
-            raise InputError(f"{path} has no number in column {name!r} of row {wrong[0]}; leave such rows out")
+            raise InputError(f"{path} has no number in column {name!r} of row {wrong[0]}, from 0; leave such rows out")
     frames = _numbered(config, names.when, values[names.when])
     places = np.stack([values[names.x], values[names.y]], axis=1)
     if names.chip:
@@ -179,20 +183,19 @@ def _open(config: EventsConfig) -> EventsSource:
 
 def _numbered(config: EventsConfig, name: str, when: FloatArray) -> NDArray[np.int64]:
     """Return the frame of each photon, by the number in its list, or by its time."""
-    path, fallen = config.path, np.flatnonzero(np.diff(when) < 0)
-    if fallen.size:
-        before, after = when[fallen[0] : fallen[0] + 2]
-        raise InputError(
-            f"{path}: column {name!r} falls from {before:.10g} to {after:.10g} at row {fallen[0] + 1}; sort the list by it, or "
-            "unwrap the counter that began anew"
-        )
-    first = config.start if config.start is not None else float(when[0])
+    path, first = config.path, float(when.min()) if config.start is None else config.start
     if config.frame_duration is None and (broken := np.flatnonzero(when != np.floor(when))).size:
         raise InputError(
             f"{path}: column {name!r} has times, such as {when[broken[0]]:.10g}, not numbers of frames; write "
             "frame_duration, in their unit"
         )
     frames = np.floor((when - first) / (config.frame_duration or 1)).astype(np.int64)
+    if (fallen := np.flatnonzero(np.diff(frames) < 0)).size:
+        before, after = when[fallen[0] : fallen[0] + 2]
+        raise InputError(
+            f"{path}: column {name!r} falls from {before:.10g} to {after:.10g} at row {fallen[0] + 1}, from 0; sort the list "
+            "by it, or unwrap the counter that began anew"
+        )
     lit = len(np.unique(frames)) / (frames[-1] + 1 - min(int(frames[0]), 0))
     if config.n_frames is None and lit < _LEAST_SHARE:
         raise InputError(
@@ -226,50 +229,56 @@ def _named(path: Path, names: list[str], *, timed: bool = False) -> ColumnsConfi
     return ColumnsConfig(when=when, x=known[place[0]], y=known[place[1]], sky=sky)
 
 
-def _columns(path: Path) -> Columns:
-    """Read the columns of a list, by name; numbered, where they have none."""
+class _Table(NamedTuple):
+    """The columns of a list. Only its beginning was read."""
+
+    names: list[str]  # their numbers from 0, where they have no names
+    read: Callable[[Sequence[str]], Mapping[str, NDArray[Any]]]  # returns some columns, whole
+
+
+def _table(path: Path) -> _Table:
     require_readable(path)
     if _is_fits(path):
-        return _fits_columns(path)
-    with reading(path, _DAMAGED):
-        if path.suffix.lower() == ".npz":
+        return _fits_table(path)
+    if path.suffix.lower() == ".npz":
+        with reading(path, _DAMAGED), np.load(path, allow_pickle=False) as archive:
+            names = list(archive.files)
+
+        def read(used: Sequence[str]) -> Mapping[str, NDArray[Any]]:
             with np.load(path, allow_pickle=False) as archive:
-                return _of_one_length(path, {name: archive[name] for name in archive.files})
-        if path.suffix.lower() == ".npy":
-            array = np.load(path, allow_pickle=False)
-        else:
-            header = _header(path)
-            array = np.loadtxt(path, delimiter=",", ndmin=2, skiprows=int(header is not None), dtype=float)
-            if header is not None and len(header) == array.shape[1]:
-                return _of_one_length(path, dict(zip(header, array.T, strict=True)))
-    if (names := array.dtype.names) is not None:
-        return _of_one_length(path, {name: array[name] for name in names})
-    if array.ndim != 2 or array.shape[1] < _FEWEST:
-        raise InputError(f"{path} has the shape {array.shape}; a list of photons has a row for each, of frame or time, x and y")
-    return _of_one_length(path, {str(number): column for number, column in enumerate(array.T)})
+                return {name: archive[name] for name in used}
+
+        return _Table(names, read)
+    if path.suffix.lower() != ".npy":
+        return _csv_table(path)
+    with reading(path, _DAMAGED):
+        rows = np.load(path, "r", allow_pickle=False)
+    if rows.dtype.names:
+        return _Table(list(rows.dtype.names), lambda used: {name: rows[name] for name in used})
+    if rows.ndim != 2 or rows.shape[1] < _FEWEST:
+        raise InputError(f"{path} has the shape {rows.shape}; a list of photons has a row for each, of frame or time, x and y")
+    return _Table([str(number) for number in range(rows.shape[1])], lambda used: {name: rows[:, int(name)] for name in used})
 
 
-def _of_one_length(path: Path, columns: Columns) -> Columns:
-    """Return the columns that are as long as the first of usual name; an `InputError` if there are no photons."""
-    if len(columns) < _FEWEST:
-        raise InputError(f"{path} has the columns {listed(list(columns))}; a photon has a frame or time, x and y")
-    lengths = {name: column.shape for name, column in columns.items()}
-    if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
-        raise InputError(f"{path} has arrays of the shapes {listed(map(str, lengths.values()))}; all columns have one length")
-    if not next(iter(columns.values())).size:
-        raise InputError(f"{path} holds no photon")
-    return columns
-
-
-def _header(path: Path) -> list[str] | None:
-    """Return the names in the first line of a CSV file; None if it holds numbers."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+def _csv_table(path: Path) -> _Table:
+    with reading(path), path.open(encoding="utf-8", errors="replace") as file:
         fields = [field.strip().strip('"') for field in file.readline().lstrip("#").split(",")]
     try:
         [float(field) for field in fields]
     except ValueError:
-        return fields
-    return None
+        names, headers = fields, 1
+    else:
+        names, headers = [str(number) for number in range(len(fields))], 0
+
+    def read(used: Sequence[str]) -> Mapping[str, NDArray[Any]]:
+        places = [names.index(name) for name in used]
+        try:
+            rows = np.loadtxt(path, delimiter=",", ndmin=2, skiprows=headers, usecols=places)
+        except ValueError as error:
+            raise InputError(f"{path} is not a list of numbers: {error}") from error
+        return dict(zip(used, rows.T, strict=True))
+
+    return _Table(names, read)
 
 
 def _is_fits(path: Path) -> bool:
@@ -280,35 +289,34 @@ def _is_fits(path: Path) -> bool:
     return start.startswith(b"SIMPLE  =")
 
 
-def _fits_columns(path: Path) -> Columns:
-    try:
-        from astropy.io import fits
-    except ImportError as error:
-        raise InputError(f"{path} is a FITS file; pip install 'photonpano[fits]' to read it") from error
+def _fits_table(path: Path) -> _Table:
+    fits = library("astropy.io.fits", "photonpano[fits]", f"{path}, a FITS file,")
     with reading(path, _DAMAGED), fits.open(path) as units:
-        tables = [unit for unit in units if isinstance(unit, fits.BinTableHDU)]
+        tables = {unit.name: number for number, unit in reversed([*enumerate(units)]) if isinstance(unit, fits.BinTableHDU)}
         if not tables:
             raise InputError(f"{path} holds an image, and no table of photons; read pictures with image-folder")
-        table = next((unit for unit in tables if unit.name == "EVENTS"), tables[0])
-        found = {name: np.asarray(table.data[name]) for name in table.columns.names}
-    return _of_one_length(path, {name: each for name, each in found.items() if each.ndim == 1 and each.dtype.kind in "iuf"})
+        number = tables.get("EVENTS", min(tables.values()))
+        names = list(units[number].columns.names)
+
+    def read(used: Sequence[str]) -> Mapping[str, NDArray[Any]]:
+        with fits.open(path) as units:
+            return {name: np.array(units[number].data[name]) for name in used}
+
+    return _Table(names, read)
 
 
 def _recognise(path: Path) -> Recognised | None:
-    """Take a file whose columns have the usual names, and number the frames."""
-    is_table = path.suffix.lower() in (".npy", ".npz", ".csv") or "".join(path.suffixes[-2:]).lower().endswith(_SUFFIXES)
-    if not is_table or not path.is_file():
+    """Take a file whose columns have the usual names, or none, and number the frames."""
+    if not path.is_file() or not path.name.lower().endswith((".npy", *_SUFFIXES)):
         return None
     try:
-        names = _named(path, list(columns := _columns(path)))
+        names = _named(path, _table(path).names)
     except InputError:
         return None
-    if names.when == "0" or names.when.lower() not in _FRAMES:
+    if names.when.lower() not in ("0", *_FRAMES):
         return None
-    number = len(next(iter(columns.values())))
-    return Recognised(
-        {"path": as_written(path)}, f"it holds columns {names.when}, {names.x} and {names.y} of {number:,} photons"
-    )
+    unnamed = "rows of frame, x and y" if names.when == "0" else f"columns {names.when}, {names.x} and {names.y}"
+    return Recognised({"path": as_written(path)}, f"a list of photons: it holds {unnamed}")
 
 
 EVENTS = SourceContribution(
@@ -318,5 +326,5 @@ EVENTS = SourceContribution(
     build=lambda config, _: _open(config),
     check=lambda config: objections(_placed, config),
     recognise=_recognise,
-    suffixes=(".npz", ".csv", *_SUFFIXES),
+    suffixes=_SUFFIXES,
 )

@@ -83,8 +83,8 @@ def test_motion_of_a_telescope_is_the_truth(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("columns", "keys", "message"),
     [
-        ({"frame": FRAME[::-1]}, {}, "column 'frame' falls from 6 to 4 at row 1; sort the list by it"),
-        ({"x": X + np.array([0, np.nan, 0, 0, 0])}, {}, "no number in column 'x' of row 1"),
+        ({"frame": FRAME[::-1]}, {}, "column 'frame' falls from 6 to 4 at row 1, from 0; sort the list by it"),
+        ({"x": X + np.array([0, np.nan, 0, 0, 0])}, {}, "no number in column 'x' of row 1, from 0"),
         ({"x": X - 6}, {"frame_shape": (9, 9)}, "3 of 5 photons lie outside of the 9x9 px, the first at (-1, 2)"),
         ({"frame": 0.25 * FRAME}, {}, "column 'frame' has times, such as 0.75, not numbers of frames; write frame_duration"),
         ({"frame": FRAME * 10**9}, {}, "frames hold a photon; column 'frame' holds times: write a (longer) frame_duration"),
@@ -94,6 +94,7 @@ def test_motion_of_a_telescope_is_the_truth(tmp_path: Path) -> None:
             "of the columns x, y and a, it is unknown which hold a photon's frame and pixel; write",
         ),
         ({"x": X[:3]}, {}, "has arrays of the shapes (5,), (3,) and (5,); all columns have one length"),
+        ({"x": np.stack([X, X])}, {}, "has arrays of the shapes (5,), (2, 5) and (5,); all columns have one length"),
         ({"frame": [], "x": [], "y": []}, {}, "holds no photon"),
         ({"x": X * 10**6}, {}, "px; give frame_shape and origin, or a larger bin"),
         ({}, {"start": 8}, "no photon lies in the frames; correct start, n_frames or frame_duration"),
@@ -112,13 +113,37 @@ def test_what_is_wrong_with_a_list_is_named(
         opened(path, **keys)
 
 
+def test_photons_of_one_frame_may_come_in_any_order(tmp_path: Path) -> None:
+    with opened(saved(tmp_path, frame=None, time=[3.4, 3.1, 3.9, 4.2, 6.0]), frame_duration=1.0) as source:
+        lit = [tuple(place) for place in np.argwhere(source.frames(FrameSpan(0, 1))).tolist()]
+        assert lit == [(0, 0, 0), (0, 0, 1)]
+
+
+def test_lists_are_recognised_by_their_beginnings(tmp_path: Path) -> None:
+    """A packed capture has the ending of a list, too, and may have terabytes."""
+    np.lib.format.open_memmap(tmp_path / "cube.npy", "w+", np.uint8, (2**14, 1024, 1024)).flush()
+    assert EVENTS.recognise(tmp_path / "cube.npy") is None
+    np.lib.format.open_memmap(tmp_path / "list.npy", "w+", np.int64, (2**30, 3)).flush()
+    found = EVENTS.recognise(tmp_path / "list.npy")
+    assert found is not None
+    assert found.because == "a list of photons: it holds rows of frame, x and y"
+
+
+def test_field_of_a_csv_file_that_is_no_number_is_named(tmp_path: Path) -> None:
+    (tmp_path / "list.csv").write_text("x,y,frame\n1,2,3\n1,,3\n")
+    [objection] = EVENTS.check(EventsConfig(path=tmp_path / "list.csv"))
+    assert objection.startswith(
+        f"{tmp_path / 'list.csv'} is not a list of numbers: could not convert string '' to float64 at row 1"
+    )
+
+
 def test_picture_and_garbage_are_no_lists(tmp_path: Path) -> None:
     fits = pytest.importorskip("astropy.io.fits", reason="FITS needs photonpano[fits]")
     fits.PrimaryHDU(np.zeros((4, 5), np.float32)).writeto(tmp_path / "picture.fits")
     (tmp_path / "text.csv").write_text("one, two\nthree, four\n")
     for name, message in (
         ("picture.fits", "holds an image, and no table of photons"),
-        ("text.csv", "cannot be read as a list"),
+        ("text.csv", "it is unknown which hold a photon's frame"),
     ):
         assert EVENTS.recognise(tmp_path / name) is None
         with pytest.raises(InputError, match=message):
