@@ -112,3 +112,23 @@ def test_run_is_trusted_in_colour_and_follows_the_truth(
     assert scores.trajectory.errors_px.mean() < 0.15
     assert scores.below_oracle_db is not None
     assert scores.below_oracle_db < 0.3
+
+
+@pytest.mark.usefixtures("without_report")
+def test_red_lamp_that_goes_down_leaves_the_colours_alike_all_over_the_panorama(
+    scene: np.ndarray, homographies: np.ndarray, tmp_path: Path
+) -> None:
+    """With one gain for all colours, red over green would fall to 0.4 along the way."""
+    seen = np.stack([seen_along(each, homographies, SHAPE) for each in np.moveaxis(scene, -1, 0)], axis=-1)
+    seen[FRAMES // 2 :, ..., 0] *= 0.4
+    np.save(tmp_path / "cube.npy", PACK["packed-npy"](detected(seen, 6)))
+    source = {"use": "packed-npy", "with": {"path": str(tmp_path / "cube.npy"), "width": SHAPE[1]}}
+    spec = {"version": 1, "source": source, "resample": {"with": {"group_size": 25}}, "levels": 2}
+    run(parse_spec(spec, output=tmp_path / "run"))
+    with np.load(tmp_path / "run" / "light.npz") as light:
+        assert light["tints"].shape == (3, FRAMES)
+    flux = tifffile.imread(tmp_path / "run" / "panorama.tiff")
+    thirds = [np.array_split(image[..., :2], 3, axis=1) for image in (flux, scene[20:92, 10:172])]
+    found, true = ([np.nansum(part[..., 0]) / np.nansum(part[..., 1]) for part in parts] for parts in thirds)
+    ratios = np.array(found) / true
+    np.testing.assert_allclose(ratios / ratios.mean(), 1, atol=0.05)

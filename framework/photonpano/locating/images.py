@@ -15,7 +15,14 @@ from scipy import fft
 
 from photonpano.geometry import corners, generators, jacobian, rescaled, slopes, unit_coordinates, why_implausible
 from photonpano.locating.configs import BlurPx, ImageLimits
-from photonpano.photometry import Similarity, autocorrelation, signal_to_noise, similarity_of, stabilised, without_local_mean
+from photonpano.photometry import (
+    Similarity,
+    autocorrelation,
+    signal_to_noise,
+    similarity_of,
+    stabilised_flux,
+    without_local_mean,
+)
 from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLocated, VirtualExposure
 
 # Fraction of pixels clipped to black and to white, so that single hot pixels do not reduce the contrast of the rest.
@@ -108,9 +115,7 @@ def view_of(exposure: VirtualExposure, blur_px: float) -> View:
     std = exposure.response.stabilised_std(np.where(known, exposure.weight, np.float32(1)))
     # A pixel at a smaller scale averages those of the frames that it covers.
     variance = np.where(known, std * std, np.float32(0)) * np.float32(min(1.0, exposure.scale) ** 2)
-    image, noise, near = _blurred(
-        stabilised(exposure.flux, exposure.weight, exposure.response), variance, known.astype(np.float32), blur_px=blur_px
-    )
+    image, noise, near = _blurred(stabilised_flux(exposure), variance, known.astype(np.float32), blur_px=blur_px)
     bridged = cv2.morphologyEx(known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     border = math.ceil(_BORDER * blur_px)
     square = np.ones((2 * border + 1, 2 * border + 1), np.uint8)
@@ -156,7 +161,7 @@ def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray
     """
     known = exposure.weight > 0
     # Masked pixels have no weight; all others have the same, since weights by numbers of frames would shift structures.
-    values = stabilised(exposure.flux, exposure.weight, exposure.response)
+    values = stabilised_flux(exposure)
     weighted, weight = _blurred(values, known.astype(np.float32), blur_px=blur_px)
     image = weighted / np.maximum(weight, 1e-6)
     mask = np.where(known, np.uint8(255), np.uint8(0))

@@ -39,6 +39,7 @@ class LoopSetting:
     context: Context
     reference: int  # the frame whose homography is the identity
     timeline: Timeline  # where the image jumps, and which frames show something
+    finest: float = 1.0  # pixels of the last level's exposures per pixel of a frame
     model: MotionModel = HOMOGRAPHIES
     gyroscope: Gyroscope | None = None  # ties exposures, and knows how they tremble
 

@@ -112,7 +112,7 @@ def estimate_motion(
             break
         clock = Stopwatch()
         layered = capture_of(source).background is not None
-        model = replace(setting.model.knowing(camera_of_motion(previous)), layered=layered, rough=level.scale < 1)
+        model = replace(setting.model.knowing(camera_of_motion(previous)), layered=layered, rough=level.scale < setting.finest)
         setting = replace(setting, model=model)
         groups = timeline.parts(resample(level, source.info.n_frames, clock))
         turning = level.turning(model.turning_camera(source.info.frame_shape))

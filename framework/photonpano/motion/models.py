@@ -48,7 +48,7 @@ class MotionModel:
     distortion: tuple[float | None, float | None, float | None, float | None] = (0.0, 0.0, 0.0, 0.0)
     known: Camera | None = None  # the camera that the level before has found
     doubts_lens: bool = False  # whether the lens of that camera was found without being asked for
-    rough: bool = False  # whether a level that is more exact follows, which asks about the lens again
+    rough: bool = False  # whether a level of larger exposures follows, which asks about the lens again
     layered: bool = False  # whether frames are known to show more than a background that follows the camera
 
     @property

@@ -26,7 +26,7 @@ from photonpano.motion.graph import GraphOptions, GraphSolution
 from photonpano.motion.level import FrameHomography, NamedLocator, VirtualExposures
 from photonpano.motion.pairs import instants_of, lengths_of, shared_share
 from photonpano.motion.tracking import Place, StartingMotion, Track
-from photonpano.photometry import noise_free_correlation, stabilised
+from photonpano.photometry import noise_free_correlation, stabilised_flux
 from photonpano.values import Decision, Edge, FloatArray, FluxImage, Group, Homography, Located, NotLocated, VirtualExposure
 
 # Least similarity of a loop closure: that of one place is 0.9 and more in enough light, that of different places below 0.5.
@@ -105,7 +105,7 @@ def _averages(exposure: VirtualExposure) -> tuple[FluxImage, FluxImage]:
     Both are NaN where part of the block was not seen.
     """
     seen = exposure.weight > 0
-    values = np.where(seen, stabilised(exposure.flux, exposure.weight, exposure.response), np.float32(np.nan))
+    values = np.where(seen, stabilised_flux(exposure), np.float32(np.nan))
     variance = np.full_like(values, np.nan)
     variance[seen] = exposure.response.stabilised_std(exposure.weight[seen]) ** 2 / _BLOCK**2
     kernel = np.full((_BLOCK, _BLOCK), 1 / _BLOCK**2)

@@ -14,7 +14,7 @@ from .images import picture_of as picture_of
 from .images import signal_to_noise as signal_to_noise
 from .images import similarity_of as similarity_of
 from .images import srgb_to_linear as srgb_to_linear
-from .images import stabilised as stabilised
+from .images import stabilised_flux as stabilised_flux
 from .images import tapered as tapered
 from .images import tone_mapped as tone_mapped
 from .images import without_local_mean as without_local_mean

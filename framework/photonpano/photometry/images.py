@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.values import BoolArray, FloatArray, Response, VirtualExposure
+from photonpano.values import BoolArray, FloatArray, VirtualExposure
 
 # Factors of red, green and blue in a picture: all 1, those that make the mean grey, or given ones.
 WhiteBalance: TypeAlias = Literal["none", "grey-world"] | tuple[float, float, float]
@@ -298,17 +299,18 @@ def similarity_of(
     return Similarity(noise_free_correlation(covariance, noise, independent), structures, score)
 
 
-def stabilised(flux: NDArray[np.float32], weight: NDArray[np.float32], response: Response) -> NDArray[np.float32]:
+def stabilised_flux(exposure: VirtualExposure) -> NDArray[np.float32]:
     """Return the flux of an exposure on the scale on which its noise is uniform, 0 where nothing was seen.
 
     Where pixels hold less than a photon, values on that scale depend on the number of frames. Those that a mask covers in part
     would be brighter, and stand still while the scene moves: there, all pixels are taken as of the mean number of frames.
     """
+    flux, weight = exposure.flux, exposure.weight
     seen = weight > 0
     if not seen.any():
         return np.zeros_like(flux)
     frames, mean = float(weight[seen].mean()), float(flux[seen].mean())
-    values = response.stabilised(flux, weight if frames * mean >= 1 else np.full_like(weight, frames))
+    values = exposure.response.stabilised(flux, weight if frames * mean >= 1 else np.full_like(weight, frames))
     return np.where(seen, values, np.float32(0))
 
 
@@ -317,11 +319,11 @@ def signal_to_noise(exposure: VirtualExposure) -> float:
 
     At 1 and below, single pixels are mostly noise, and registration needs larger structures. 0 if there is no contrast.
     """
-    flux, weight = _some_rows(exposure.flux), _some_rows(exposure.weight)
+    rows = replace(exposure, flux=_some_rows(exposure.flux), weight=_some_rows(exposure.weight))
+    weight, values = rows.weight, stabilised_flux(rows)
     seen = weight > 0
     if not seen.any():
         return 0.0
-    values = stabilised(flux, weight, exposure.response)
     sums, counts = sums_of_blocks(values, _BLOCK), sums_of_blocks(seen.astype(np.float32), _BLOCK)
     full = counts == _BLOCK**2
     if np.count_nonzero(full) < 2:

@@ -62,7 +62,7 @@ def forecast(plan: Plan, source: Source) -> Forecast:
     context = Context(threads=threads)
     groups = resample(build_levels(plan, source, [])[0], n_frames, Stopwatch())
     length = float(np.median([len(group.span) for group in groups]))
-    with suppress(PhotonpanoError):
+    with suppress(PhotonpanoError):  # what fails here fails in the trial, too, or is too short for it
         _tried(plan, part_of(source, _middle(n_frames, round(_WARM_UP_GROUPS * length))), context)
     span = _middle(n_frames, round(TRIAL_GROUPS * length))
     part, more = part_of(source, span), n_frames / len(span)

@@ -73,6 +73,7 @@ class State:
             context=self.context,
             reference=self.reference,
             timeline=self.timeline,
+            finest=self.levels[-1].scale,
             model=self.model,
             gyroscope=self.gyroscope,
         )

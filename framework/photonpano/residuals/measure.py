@@ -80,8 +80,7 @@ class Residuals:
     block_chi2: FloatArray  # (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen
     pixel_gain: FluxImage  # (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted
     pixel_mean: FluxImage  # (H, W) predicted photons of each pixel, in one of four spans
-    # (4, H, W) how pixels lie beside the panorama, in these spans: see `add_pixel_sums`; None if that is not known
-    pixel_slopes: FluxImage | None = None
+    pixel_slopes: FluxImage  # (4, H, W) how pixels lie beside the panorama, in these spans: see `add_pixel_sums`
     # (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was seen
     cell_chi2: FloatArray
     cell_count: FloatArray  # (H', W') number of blocks that fell on each square

@@ -130,11 +130,7 @@ def _lens(run: TestedRun) -> Found | None:
 )
 def _parts(run: TestedRun) -> Found | None:
     """As where rows take turns, or a half of the sensor is read out some frames later than the other."""
-    residuals = run.explained.residuals
-    if residuals.pixel_slopes is None:
-        return None
-    misfit = max(1.0, float(residuals.reduced_chi2.mean())) ** 0.5
-    apart = [each for each in parts_apart(residuals.pixel_slopes) if each.sigmas > _SURE_SIGMAS * misfit]
+    apart = [each for each in parts_apart(run.explained.residuals.pixel_slopes) if each.sigmas > _SURE_SIGMAS]
     farthest = max(apart, key=lambda each: each.px, default=None)
     return farthest and Found(farthest.px, f"px between {farthest.parts}")
 

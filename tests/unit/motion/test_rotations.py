@@ -160,6 +160,15 @@ def test_patches_of_pairs_show_the_lens_that_their_homographies_follow(focal_px:
     assert std[0] < 0.05 * focal_px
 
 
+@pytest.mark.parametrize(("k1", "rough", "finds"), [(-0.11, True, True), (-0.04, True, False), (-0.04, False, True)])
+def test_lens_must_be_clear_as_long_as_a_level_of_larger_exposures_follows(k1: float, rough: bool, finds: bool) -> None:
+    """With a k1 of -0.04, rotations with a lens are likelier by a deviance between 0 and 6."""
+    pairs = bent(turn(20, 10.0), Camera.of(2000.0, SHAPE, (k1, 0, 0, 0)), Camera.of(2000.0, SHAPE))
+    solution = solve(groups_of(20), pairs, 10, frame_shape=SHAPE, model=MotionModel(kind="auto", rough=rough))
+    assert solution.model.finds_lens == finds
+    assert (0 < solution.compare()["rotation"].deviance < 6) == (k1 == -0.04)
+
+
 def test_auto_gives_up_a_lens_that_the_level_before_took_by_chance() -> None:
     camera, assumed = Camera.of(2000.0, SHAPE), Camera.of(2020.0, SHAPE, (0.1, 0, 0, 0))
     model = MotionModel(kind="auto").knowing(assumed)
