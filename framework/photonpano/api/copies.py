@@ -69,12 +69,13 @@ def lines_of_capture(written: WrittenCapture) -> Iterator[str]:
     if written.n_masked:
         mask = "mask them with `corrections`"
         warn(f"{written.n_masked} pixels of the capture are masked, and {written.path} holds no mask; {mask}")
-    files = [(written.path, str(written.info)), (written.truth, "the truth: motion and scene")]
+    held = ZipFile(written.truth).namelist() if written.truth else ()
+    known = "motion" if {*held} <= {"homographies.npy", "frame_shape.npy"} else "motion and scene"
+    files = [(written.path, str(written.info)), (written.truth, f"the truth: {known}")]
     if written.sharp:
         files.append((written.sharp, f"{counted(len(list(written.sharp.iterdir())), 'frame')} without noise"))
     yield columns([[str(file), decimal(_size(file)), text] for file, text in files if file])
     yield f"\nIn a spec in this folder:\n\nsource: {flow(dict(written.source))}"
-    held = ZipFile(written.truth).namelist() if written.truth else ()
     others = [(kind.truth, f"run with `{kind.section}`") for kind in discover().run_kinds.values()]
     for array, kind in (("homographies", "run"), *others):
         if f"{array}.npy" in held:
