@@ -13,8 +13,6 @@ from pydantic import Field
 
 from photonpano import Config, FrameSpan, InputError, Recognised, SourceContribution, SpecPath
 from photonpano.reading import BinarySource, FrameLayout, as_written, library, objections, read_start, reading, require_readable
-from photonpano.text import listed
-from photonpano.values import FloatArray
 
 # Columns of the frame, and of the time, by their names in lower case; the first that is there.
 _FRAMES, _TIMES = ("frame", "frame_number", "expno"), ("time", "timestamp", "t", "toa")
@@ -73,10 +71,10 @@ class _Photons(NamedTuple):
     """The photons that lie in the frames, in order."""
 
     frames: NDArray[np.int64]  # (N,) number of the frame of each
-    places: FloatArray  # (N, 2) x and y, in px
+    places: NDArray[np.float64]  # (N, 2) x and y, in px
     shape: tuple[int, int]  # (height, width) of a frame
     n_frames: int
-    sky: FloatArray | None  # (N, 2) where they come from, if that is known
+    sky: NDArray[np.float64] | None  # (N, 2) where they come from, if that is known
 
 
 class EventsSource(BinarySource):
@@ -121,7 +119,7 @@ class SkyEventsSource(EventsSource):
         number = np.bincount(frames, minlength=n_frames)[:, None]
         seen = np.flatnonzero(number)
 
-        def of_frames(values: FloatArray) -> FloatArray:
+        def of_frames(values: NDArray[np.float64]) -> NDArray[np.float64]:
             sums = np.stack([np.bincount(frames, each, n_frames) for each in values.T], axis=1)
             return np.asarray(sums / np.maximum(number, 1))
 
@@ -140,12 +138,12 @@ def _placed(config: EventsConfig) -> _Photons:
     names = config.columns or _named(path, table.names, timed=config.frame_duration is not None)
     used = [names.when, names.x, names.y, *([names.chip] if names.chip else []), *(names.sky or ())]
     if missing := [name for name in used if name not in table.names]:
-        raise InputError(f"{path} has no column {missing[0]!r}; its columns are {listed(table.names)}")
+        raise InputError(f"{path} has no column {missing[0]!r}; its columns are {', '.join(table.names)}")
     with reading(path, _DAMAGED):
         values = {name: np.asarray(column, float) for name, column in table.read(used).items()}
     lengths = [column.shape for column in values.values()]
     if len(set(lengths)) > 1 or len(lengths[0]) != 1:
-        raise InputError(f"{path} has arrays of the shapes {listed(map(str, lengths))}; all columns have one length")
+        raise InputError(f"{path} has arrays of the shapes {', '.join(map(str, lengths))}; all columns have one length")
     if not lengths[0][0]:
         raise InputError(f"{path} holds no photon")
     for name, each in values.items():
@@ -181,7 +179,7 @@ def _open(config: EventsConfig) -> EventsSource:
     return (EventsSource if photons.sky is None else SkyEventsSource)(photons, config.frame_rate_hz)
 
 
-def _numbered(config: EventsConfig, name: str, when: FloatArray) -> NDArray[np.int64]:
+def _numbered(config: EventsConfig, name: str, when: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the frame of each photon, by the number in its list, or by its time."""
     path, first = config.path, float(when.min()) if config.start is None else config.start
     if config.frame_duration is None and (broken := np.flatnonzero(when != np.floor(when))).size:
@@ -205,12 +203,12 @@ def _numbered(config: EventsConfig, name: str, when: FloatArray) -> NDArray[np.i
     return frames
 
 
-def _of_chips(config: EventsConfig, chips: FloatArray) -> FloatArray:
+def _of_chips(config: EventsConfig, chips: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return by how much the chip of each photon is moved: (N, 2)."""
     known, index = np.unique(chips.astype(int), return_inverse=True)
     moves = config.chips or {}
     if lacking := [chip for chip in known.tolist() if chip not in moves]:
-        raise InputError(f"{config.path} has photons of the chips {listed(map(str, known))}; `chips` lacks {lacking[0]}")
+        raise InputError(f"{config.path} has photons of the chips {', '.join(map(str, known))}; `chips` lacks {lacking[0]}")
     return np.array([moves[chip] for chip in known.tolist()], float)[index]
 
 
@@ -223,7 +221,7 @@ def _named(path: Path, names: list[str], *, timed: bool = False) -> ColumnsConfi
     place = next((each for each in _PLACES if set(each) <= known.keys()), None)
     if when is None or place is None:
         raise InputError(
-            f"{path}: of the columns {listed(names)}, it is unknown which hold a photon's frame and pixel; {_NAME_THEM}"
+            f"{path}: of the columns {', '.join(names)}, it is unknown which hold a photon's frame and pixel; {_NAME_THEM}"
         )
     sky = (known["x"], known["y"]) if place != _SKY and set(_SKY) <= known.keys() else None
     return ColumnsConfig(when=when, x=known[place[0]], y=known[place[1]], sky=sky)

@@ -91,15 +91,15 @@ def test_motion_of_a_telescope_is_the_truth(tmp_path: Path) -> None:
         (
             {"frame": None, "a": FRAME},
             {},
-            "of the columns x, y and a, it is unknown which hold a photon's frame and pixel; write",
+            "of the columns x, y, a, it is unknown which hold a photon's frame and pixel; write",
         ),
-        ({"x": X[:3]}, {}, "has arrays of the shapes (5,), (3,) and (5,); all columns have one length"),
-        ({"x": np.stack([X, X])}, {}, "has arrays of the shapes (5,), (2, 5) and (5,); all columns have one length"),
+        ({"x": X[:3]}, {}, "has arrays of the shapes (5,), (3,), (5,); all columns have one length"),
+        ({"x": np.stack([X, X])}, {}, "has arrays of the shapes (5,), (2, 5), (5,); all columns have one length"),
         ({"frame": [], "x": [], "y": []}, {}, "holds no photon"),
         ({"x": X * 10**6}, {}, "px; give frame_shape and origin, or a larger bin"),
         ({}, {"start": 8}, "no photon lies in the frames; correct start, n_frames or frame_duration"),
-        ({}, {"columns": {"when": "frame", "x": "x", "y": "row"}}, "has no column 'row'; its columns are frame, x and y"),
-        ({}, {"columns": {"when": "frame", "x": "x", "y": "y", "chip": "x"}}, "of the chips 5, 6 and 9; `chips` lacks 5"),
+        ({}, {"columns": {"when": "frame", "x": "x", "y": "row"}}, "has no column 'row'; its columns are frame, x, y"),
+        ({}, {"columns": {"when": "frame", "x": "x", "y": "y", "chip": "x"}}, "of the chips 5, 6, 9; `chips` lacks 5"),
     ],
 )
 def test_what_is_wrong_with_a_list_is_named(
