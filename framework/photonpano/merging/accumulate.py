@@ -444,16 +444,19 @@ def binning_of(source: Source) -> int:
     return max(1, min(source.info.frame_shape) // _SIDE_PX)
 
 
-def binned_mean(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the mean count per frame of a span in binned pixels, (h, w); NaN where no pixel is valid."""
+def binned_mean(source: Source, span: FrameSpan, binning: int | None = None) -> FluxImage:
+    """Return the mean count per frame of a span in binned pixels, (h, w); NaN where no pixel is valid.
+
+    The `binning` is that of `binning_of`, unless it is given.
+    """
     capture = with_background(source, None)
     if len(pieces := capture.pieces(span)) > 1:
-        means = np.array([binned_mean(source, each) for each in pieces])
+        means = np.array([binned_mean(source, each, binning) for each in pieces])
         frames = np.isfinite(means) * np.array([len(each) for each in pieces], np.float32)[:, None, None]
         n_frames = frames.sum(axis=0)
         mean = (np.nan_to_num(means) * frames).sum(axis=0) / np.maximum(n_frames, 1)
         return np.where(n_frames > 0, mean, np.float32(np.nan))
-    binning = binning_of(source)
+    binning = binning or binning_of(source)
     height, width = (side // binning * binning for side in source.info.frame_shape)
     size = (width // binning, height // binning)
     counts = np.asarray(capture.corrected(capture.chunk(span), len(span)), np.float32)[:height, :width]

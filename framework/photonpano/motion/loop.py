@@ -23,6 +23,7 @@ from photonpano.motion.locate import LocatedLevel, LoopSetting, locate
 from photonpano.motion.models import SAME_LENS_PX, MotionModel
 from photonpano.motion.pairs import require_agreement, ties_of
 from photonpano.motion.rotations import ReferencedTrajectory, RotationTrajectory, fit_rotations
+from photonpano.motion.smooth_path import SmoothPath
 from photonpano.motion.tracking import starting_motion
 from photonpano.motion.trajectories import Interpolated, Knots, RefinedMotion, Uncertainty
 from photonpano.values import FloatArray, FrameSpan, Group
@@ -196,7 +197,10 @@ def interpolate(
             knots = measured.moved(smooth * displaced + (1 - smooth) * np.eye(3))
             trajectory = _through(knots, exposures, located, timeline=timeline, reference=reference, refined=refined)
         # No interpolator smooths what all exposures share, such as the error of a focal length.
-        std_px, shared_px = located.std_px, std_of(located.assessed.shared_px)
+        shared_px = std_of(located.assessed.shared_px)
+        # Neither do exposures see how a path errs within them.
+        unseen_px = refined.std_px if isinstance(refined, SmoothPath) else 0.0
+        std_px = np.hypot(located.std_px, unseen_px)
         own_px = located.assessed.errors_px - located.assessed.shared_px
         if len(std_px) < _FEWEST_KNOTS:
             return Interpolated(trajectory, std_px, np.zeros(len(std_px)))
@@ -217,7 +221,8 @@ def interpolate(
     share = np.clip(after / np.maximum(before, np.finfo(float).tiny), _LEAST_LEFT, 1)
     own_std_px = std_of(own_px)
     beyond = uniform_filter1d(left_px2 - (1 - share) * own_std_px**2, _BESIDE, mode="reflect")
-    return Interpolated(trajectory, np.hypot(shared_px, own_std_px * np.sqrt(share)), np.sqrt(np.maximum(beyond, 0)))
+    std_px = np.sqrt(shared_px**2 + share * own_std_px**2 + unseen_px**2)
+    return Interpolated(trajectory, std_px, np.sqrt(np.maximum(beyond, 0)))
 
 
 def _smooth_share(trajectory: Trajectory, located: LocatedLevel) -> float:

@@ -132,7 +132,7 @@ def find_velocity(source: Source, context: Context) -> FoundVelocity:
         LocationError: no velocity stands out, what stands out stands still, or the velocity changes.
     """
     varying, seen, n_frames = varying_spans(source, context)
-    velocity, significance = _searched(structure_of(_halved(varying), _halved(seen[None])[0]), context)
+    velocity, significance = _searched(structure_of(halved(varying), halved(seen[None])[0]), context)
     velocity *= [1, 2, 2]
     images = structure_of(varying, seen)
     if significance < _SIGNIFICANT:
@@ -177,25 +177,26 @@ def varying_spans(source: Source, context: Context) -> tuple[Images, Images, int
 
     What stands still, such as hot pixels and the light on the scene, is subtracted in proportion to the brightness of a span.
     """
-    n_frames = -(-source.info.n_frames // _SPANS)
+    images, seen, n_frames = span_means(source, context, _SPANS)
+    brightness = images.sum(axis=(1, 2))
+    still = np.tensordot(brightness, images, 1) / max(float(brightness @ brightness), 1e-12)
+    return images - brightness[:, None, None] * still, seen, n_frames
+
+
+def span_means(source: Source, context: Context, most: int, binning: int | None = None) -> tuple[Images, Images, int]:
+    """Return the means of up to `most` spans, in binned pixels: (S, h, w), which pixels are seen, and the frames of a span."""
+    n_frames = -(-source.info.n_frames // most)
     spans = [FrameSpan(start, start + n_frames) for start in range(0, source.info.n_frames - n_frames + 1, n_frames)]
     if len(spans) < _FEWEST_SPANS:
-        raise InputError(
-            f"motion.start: {len(spans)} frames are too few to find a constant velocity; at least {_FEWEST_SPANS} are needed"
-        )
-    means = np.stack(list(context.in_order(partial(binned_mean, source), spans)))
+        raise InputError(f"motion.start: {len(spans)} frames are too few to find a motion; at least {_FEWEST_SPANS} are needed")
+    means = np.stack(list(context.in_order(partial(binned_mean, source, binning=binning), spans)))
     if min(means.shape[1:]) < _FEWEST_PIXELS:
-        raise InputError(
-            f"motion.start: frames of {source.info.height}x{source.info.width} px are too small to show a velocity"
-        )
+        raise InputError(f"motion.start: frames of {source.info.height}x{source.info.width} px are too small to show a motion")
     known, images = np.isfinite(means), np.nan_to_num(means)
     n_known = known.sum(axis=0)
     seen = (n_known > 0).astype(np.float32)
     # What is masked for a time shows neither motion nor edges.
     images = np.where(known, images, images.sum(axis=0) / np.maximum(n_known, 1).astype(np.float32))
-    brightness = images.sum(axis=(1, 2))
-    still = np.tensordot(brightness, images, 1) / max(float(brightness @ brightness), 1e-12)
-    images -= brightness[:, None, None] * still
     return images, seen, n_frames
 
 
@@ -206,7 +207,7 @@ def structure_of(images: Images, seen: Images) -> Images:
     return np.asarray(np.stack(found) * seen, np.float32)
 
 
-def _halved(images: Images) -> Images:
+def halved(images: Images) -> Images:
     """Return images at half the size."""
     size = (images.shape[-1] // 2, images.shape[-2] // 2)
     return np.stack([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in images])

@@ -12,7 +12,7 @@ from typing import Any
 
 from photonpano.capture import Capture, capture_of, part_of
 from photonpano.contracts.attribution import attributed
-from photonpano.contracts.protocols import Resampler, Source, light_of
+from photonpano.contracts.protocols import Resampler, Source, Trajectory, light_of
 from photonpano.contracts.requirements import shown
 from photonpano.corrections import Mask, corrected_source, without_still_pixels
 from photonpano.errors import CaptureUnreadError, InputError, PhotonpanoError, PluginError, SpecError, described
@@ -106,17 +106,17 @@ def _require_frames(plan: Plan, capture: Capture, where: str, frames: tuple[int,
         raise SpecError([plan.place(where).problem(message)])
 
 
-def build_levels(plan: Plan, source: Source, decisions: Journal, shortened: int = 1) -> tuple[Level, ...]:
+def build_levels(
+    plan: Plan, source: Source, decisions: Journal, shortened: int = 1, start: Trajectory | None = None
+) -> tuple[Level, ...]:
     """Build the components of all levels; those with the same config are shared. `decisions` receives their choices.
 
-    Groups whose size is chosen from the capture are `shortened` that many times.
+    Groups whose size is chosen from the capture are `shortened` that many times. Along a smooth path with which the first
+    level starts, they are blurred by its error alone.
     """
-    from photonpano.pipeline.summary import summarise  # imports OpenCV, which is not needed to check a spec
-
     light = light_of(source)
     period = 1 / light.frequency if light is not None and light.frequency else None
-    measured = partial(summarise, source, thread_count(plan.run.threads))
-    capture = _Once(lambda: replace(measured(), period_frames=period, shortened=shortened))
+    capture = _Once(partial(_summary, source, thread_count(plan.run.threads), start, period_frames=period, shortened=shortened))
     recorder = Recorder(decisions)
     context = stage_context(plan, source, recorder, capture)
     made: list[tuple[Choice, Any]] = []
@@ -169,6 +169,17 @@ def scale_of(plan: Plan, number: int, frame_shape: tuple[int, int]) -> float:
         return scale
     refined = number <= HALVED_LEVELS and number < len(plan.levels)
     return 0.5 if refined and min(frame_shape) >= LARGE_FRAME_PX else 1.0
+
+
+def _summary(source: Source, threads: int, start: Trajectory | None, **known: Any) -> CaptureSummary:
+    """Summarise a capture whose image is followed along a start, if that is a smooth path."""
+    from photonpano.motion.smooth_path import SmoothPath  # both import OpenCV, which is not needed to check a spec
+    from photonpano.pipeline.summary import summarise
+
+    found = replace(summarise(source, threads), **known)
+    if not isinstance(start, SmoothPath):
+        return found
+    return replace(found, speed_px=start.error_px_a_frame, how="the error of the path that is followed", away_frames=None)
 
 
 def foreseen_groups(plan: Plan, source: Source) -> list[tuple[Group, ...] | str]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from photonpano.capture import capture_of, leaving_out
-from photonpano.contracts.protocols import Source
+from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.corrections.lighting import decision_of
 from photonpano.errors import InputError, LocationError
 from photonpano.execution.context import Context
@@ -17,6 +17,7 @@ from photonpano.motion.diagnosis import UntiedError, tell_attempt
 from photonpano.motion.gyroscope import Gyroscope, fit_rates
 from photonpano.motion.level import Timeline
 from photonpano.motion.loop import LevelResult
+from photonpano.motion.smooth_path import SmoothPath, find_path
 from photonpano.motion.velocity import ConstantVelocity, find_velocity
 from photonpano.pipeline import passes
 from photonpano.pipeline.components import build_levels, foreseen_groups
@@ -51,14 +52,14 @@ def _in_attempts(plan: Plan, source: Source, attempts: list[Journal], context: C
     `attempts` receives the decisions of each attempt.
     """
     in_shots = partial(_in_shots, timeline_of(source, context), plan, source, attempts=attempts, context=context)
-    started = plan.motion.start != "none"
+    started = plan.motion.start
     try:
         return in_shots(started=started, shortened=1)
     except LocationError as unlocated:
         error = unlocated
-    others: list[tuple[str, bool, int]] = []
-    if not started and plan.motion.prior is None:
-        others.append(("motion: {start: constant-velocity}", True, 1))
+    others: list[tuple[str, str, int]] = []
+    if started == "none" and plan.motion.prior is None:
+        others += [(f"motion: {{start: {each}}}", each, 1) for each in ("constant-velocity", "smooth-path")]
     chosen = any(isinstance(each, str) for each in foreseen_groups(plan, source))
     if chosen and isinstance(error, UntiedError) and error.blurred:
         others += [(f"1/{times} of the group size", started, times) for times in _SHORTENED]
@@ -71,7 +72,7 @@ def _in_attempts(plan: Plan, source: Source, attempts: list[Journal], context: C
 
 
 def _in_shots(
-    timeline: Timeline, plan: Plan, source: Source, *, attempts: list[Journal], context: Context, started: bool, shortened: int
+    timeline: Timeline, plan: Plan, source: Source, *, attempts: list[Journal], context: Context, started: str, shortened: int
 ) -> State:
     """Estimate the motion of a capture as one, or in shots if its exposures fall into such."""
     while True:
@@ -92,17 +93,18 @@ def _in_shots(
 
 
 def _along(
-    timeline: Timeline, plan: Plan, source: Source, *, attempts: list[Journal], context: Context, started: bool, shortened: int
+    timeline: Timeline, plan: Plan, source: Source, *, attempts: list[Journal], context: Context, started: str, shortened: int
 ) -> State:
-    """Estimate the motion of the frames that a timeline shows, from a constant velocity if it is `started`."""
+    """Estimate the motion of the frames that a timeline shows; how it is `started` is a value of `motion.start`."""
     attempts.append([])
     source = replace(leaving_out(source, timeline.shown), copies=timeline.copies)
     if shortened > 1:
         context = within(context, shortened)
-    reference, levels = _reference_frame(plan, timeline.shot), build_levels(plan, source, attempts[-1], shortened)
-    start, velocity = _start(plan, source, reference, context) if started else (None, None)
+    reference = _reference_frame(plan, timeline.shot)
+    start, decided = _START[started](plan, source, reference, context)
+    levels = build_levels(plan, source, attempts[-1], shortened, start)
     gyroscope, fitted = _gyroscope(plan, source, timeline, context)
-    findings = Findings(standing_share=capture_of(source).still.share, start=velocity, gyroscope=fitted)
+    findings = Findings(standing_share=capture_of(source).still.share, start=decided, gyroscope=fitted)
     attempts[-1] += findings.started
     state = State(
         plan=plan,
@@ -173,7 +175,11 @@ def _reference_frame(plan: Plan, shot: FrameSpan) -> int:
     return frame if shot.start <= frame < shot.stop else middle
 
 
-def _start(plan: Plan, source: Source, reference: int, context: Context) -> tuple[ConstantVelocity, Decision]:
+def _no_start(*_: object) -> tuple[None, None]:
+    return None, None
+
+
+def _constant_velocity(plan: Plan, source: Source, reference: int, context: Context) -> tuple[ConstantVelocity, Decision]:
     """Find the constant velocity with which the first level starts; `InputError` or `LocationError` if there is none."""
     found = find_velocity(source, context)
     halves = " and ".join(f"{np.degrees(each.turn):.4g}" for each in found.halves)
@@ -184,6 +190,26 @@ def _start(plan: Plan, source: Source, reference: int, context: Context) -> tupl
     if plan.motion.start == "none":
         reason += "; without it, pairs of exposures could not be located"
     return ConstantVelocity(found.velocity, reference), Decision("start", found.text, reason)
+
+
+def _smooth_path(plan: Plan, source: Source, reference: int, context: Context) -> tuple[SmoothPath, Decision]:
+    """Find the smooth path with which the first level starts; `InputError` or `LocationError` if there is none."""
+    found = find_path(source, reference, context)
+    reason = (
+        f"photons that it was not fitted to stand out along it by {found.significance:.2g} standard deviations more than in a "
+        "still image"
+    )
+    if plan.motion.start == "none":
+        reason += "; without it, pairs of exposures could not be located"
+    text = f"shifts along a spline with {found.n_knots} knots, within {found.trajectory.std_px:.2g} px"
+    return found.trajectory, Decision("start", text, reason)
+
+
+_START: Mapping[str, Callable[[Plan, Source, int, Context], tuple[Trajectory | None, Decision | None]]] = {
+    "none": _no_start,
+    "constant-velocity": _constant_velocity,
+    "smooth-path": _smooth_path,
+}
 
 
 def _gyroscope(

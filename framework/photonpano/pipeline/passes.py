@@ -221,7 +221,7 @@ def later_levels(state: State) -> Proposal:
     """
     levels, light = state.levels, light_of(state.source)
     if light is not None and light.frequency:
-        levels = build_levels(state.plan, state.source, state.findings.started, state.shortened)
+        levels = build_levels(state.plan, state.source, state.findings.started, state.shortened, state.start)
     left = levels if state.outdated and len(levels) == 1 else levels[1:]
 
     def make() -> State:
@@ -313,7 +313,7 @@ def cut_at_jumps(state: State) -> Proposal | None:
         return None
 
     def make(cuts: Sequence[Cut] = cuts) -> State | None:
-        levels = build_levels(state.plan, state.source, state.findings.started, state.shortened)
+        levels = build_levels(state.plan, state.source, state.findings.started, state.shortened, state.start)
         try:
             cut = _located_anew(replace(state, timeline=state.timeline.cut_at(cuts), levels=levels))
         except UntiedError as error:

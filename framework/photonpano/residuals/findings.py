@@ -44,7 +44,7 @@ class Findings:
     """What a run finds beside its motion and its panorama."""
 
     standing_share: float = 0.0  # of the frame that stands still, of the parts that show motion or rest
-    start: Decision | None = None  # the constant velocity from which the first level starts
+    start: Decision | None = None  # the constant velocity or smooth path from which the first level starts
     gyroscope: Decision | None = None  # how the gyroscope was fitted to the capture
     repeated: int = 0  # frames that are copies of the one before
     dark: tuple[FrameSpan, ...] = ()  # frames without light, which are left out

@@ -95,11 +95,11 @@ class MotionSettings(Config):
         "length; auto takes homographies that do no more than the capture shows, or rotations where these are likelier, with a "
         "lens if pairs show one",
     )
-    start: Literal["none", "constant-velocity"] = Field(
+    start: Literal["none", "constant-velocity", "smooth-path"] = Field(
         "none",
-        description="what is known of the motion before the first level: none, or the constant-velocity of the image, a turn "
-        "about any point or a shift, that is found from all frames together, where groups of them are too dark or too blurred; "
-        "with none, this is tried if pairs of exposures cannot be located",
+        description="what is known of the motion before the first level: none, the constant-velocity of the image, a turn "
+        "about any point or a shift, or the smooth-path along which it shifts, that are found from all frames together, where "
+        "groups of them are too dark or too blurred; with none, they are tried if pairs of exposures cannot be located",
     )
     prior: PriorSettings | None = Field(
         None, description="a gyroscope, whose rates tie exposures that are too dark to be located; for motion.model: rotation"
