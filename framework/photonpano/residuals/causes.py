@@ -133,6 +133,8 @@ def _light(run: TestedRun) -> Found:
     residuals = run.explained.residuals
     # Relative to the mean light: in the dark between two flickers, an error of the gain matters little.
     gains, stds = (each * residuals.light for each in residuals.gains())
+    # What all spans have in common is the panorama's, as where noise of dark places draws it down, and no change.
+    gains -= np.average(gains, weights=1 / np.maximum(stds, 1e-9) ** 2)
     change = float(np.sqrt(max(float(np.mean(gains**2 - stds**2)), 0)))
     return Found(change, f"most at {residuals.spans[int(np.argmax(np.abs(gains) / np.maximum(stds, 1e-9)))]}")
 
