@@ -14,3 +14,7 @@ from .scores import align_positions as align_positions
 from .scores import evaluate_poses as evaluate_poses
 from .scores import load_run_poses as load_run_poses
 from .scores import pose_errors as pose_errors
+from .views import Lens as Lens
+from .views import between as between
+from .views import imaged as imaged
+from .views import lens_of as lens_of
