@@ -28,7 +28,7 @@ from photonpano.locating import blur_against_noise, stabilised_8_bit
 from photonpano_colmap.exposures import PoseSpline, left_out, lit_counts
 from photonpano_colmap.hooks import MIN_AVERAGES, ColmapAveragesConfig, counted, starts_of, too_few_averages
 from photonpano_colmap.reconstruction import FOCAL_BIAS, Piece, PoseNoise, Reconstruction, pose_noise, reconstruct
-from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
+from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints, with_depth
 
 _PHOTONS = 60.0  # photons per pixel of an average; with fewer, keypoints are noise
 _BLUR_PX = 6.0  # motion blur of an average that keypoints tolerate; the shorter average of both limits is taken
@@ -56,7 +56,8 @@ class AveragesEstimator:
 
     def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
         """Estimate the poses of a capture: see `photonpano_poses.PoseEstimator`."""
-        return with_focal_judged(self.averaged(source, camera, progress), self._context)
+        estimate = with_focal_judged(self.averaged(source, camera, progress), self._context)
+        return with_depth(source, estimate, self._context.threads, progress) if self._config.depth else estimate
 
     def averaged(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
         """Estimate the poses, without judging a focal length that was found.

@@ -32,7 +32,7 @@ from photonpano_colmap.exposures import (
 from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Adjusted, Found, Observations, adjust, find_patches, patches_of, stabilised
 from photonpano_colmap.reconstruction import FOCAL_BIAS
-from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints, between
+from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints, between, with_depth
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
 _CONTRADICTION, _CONTRADICTION_PX = 10.0, 0.5
@@ -78,7 +78,8 @@ class StratifiedEstimator:
                     }
                 )
         first = replace(first, levels=tuple(levels), lost=tuple(sorted(lost, key=lambda each: each.span.start)))
-        return with_focal_judged(_Assembly(source, camera, first, level, before).estimate(), self._context)
+        estimate = with_focal_judged(_Assembly(source, camera, first, level, before).estimate(), self._context)
+        return with_depth(source, estimate, self._context.threads, progress) if self._config.depth else estimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)

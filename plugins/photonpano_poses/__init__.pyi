@@ -1,4 +1,5 @@
 from .contract import CameraGuess as CameraGuess
+from .contract import DepthMap as DepthMap
 from .contract import LostFrames as LostFrames
 from .contract import PosedView as PosedView
 from .contract import PoseEstimate as PoseEstimate
@@ -6,6 +7,7 @@ from .contract import PoseEstimator as PoseEstimator
 from .contract import PoseEstimatorContribution as PoseEstimatorContribution
 from .contract import ScenePoints as ScenePoints
 from .contract import require_poses as require_poses
+from .depth import with_depth as with_depth
 from .exporting import ExportedPoses as ExportedPoses
 from .exporting import export as export
 from .run import PoseRuns as PoseRuns
