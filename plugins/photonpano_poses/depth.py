@@ -34,12 +34,12 @@ _KEYS = 32  # key exposures, at most
 _OTHERS = 24  # exposures that a key is compared with, at most
 _OVERLAP = 0.5  # they see the middle of the key within this share of a frame
 _BLUR_PX = 1.0  # standard deviation of the blur against photon noise
-_STEP_PX = 1.0  # parallax from one inverse depth to the next, root mean square
-_FEWEST, _MOST = 32, 96  # inverse depths
+_STEP_PX = 0.5  # parallax from one inverse depth to the next, root mean square
+_FEWEST, _MOST = 48, 128  # inverse depths
 _BEYOND = 0.005  # share of the points that may be nearer, or farther, than the inverse depths reach
 _LEAST_POINTS = 8
 # Deviances of neighbours whose inverse depths differ by one step, and by more; the latter falls across edges of the flux.
-_SLOPED, _BROKEN = 0.3, 6.0
+_SLOPED, _BROKEN = 2.0, 12.0
 _EDGE_PX = 3.0  # standard deviation of the place of an edge of depth
 _LEAST_SEEN = 3  # fewest exposures that show a pixel
 _AGREE = 3.0  # standard errors within which two keys agree
