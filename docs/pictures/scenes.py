@@ -14,13 +14,13 @@ from harness import RATE_HZ, Compared, Study, packed, simulator
 from paper.figures.light import fine_images, fine_pictures
 from paper.figures.others import draw_found, true_centres
 
-from photonpano import FrameSpan, load_panorama, open_source, parse_spec
+from photonpano import FloatArray, FrameSpan, load_panorama, open_source, parse_spec
 from photonpano.capture.writing import truth_path
 from photonpano.photometry import BinaryResponse, Tone, picture_of
 from photonpano_poses import evaluate_poses
 from photonpano_simulator.config import NightScene
 from photonpano_simulator.scenes import scene_flux
-from photonpano_simulator.travel import depth, sharp_view, truth_of
+from photonpano_simulator.travel import depth, read_truth, sharp_view, truth_of
 
 from . import finished
 
@@ -90,7 +90,8 @@ def room(study: Study) -> Iterator[tuple[str, draw.Picture]]:
     cube = study.capture("room", spec)
     runs = {}
     for name in ESTIMATORS:
-        chosen = {"pose": {"use": name, "with": {"group_size": GROUP_SIZE}}, "camera": {"focal_px": 160}}
+        keys = {"group_size": GROUP_SIZE, "depth": name == "stratified-pose"}
+        chosen = {"pose": {"use": name, "with": keys}, "camera": {"focal_px": 160}}
         runs[name] = study.run(name, packed(cube, 1000, **chosen, output={"exposures": True}))
         score = evaluate_poses(runs[name], truth_path(cube))
         print(f"{name:16} ATE {100 * score.ate_share:.3f} % of the path, rotation {score.rotation_deg:.3f} degrees")
@@ -106,6 +107,33 @@ def room(study: Study) -> Iterator[tuple[str, draw.Picture]]:
         shown[name] = cv2.resize(image, None, fx=MAGNIFIED, fy=MAGNIFIED, interpolation=cv2.INTER_AREA)
     above = draw.beside(draw.all_labelled(shown))
     yield "room.png", draw.in_rows([draw.in_colour(above), paths(runs, cube, above.shape[1])])
+    yield "room-depth.png", depth_found(runs["stratified-pose"], cube)
+
+
+def depth_found(folder: Path, cube: Path) -> draw.Picture:
+    """Show an exposure, the inverse depth that was found of it, the true one, and the expected error."""
+    exposure, found, std = (
+        cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
+        for name in (f"images/exposure_{FIRST}.png", f"depth/exposure_{FIRST}.tif", f"depth/exposure_{FIRST}_std.tif")
+    )
+    known, distance = found > 0, np.where(found > 0, found, 1)
+    true = 1 / depth(read_truth(truth_path(cube)), FIRST + GROUP_SIZE // 2)
+    far, near = np.quantile(true, (0.01, 0.9))
+    # A path of the length 1 has another scale.
+    scale = float(np.median((true * distance)[known]))
+    shown = {
+        "30 frames, merged": exposure,
+        "inverse depth, found": _levels(np.where(known, scale / distance, 0), far, near),
+        "inverse depth, true": _levels(true, far, near),
+        "expected error: white is 10 % or more": _levels(np.where(known, std / distance, 0), 0, 0.1),
+    }
+    for name, image in shown.items():
+        shown[name] = cv2.resize(image, None, fx=1.6, fy=1.6, interpolation=cv2.INTER_AREA)
+    return draw.beside(draw.all_labelled(shown))
+
+
+def _levels(values: FloatArray, low: float, high: float) -> draw.Picture:
+    return (255 * np.clip((values - low) / (high - low), 0, 1)).astype(np.uint8)
 
 
 def paths(runs: dict[str, Path], cube: Path, width: int) -> draw.Picture:

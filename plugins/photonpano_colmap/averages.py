@@ -27,8 +27,8 @@ from photonpano.geometry import Camera, camera_matrix, positions_of
 from photonpano.locating import blur_against_noise, stabilised_8_bit
 from photonpano_colmap.exposures import PoseSpline, left_out, lit_counts
 from photonpano_colmap.hooks import MIN_AVERAGES, ColmapAveragesConfig, counted, starts_of, too_few_averages
-from photonpano_colmap.reconstruction import Piece, PoseNoise, Reconstruction, pose_noise, reconstruct
-from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
+from photonpano_colmap.reconstruction import FOCAL_BIAS, Piece, PoseNoise, Reconstruction, pose_noise, reconstruct
+from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints, with_depth
 
 _PHOTONS = 60.0  # photons per pixel of an average; with fewer, keypoints are noise
 _BLUR_PX = 6.0  # motion blur of an average that keypoints tolerate; the shorter average of both limits is taken
@@ -40,8 +40,6 @@ _TEXTURE = 60, 15  # keypoints of an average, and matches with another, below wh
 _FEW_MATCH = 0.25
 _ANOTHER_SIZE = "choose a larger pose.with.group_size for less noise, or a smaller one for less blur"
 _FOCAL_SHARE = 0.02  # relative standard error of an estimated focal length above which poses are doubtful
-# Relative error of an estimated focal length that residuals do not show: blur shifts keypoints alike in many averages.
-FOCAL_BIAS = 0.01
 _GIVE_FOCAL = "calibrate the camera, and give camera.focal_px"
 _PLANE = 0.01  # points lie in a plane if their smallest extent is below this fraction of the largest
 _SHOWN_PIECES = 4
@@ -58,7 +56,8 @@ class AveragesEstimator:
 
     def estimate(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
         """Estimate the poses of a capture: see `photonpano_poses.PoseEstimator`."""
-        return with_focal_judged(self.averaged(source, camera, progress), self._context)
+        estimate = with_focal_judged(self.averaged(source, camera, progress), self._context)
+        return with_depth(source, estimate, self._context.threads, progress) if self._config.depth else estimate
 
     def averaged(self, source: Source, camera: CameraGuess, progress: Progress) -> PoseEstimate:
         """Estimate the poses, without judging a focal length that was found.
@@ -77,7 +76,7 @@ class AveragesEstimator:
         with progress.stage("COLMAP: features, matches, poses", 1, "model") as advance:
             found = reconstruct(images, camera, self._config, self._context.seed)
             advance(1)
-        piece = self._chosen(found, spans)
+        piece = self._chosen(found, spans, camera.focal_px)
         return _Assembly(source, spans, found, piece, camera).estimate()
 
     def _spans(self, n_frames: int) -> list[FrameSpan]:
@@ -90,7 +89,7 @@ class AveragesEstimator:
             raise LocationError(problem)
         return [FrameSpan(start, start + size) for start in starts_of(n_frames, size, self._config.step)]
 
-    def _chosen(self, found: Reconstruction, spans: Sequence[FrameSpan]) -> Piece:
+    def _chosen(self, found: Reconstruction, spans: Sequence[FrameSpan], focal_px: float | None) -> Piece:
         """Return the piece of the poses to go on with."""
         texture = [float(np.median(each)) for each in (found.n_keypoints, found.n_matches)]
         if texture[0] < _TEXTURE[0] or texture[1] < _TEXTURE[1]:
@@ -99,6 +98,11 @@ class AveragesEstimator:
                 f"median) {texture[1]:.0f} match another average; {_ANOTHER_SIZE}"
             )
         if not found.pieces or len(found.pieces[0].images) < MIN_AVERAGES:
+            if found.free_focal is not None and found.free_focal.n_images >= MIN_AVERAGES:
+                raise LocationError(
+                    f"COLMAP finds no poses with the focal length that is given, camera.focal_px = {focal_px:g}, and does with "
+                    f"{found.free_focal}: correct it, or leave it out"
+                )
             keypoints, matches = (int(np.median(each)) for each in (found.n_keypoints, found.n_matches))
             figures = f"of {keypoints} keypoints in an average (the median) {matches} match another average"
             if matches < _FEW_MATCH * keypoints:
@@ -218,6 +222,7 @@ class _Assembly:
         return tuple(lost)
 
     def _level(self, noise: PoseNoise) -> dict[str, float | int | str | None]:
+        free = self.found.free_focal
         return {
             "group_frames": len(self.spans[0]),
             "averages": len(self.spans),
@@ -226,12 +231,17 @@ class _Assembly:
             "keypoints": float(np.median(self.found.n_keypoints)),
             "parallax_deg": float(np.rad2deg(np.median(parallax(self.piece)))),
             "residual_px": noise.residual_px,
+            "free_focal_px": None if free is None else free.focal_px,
+            "std_free_focal_px": None if free is None else free.std_px,
             "depth_readings": self.piece.readings.ratio,
             "std_position": relative_std(noise.std_position, self.piece.poses),
         }
 
     def _doubts(self) -> list[Reason]:
         doubts = [] if self.piece.readings.doubt is None else [self.piece.readings.doubt]
+        given, free = self.guess.focal_px, self.found.free_focal
+        if given is not None and free is not None and (doubt := free.doubt_of(given)) is not None:
+            doubts.insert(0, doubt)
         extents = np.linalg.svd(self.piece.points - np.median(self.piece.points, axis=0), compute_uv=False)
         if self.guess.focal_px is None and extents[2] < _PLANE * extents[0]:
             flat = "the points lie in a plane, from which no focal length can be found"

@@ -88,6 +88,9 @@ class ColmapAveragesConfig(Config):
         description="if COLMAP finds several pieces whose poses are not connected: stop with an error that names them, or go "
         "on with the largest",
     )
+    depth: bool = Field(
+        False, description="find the depth of all pixels of up to 32 exposures, with its error, and dense points"
+    )
 
 
 class StratifiedPoseConfig(ColmapAveragesConfig):

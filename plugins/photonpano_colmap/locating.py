@@ -22,8 +22,9 @@ from photonpano import FloatArray
 from photonpano.compiling import compiled
 from photonpano.geometry import Camera, camera_matrix, positions_of
 from photonpano.locating import view_of
-from photonpano_colmap.exposures import Image, Lens, PosedExposure, between, imaged, lens_of, posed, projected
+from photonpano_colmap.exposures import Image, PosedExposure, posed, projected
 from photonpano_colmap.reconstruction import without_gauge
+from photonpano_poses import Lens, between, imaged, lens_of
 
 _BLUR_PX = 1.0  # standard deviation of the blur against photon noise
 _HALF = 9  # patches have 19 x 19 pixels, with Gaussian weights

@@ -14,9 +14,10 @@ Convention:
 from __future__ import annotations
 
 import copy
+import math
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from photonpano import FloatArray, Homography, Located, NotLocated, OutputError, Reason, VirtualExposure
-from photonpano.geometry import normalised, positions_of
+from photonpano.geometry import Camera, camera_matrix, normalised, positions_of
 from photonpano.locating import Matches, PointLocator, blur_against_noise, motion_from_points, stabilised_8_bit, too_few_matches
 from photonpano_colmap.hooks import FIRST_CENTRE, SEEDS, ColmapAveragesConfig, PycolmapTwoViewConfig
 from photonpano_poses import CameraGuess
@@ -35,6 +36,10 @@ from photonpano_poses import CameraGuess
 MAX_TRIALS = 10_000  # of RANSAC, which finds a homography with 20 % inliers in half as many
 _SIFT = pycolmap.FeatureExtractorType.SIFT
 _USUAL_FOCAL = 1.2  # initial focal length where none is given, in longer sides of a frame
+# Relative error of an estimated focal length that residuals do not show: blur shifts keypoints alike in many averages.
+FOCAL_BIAS = 0.01
+_FREE_BIAS = 0.04  # the same in COLMAP where another one was given: up to 6 % on simulated captures
+_FOCAL_SIGMAS = 3.0  # expected errors by which a focal length that is given may differ from the one that fits
 _START_ANGLE_DEG = 4.0  # parallax of COLMAP's initial pair; its own 16 degrees are too much for short captures
 
 
@@ -158,6 +163,27 @@ class Piece:
     halves: Halves  # what half of the points tell
 
 
+@dataclass(frozen=True, slots=True)
+class FreeFocal:
+    """The focal length that images have if it is not given."""
+
+    focal_px: float
+    std_px: float  # its expected error
+    n_images: int = 0  # images with a pose
+
+    def __str__(self) -> str:
+        return f"{self.focal_px:.4g} ± {self.std_px:.2g} px"
+
+    def doubt_of(self, given_px: float) -> Reason | None:
+        """Doubt a focal length that is given; None if the averages do not contradict it."""
+        off = abs(self.focal_px - given_px) / self.std_px
+        if off <= _FOCAL_SIGMAS:
+            return None
+        where = f"{self} fits, {given_px:.4g} px is given; in expected errors"
+        todo = "calibrate the camera, and correct camera.focal_px, or leave it out"
+        return Reason("the averages contradict the focal length", off, _FOCAL_SIGMAS, where, todo)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
     """The result of COLMAP."""
@@ -167,6 +193,7 @@ class Reconstruction:
     n_keypoints: NDArray[np.intp]  # (N,) keypoints of each image
     # (N,) keypoints of each image that match those of another one, in agreement with a motion: the most of any
     n_matches: NDArray[np.intp]
+    free_focal: FreeFocal | None = None  # of the same matches; None if it was not given, or no poses are found without it
 
 
 def reconstruct(
@@ -197,8 +224,9 @@ def reconstruct(
         _match(database, config, seed)
         keypoints, matches = _counts(database, len(images))
         pieces = [_piece(each, camera.focal_px is None) for each in _apart(_map(database, folder, camera, config, seed))]
+        free_focal = None if camera.focal_px is None else _free_focal(database, folder, camera, config, seed)
     # a camera that only turns may leave images without a point
-    return Reconstruction(tuple(piece for piece in pieces if len(piece.points)), keypoints, matches)
+    return Reconstruction(tuple(piece for piece in pieces if len(piece.points)), keypoints, matches, free_focal)
 
 
 def _extract(database: Path, folder: Path, camera: CameraGuess, shape: tuple[int, ...], config: ColmapAveragesConfig) -> None:
@@ -274,7 +302,7 @@ def _apart(found: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruc
     seen: set[int] = set()
     for each in sorted(found, key=lambda model: -model.num_reg_images()):
         images = set(each.reg_image_ids())
-        if not images <= seen:
+        if each.num_points3D() and not images <= seen:
             kept.append(each)
             seen |= images
     return kept
@@ -283,6 +311,45 @@ def _apart(found: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruc
 def _piece(found: pycolmap.Reconstruction, finds_focal: bool) -> Piece:
     """Return poses and points of the likelier reading of a reconstruction in numpy."""
     found, readings = likelier_reading(found, finds_focal)
+    images, poses, points, observed = _arrays(found)
+    [camera] = found.cameras.values()
+    return Piece(
+        images=images,
+        poses=poses,
+        points=points,
+        observed=observed,
+        focal_px=float(camera.params[0]),
+        readings=readings,
+        halves=compared_halves(found, finds_focal),
+    )
+
+
+def _free_focal(database: Path, folder: Path, guess: CameraGuess, config: ColmapAveragesConfig, seed: int) -> FreeFocal | None:
+    """Find poses from the same matches once more, with a focal length that is not known."""
+    with pycolmap.Database.open(database) as opened:
+        [camera] = opened.read_all_cameras()
+        camera.focal_length = _USUAL_FOCAL * max(camera.width, camera.height)
+        camera.has_prior_focal_length = False
+        opened.update_camera(camera)
+    models = _apart(_map(database, folder, replace(guess, focal_px=None), config, seed))
+    if not models:
+        return None
+    likelier, _ = likelier_reading(models[0], True)
+    images, poses, points, observed = _arrays(likelier)
+    if not len(points):
+        return None
+    [camera] = likelier.cameras.values()
+    centre = camera.principal_point_x - FIRST_CENTRE, camera.principal_point_y - FIRST_CENTRE
+    lens = Camera(camera_matrix(camera.params[0], centre), np.array(guess.distortion))
+    noise = pose_noise(poses, points, [(indices, lens.ideal(xy)) for indices, xy in observed], lens.matrix, True)
+    return FreeFocal(lens.focal_px, math.hypot(noise.std_focal_px, _FREE_BIAS * lens.focal_px), len(images))
+
+
+_Arrays = tuple[NDArray[np.intp], FloatArray, FloatArray, tuple[tuple[NDArray[np.intp], FloatArray], ...]]
+
+
+def _arrays(found: pycolmap.Reconstruction) -> _Arrays:
+    """Return the indices of the images, their poses, the points, and what each image shows of them, as in `Piece`."""
     images = sorted((image for image in found.images.values() if image.has_pose), key=lambda image: image.name)
     numbers = {identifier: number for number, identifier in enumerate(sorted(found.points3D))}
     observed = []
@@ -291,15 +358,11 @@ def _piece(found: pycolmap.Reconstruction, finds_focal: bool) -> Piece:
         indices = np.array([numbers[point.point3D_id] for point in seen], np.intp)
         xy = np.array([point.xy for point in seen], dtype=np.float64).reshape(-1, 2) - FIRST_CENTRE
         observed.append((indices, xy))
-    [camera] = found.cameras.values()
-    return Piece(
-        images=np.array([_index(image.name) for image in images], np.intp),
-        poses=np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
-        points=np.array([found.points3D[identifier].xyz for identifier in sorted(found.points3D)]).reshape(-1, 3),
-        observed=tuple(observed),
-        focal_px=float(camera.params[0]),
-        readings=readings,
-        halves=compared_halves(found, finds_focal),
+    return (
+        np.array([_index(image.name) for image in images], np.intp),
+        np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
+        np.array([found.points3D[identifier].xyz for identifier in sorted(found.points3D)]).reshape(-1, 3),
+        tuple(observed),
     )
 
 

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from photonpano import BoolArray, FloatArray, FrameSpan, Group, LocationError, Progress, Reason, Source, StageContext
 from photonpano.geometry import Camera, camera_matrix, corners, positions_of
-from photonpano_colmap.averages import FOCAL_BIAS, AveragesEstimator, flux_of_points, relative_std, tilt, with_focal_judged
+from photonpano_colmap.averages import AveragesEstimator, flux_of_points, relative_std, tilt, with_focal_judged
 from photonpano_colmap.exposures import (
     Path,
     PosedExposure,
     PoseSpline,
     Tremor,
-    between,
     exceeding_noise_of_poses,
     find_tremor,
     inverse_depth_of,
@@ -32,7 +31,8 @@ from photonpano_colmap.exposures import (
 )
 from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Adjusted, Found, Observations, adjust, find_patches, patches_of, stabilised
-from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints
+from photonpano_colmap.reconstruction import FOCAL_BIAS
+from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints, between, with_depth
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
 _CONTRADICTION, _CONTRADICTION_PX = 10.0, 0.5
@@ -78,7 +78,8 @@ class StratifiedEstimator:
                     }
                 )
         first = replace(first, levels=tuple(levels), lost=tuple(sorted(lost, key=lambda each: each.span.start)))
-        return with_focal_judged(_Assembly(source, camera, first, level, before).estimate(), self._context)
+        estimate = with_focal_judged(_Assembly(source, camera, first, level, before).estimate(), self._context)
+        return with_depth(source, estimate, self._context.threads, progress) if self._config.depth else estimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,5 @@
 from .contract import CameraGuess as CameraGuess
+from .contract import DepthMap as DepthMap
 from .contract import LostFrames as LostFrames
 from .contract import PosedView as PosedView
 from .contract import PoseEstimate as PoseEstimate
@@ -6,6 +7,7 @@ from .contract import PoseEstimator as PoseEstimator
 from .contract import PoseEstimatorContribution as PoseEstimatorContribution
 from .contract import ScenePoints as ScenePoints
 from .contract import require_poses as require_poses
+from .depth import with_depth as with_depth
 from .exporting import ExportedPoses as ExportedPoses
 from .exporting import export as export
 from .run import PoseRuns as PoseRuns
@@ -14,3 +16,7 @@ from .scores import align_positions as align_positions
 from .scores import evaluate_poses as evaluate_poses
 from .scores import load_run_poses as load_run_poses
 from .scores import pose_errors as pose_errors
+from .views import Lens as Lens
+from .views import between as between
+from .views import imaged as imaged
+from .views import lens_of as lens_of

@@ -46,6 +46,16 @@ class PosedView:
     flux: Callable[[], FluxImage]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """The depth of the pixels of an exposure, found from the other exposures alone."""
+
+    view: int  # number of the exposure among the views
+    inverse_depth: NDArray[np.float32]  # (H, W) float32, one over the depth along the optical axis; NaN where it is not known
+    std: NDArray[np.float32]  # (H, W) float32, its expected error; NaN where it is not known
+    flux: FluxImage  # (H, W) float32, flux of the other exposures at this depth, photons per pixel per frame
+
+
 @dataclass(frozen=True, slots=True)
 class LostFrames:
     """Frames whose pose was not found."""
@@ -81,6 +91,7 @@ class PoseEstimate:
     lost: tuple[LostFrames, ...] = ()  # the frames that are not located, with reasons
     levels: tuple[Mapping[str, float | int | str | None], ...] = ()  # a record for each level: numbers and texts by name
     doubts: tuple[Reason, ...] = ()  # why the poses may be wrong, as far as the estimator can tell; empty if it trusts them
+    depth: tuple[DepthMap, ...] = ()  # of some views; empty if it was not asked for
     # median distance of the points from where the views show them, in units of what photon noise explains; None if that is not
     # known
     residual_ratio: float | None = None
@@ -142,6 +153,8 @@ def require_poses(found: Any, source: Source) -> PoseEstimate:
         raise BrokenContract(f"expected a flux for each of {n_points} points")
     for view in found.views:
         _require_view(view, n_points, n_frames)
+    for depth in found.depth:
+        _require_depth(depth, len(found.views), source.info.frame_shape)
     explained = located.copy()
     for each in found.lost:
         explained[each.span.start : each.span.stop] = True
@@ -174,6 +187,17 @@ def _require_view(view: PosedView, n_points: int, n_frames: int) -> None:
     if indices.dtype.kind not in "iu" or ((indices < 0) | (indices >= n_points)).any():
         raise BrokenContract(f"{of} must show points 0 to {n_points - 1}, got {shown(view.points)}")
     require_finite(f"xy of {of}", view.xy, (len(indices), 2))
+
+
+def _require_depth(depth: DepthMap, n_views: int, frame_shape: tuple[int, int]) -> None:
+    require_instance(depth, DepthMap)
+    if not 0 <= depth.view < n_views:
+        raise BrokenContract(f"a depth map is that of the view {depth.view}, and there are {n_views}")
+    for name in ("inverse_depth", "std", "flux"):
+        require_array(f"{name} of a depth map", getattr(depth, name), frame_shape, "float32")
+    known = np.isfinite(depth.inverse_depth)
+    if not ((depth.inverse_depth[known] > 0).all() and (depth.std[known] >= 0).all()):
+        raise BrokenContract("the inverse depth of a depth map must be above 0, and its std 0 or more; NaN where not known")
 
 
 def are_rigid(poses: FloatArray, tolerance: float = 1e-6) -> BoolArray:

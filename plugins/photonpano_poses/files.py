@@ -12,20 +12,23 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano import FloatArray, InputError, LocationError
+from photonpano import FloatArray, FluxImage, InputError, LocationError
 from photonpano.geometry import Camera, positions_of
 from photonpano.photometry import srgb_to_linear, tone_mapped
 from photonpano_poses.contract import PoseEstimate, ScenePoints
 
+if TYPE_CHECKING:  # it compiles loops over pixels
+    from photonpano_poses.depth import Surface
+
 PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "openmvg", "tum"]
 
 _GRAPHICS = np.diag([1.0, -1.0, -1.0])  # axes of a camera in OpenGL, x right, y up, z back, to ours
-_WHITE_QUANTILE = 0.995  # quantile of the flux of points that is white
+_WHITE_QUANTILE = 0.995  # quantile of the flux of points, or of an exposure, that is white
 _MIDDLE_GREY = 128
 # Directions of the reference camera to a world whose z is up, in which that camera looks along y.
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -44,11 +47,17 @@ class Poses:
     # for each image the indices of K points and where it shows them, (K, 2); empty if they are not known
     observed: tuple[tuple[NDArray[np.intp], FloatArray], ...] = ()
     points: ScenePoints | None = None  # of the scene; None if they are not known
+    have_depth: bool = False  # whether there is a depth map for each image
 
     @property
     def places(self) -> FloatArray:
         """(N, 3) positions of the cameras, zeros if the camera only turned."""
         return np.zeros((len(self.names), 3)) if self.positions is None else self.positions
+
+
+def depth_name(name: str, suffix: str = "") -> str:
+    """Return the file of the depth map of an image, in a run folder."""
+    return f"depth/{Path(name).stem}{suffix}.tif"
 
 
 def colmap(poses: Poses) -> dict[str, str]:
@@ -75,7 +84,7 @@ def colmap(poses: Poses) -> dict[str, str]:
     cameras.append(f"1 {model} {width} {height} {_line(*numbers)}")
     cloud = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK"]
     if poses.points is not None:
-        greys, errors = greys_of(poses.points), point_errors(poses)
+        greys, errors = greys_of(poses.points.flux), point_errors(poses)
         for point, track in sorted(tracks.items()):
             position, grey = _line(*poses.points.positions[point]), greys[point]
             cloud.append(f"{point + 1} {position} {grey} {grey} {grey} {_line(errors[point])} {' '.join(track)}")
@@ -104,7 +113,11 @@ def nerfstudio(poses: Poses) -> dict[str, str]:
         **dict(zip(("k1", "k2", "p1", "p2"), camera.distortion.tolist(), strict=True)),
         **({} if poses.points is None else {"ply_file_path": "points.ply"}),
         "frames": [
-            {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
+            {
+                "file_path": f"images/{name}",
+                "transform_matrix": pose.tolist(),
+                **({"depth_file_path": depth_name(name)} if poses.have_depth else {}),
+            }
             for name, pose in zip(poses.names, poses_4x4, strict=True)
         ],
     }
@@ -209,25 +222,78 @@ def read_colmap(folder: Path, camera: Camera, frame_shape: tuple[int, int]) -> P
 
 def ply(points: ScenePoints) -> bytes:
     """Return points as a binary PLY file: x, y, z, and their grey level as red, green and blue."""
-    names = [*(("<f4", axis) for axis in "xyz"), *(("u1", colour) for colour in ("red", "green", "blue"))]
-    table = np.zeros(len(points.positions), [(name, kind) for kind, name in names])
-    for axis, values in zip("xyz", points.positions.T, strict=True):
-        table[axis] = values
-    for colour in ("red", "green", "blue"):
-        table[colour] = greys_of(points)
-    words = {"<f4": "float", "u1": "uchar"}
-    properties = "".join(f"property {words[kind]} {name}\n" for kind, name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{properties}end_header\n"
+    return ply_of({**_along("", points.positions), **_greys(points.flux)})
+
+
+def surface_ply(surface: Surface) -> bytes:
+    """Return surface elements as a binary PLY file: position, normal, grey level, and expected error along the ray."""
+    return ply_of(
+        {
+            **_along("", surface.positions),
+            **_along("n", surface.normals),
+            **_greys(surface.flux),
+            "std": surface.std.astype("<f4"),
+        }
+    )
+
+
+_OPACITY = 4.0  # logit of the opacity of a splat
+_THIN = 0.1  # extent of a splat along its normal, relative to that across
+_HARMONIC = 0.28209479177387814  # the spherical harmonic of degree 0
+
+
+def splats_ply(surface: Surface) -> bytes:
+    """Return surface elements as flat 3D Gaussians, in the PLY file that viewers of these open (Kerbl et al. 2023)."""
+    from scipy.spatial.transform import Rotation
+
+    grey = (_greys(surface.flux)["red"] / 255 - 0.5) / _HARMONIC
+    # Any rotation that takes z to the normal.
+    axes = np.cross(surface.normals, np.eye(3)[np.argmin(np.abs(surface.normals), axis=1)])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    rotations = np.stack([axes, np.cross(surface.normals, axes), surface.normals], axis=2)
+    x, y, z, w = Rotation.from_matrix(rotations).as_quat().T
+    size = np.log(surface.sizes / 2)
+    scales = size, size, size + np.log(_THIN)
+    columns: dict[str, NDArray[Any]] = {**_along("", surface.positions), **_along("n", surface.normals)}
+    columns |= {f"f_dc_{k}": grey for k in range(3)} | {"opacity": np.full(len(grey), _OPACITY)}
+    columns |= {f"scale_{k}": each for k, each in enumerate(scales)} | {f"rot_{k}": each for k, each in enumerate((w, x, y, z))}
+    return ply_of({name: each.astype("<f4") for name, each in columns.items()})
+
+
+def _along(prefix: str, vectors: FloatArray) -> dict[str, NDArray[Any]]:
+    return {prefix + axis: each.astype("<f4") for axis, each in zip("xyz", vectors.T, strict=True)}
+
+
+def _greys(flux: NDArray[np.floating]) -> dict[str, NDArray[Any]]:
+    return dict.fromkeys(("red", "green", "blue"), greys_of(flux))
+
+
+def ply_of(columns: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return vertices as a binary PLY file: properties by name, (N,) each, float32 or uint8."""
+    number = len(next(iter(columns.values())))
+    table = np.zeros(number, [(name, each.dtype) for name, each in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    words = {"f": "float", "u": "uchar"}
+    properties = "".join(f"property {words[each.dtype.kind]} {name}\n" for name, each in columns.items())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {number}\n{properties}end_header\n"
     return header.encode("ascii") + table.tobytes()
 
 
-def greys_of(points: ScenePoints) -> NDArray[np.uint8]:
+def picture_of(flux: FluxImage) -> NDArray[np.uint8]:
+    """Return an exposure, (H, W), as a picture of 8 bits in sRGB."""
+    known = np.isfinite(flux)
+    white = float(np.quantile(flux[known], _WHITE_QUANTILE)) if known.any() else 1.0
+    return np.asarray(tone_mapped(flux, max(white, 1e-12)), np.uint8)
+
+
+def greys_of(flux: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Return the grey levels of points in sRGB; those whose flux is not known are of middle grey."""
-    known = np.isfinite(points.flux)
+    known = np.isfinite(flux)
     if not known.any():
-        return np.full(len(points.flux), _MIDDLE_GREY, np.uint8)
-    white = float(np.quantile(points.flux[known], _WHITE_QUANTILE))
-    return np.where(known, tone_mapped(points.flux, max(white, 1e-12)), _MIDDLE_GREY).astype(np.uint8)
+        return np.full(len(flux), _MIDDLE_GREY, np.uint8)
+    white = float(np.quantile(flux[known], _WHITE_QUANTILE))
+    return np.where(known, tone_mapped(flux.astype(np.float32), max(white, 1e-12)), _MIDDLE_GREY).astype(np.uint8)
 
 
 def point_errors(poses: Poses) -> FloatArray:
@@ -280,5 +346,9 @@ def in_standard_world(estimate: PoseEstimate) -> PoseEstimate:
         camera_from_world=moved(estimate.camera_from_world),
         std_position=estimate.std_position / length,
         points=ScenePoints(positions, estimate.points.flux),
+        depth=tuple(
+            replace(each, inverse_depth=each.inverse_depth * np.float32(length), std=each.std * np.float32(length))
+            for each in estimate.depth
+        ),
         views=tuple(replace(view, camera_from_world=moved(view.camera_from_world)) for view in estimate.views),
     )

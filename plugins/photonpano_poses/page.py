@@ -6,6 +6,7 @@ shown is projected onto a plane through its middle.
 
 from __future__ import annotations
 
+from base64 import b64encode
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from photonpano import FloatArray
 from photonpano.geometry import nearest_rotations, positions_of
 from photonpano.photometry import linear_to_srgb
+from photonpano.record.picture_files import png_of
 from photonpano.report.drawing import (
     INK,
     MUTED,
@@ -28,15 +30,16 @@ from photonpano.report.drawing import (
 )
 from photonpano.report.page import head_of
 from photonpano_poses.contract import PoseEstimate
+from photonpano_poses.files import picture_of
 
 if TYPE_CHECKING:  # importing matplotlib takes a second
     from matplotlib.axes import Axes
 
 
 def render_pose_report(record: Any, estimate: PoseEstimate) -> str:
-    """Return the report of a run with `pose` as one HTML page that needs no other file, no network and no script.
+    """Return the report of a run with `pose` as one HTML page that needs no other file and no network.
 
-    The path of the estimate has the length 1.
+    Only depth needs a script. The path of the estimate has the length 1.
     """
     shape = record["source"]["height"], record["source"]["width"]
     return filled(
@@ -47,7 +50,24 @@ def render_pose_report(record: Any, estimate: PoseEstimate) -> str:
         path_views=path_views(estimate, shape),
         scene_views=scene_views(estimate, shape) if len(estimate.points.positions) else (),
         errors_over_time=errors_over_time(estimate, record["source"]["frame_rate_hz"]),
+        depth_source=depth_source(estimate),
     )
+
+
+def depth_source(estimate: PoseEstimate) -> str | None:
+    """Return a PNG as a `data:` URL: the depth map in the middle as it is seen, and below its inverse depth, 0 where unknown.
+
+    None if no pixel has a depth.
+    """
+    maps = [each for each in estimate.depth if np.isfinite(each.inverse_depth).any()]
+    if not maps:
+        return None
+    middle = maps[len(maps) // 2]
+    q, known = middle.inverse_depth, np.isfinite(middle.inverse_depth)
+    low, high = np.quantile(q[known], _NEAR_QUANTILES)
+    levels = np.clip(1 + 254 * (q - low) / max(high - low, 1e-12), 1, 255)
+    near = np.where(known, levels, 0).astype(np.uint8)
+    return "data:image/png;base64," + b64encode(png_of(np.concatenate([picture_of(middle.flux), near]))).decode()
 
 
 MAX_ERRORS = 2000  # frames whose expected errors are drawn; of more, every nth

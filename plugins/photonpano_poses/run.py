@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from photonpano import FloatArray, FluxImage, OutputError, Plan, StreamInfo, Verdict
+from photonpano import FloatArray, OutputError, Plan, StreamInfo, Verdict
 from photonpano.contracts.attribution import blaming
 from photonpano.geometry import Camera, positions_of
-from photonpano.photometry import tone_mapped
 from photonpano.pipeline.components import build_finder
 from photonpano.pipeline.estimate import require_centre
 from photonpano.pipeline.obstacles import naming_obstacles
@@ -23,12 +23,24 @@ from photonpano.record.run_json import verdict_record
 from photonpano.text import counted
 from photonpano.values.verdict import Found, Test, judged
 from photonpano_poses.contract import CameraGuess, PoseEstimate, require_poses
-from photonpano_poses.files import Poses, colmap, in_standard_world, nerfstudio, ply, tum
+from photonpano_poses.depth import fused
+from photonpano_poses.files import (
+    Poses,
+    colmap,
+    depth_name,
+    in_standard_world,
+    nerfstudio,
+    picture_of,
+    ply,
+    splats_ply,
+    surface_ply,
+    tum,
+)
 from photonpano_poses.page import render_pose_report
 from photonpano_poses.scores import PoseScore, evaluate_poses
 
-_WHITE_QUANTILE = 0.995  # quantile of the flux of an exposure that is white in its picture
 _SHOWN_LOST = 3  # spans of lost frames that a warning names
+_MEDIAN_OF_NORMAL = 0.6745  # of the absolute value of a standard normal number
 _FEW = 0.1  # if fewer positions lie within 3 expected errors, the truth is probably of another capture
 logger = logging.getLogger("photonpano")
 
@@ -79,13 +91,15 @@ def camera_guess(plan: Plan) -> CameraGuess:
 def write_pose_files(folder: Path, estimate: PoseEstimate, stream: StreamInfo, exposures: bool) -> list[str]:
     """Write poses.npz, sparse/, transforms.json, points.ply, poses.tum, and with `exposures` pictures in images/.
 
+    With depth also its maps in depth/, and splats.ply.
+
     The path of the estimate has the length 1. Returns warnings; `OutputError` if the disk is full.
     """
     try:
         _write(folder, estimate, stream)
         for name, view in zip(view_names(estimate, stream.n_frames), estimate.views if exposures else (), strict=False):
             (folder / "images").mkdir(exist_ok=True)
-            (folder / "images" / name).write_bytes(_picture(view.flux()))
+            (folder / "images" / name).write_bytes(png_of(picture_of(view.flux())))
     except OSError as error:
         reason = error.strerror or "a file was cut short"
         raise OutputError(f"the poses could not be written ({reason}); what was in the run folder is unchanged") from error
@@ -117,7 +131,10 @@ def _write(folder: Path, estimate: PoseEstimate, stream: StreamInfo) -> None:
         (folder / "sparse" / name).write_text(text, encoding="utf-8")
     for name, text in nerfstudio(seen).items():
         (folder / name).write_text(text, encoding="utf-8")
-    (folder / "points.ply").write_bytes(ply(estimate.points))
+    if estimate.depth:
+        _write_depth(folder, estimate, seen.names)
+    else:
+        (folder / "points.ply").write_bytes(ply(estimate.points))
     if stream.frame_rate_hz is not None:
         frames = np.flatnonzero(estimate.located)
         poses = estimate.camera_from_world[frames]
@@ -134,6 +151,19 @@ def _write(folder: Path, estimate: PoseEstimate, stream: StreamInfo) -> None:
         (folder / "poses.tum").write_text(tum(located)["trajectory.txt"], encoding="utf-8")
 
 
+def _write_depth(folder: Path, estimate: PoseEstimate, names: Sequence[str]) -> None:
+    """Write the depth maps and their errors as TIFF, 0 where the depth is not known, and the surface that they show."""
+    (folder / "depth").mkdir()
+    for each in estimate.depth:
+        q, known = each.inverse_depth, np.isfinite(each.inverse_depth)
+        for suffix, values in (("", 1 / q), ("_std", each.std / q**2)):
+            picture = np.where(known, values, np.float32(0)).astype(np.float32)
+            (folder / depth_name(names[each.view], suffix)).write_bytes(cv2.imencode(".tif", picture)[1].tobytes())
+    surface = fused(estimate)
+    (folder / "points.ply").write_bytes(surface_ply(surface))
+    (folder / "splats.ply").write_bytes(splats_ply(surface))
+
+
 def _of_views(camera: Camera, estimate: PoseEstimate, stream: StreamInfo, rate: float) -> Poses:
     """Return the poses of the exposures, with what they show."""
     poses = np.array([view.camera_from_world for view in estimate.views]).reshape(-1, 3, 4)
@@ -146,14 +176,8 @@ def _of_views(camera: Camera, estimate: PoseEstimate, stream: StreamInfo, rate: 
         positions=positions_of(poses),
         observed=tuple((np.asarray(view.points), view.xy) for view in estimate.views),
         points=estimate.points,
+        have_depth=0 < len(estimate.depth) == len(estimate.views),
     )
-
-
-def _picture(flux: FluxImage) -> bytes:
-    """Return an exposure as PNG, 8 bits in sRGB."""
-    known = np.isfinite(flux)
-    white = float(np.quantile(flux[known], _WHITE_QUANTILE)) if known.any() else 1.0
-    return png_of(tone_mapped(flux, max(white, 1e-12)))
 
 
 def counts_of(estimate: PoseEstimate) -> Mapping[str, int]:
@@ -183,10 +207,38 @@ def poses_record(estimate: PoseEstimate, verdict: Verdict) -> dict[str, Any]:
         **counts_of(estimate),
         "std_position": _rms(estimate.std_position[estimate.located]),
         "std_rotation_deg": _rms(estimate.std_rotation_deg[estimate.located]),
+        "depth": depth_record(estimate),
         "lost": [{"frames": [each.span.start, each.span.stop], "reason": each.reason} for each in estimate.lost],
         "levels": [dict(level) for level in estimate.levels],
         "doubts": [str(reason) for reason in verdict.reasons],
     }
+
+
+def depth_record(estimate: PoseEstimate) -> dict[str, Any] | None:
+    """Describe the depth maps of an estimate for `run.json`; None without any."""
+    if not estimate.depth:
+        return None
+    known = [np.isfinite(each.inverse_depth) for each in estimate.depth]
+    relative = np.concatenate([(each.std / each.inverse_depth)[seen] for each, seen in zip(estimate.depth, known, strict=True)])
+    return {
+        "exposures": len(estimate.depth),
+        "share": float(np.mean(known)),
+        "std_share": float(np.median(relative)) if len(relative) else None,
+        "held_out_ratio": _held_out(estimate),
+    }
+
+
+def _held_out(estimate: PoseEstimate) -> float | None:
+    """Return the median distance of the photons of keys from what the others predict, in units of photon noise."""
+    ratios = []
+    for each in estimate.depth:
+        view = estimate.views[each.view]
+        flux, known = view.flux(), np.isfinite(each.inverse_depth) & (each.flux > 0)
+        # Of binary frames, and nearly so of counts.
+        std = np.sqrt(np.expm1(each.flux) / len(view.span))
+        ratios.append((np.abs(flux - each.flux) / std)[known & np.isfinite(flux)])
+    ratio = np.concatenate(ratios)
+    return float(np.median(ratio) / _MEDIAN_OF_NORMAL) if len(ratio) else None
 
 
 def poses_warnings(estimate: PoseEstimate) -> list[str]:
@@ -236,6 +288,18 @@ def _lost(estimate: PoseEstimate) -> Found:
     return Found(lost / frames, f"{lost} of {frames} frames")
 
 
+def _depth_share(estimate: PoseEstimate) -> Found | None:
+    record = depth_record(estimate)
+    return None if record is None else Found(1 - record["share"], "share of the pixels of key exposures")
+
+
+def _depth_std(estimate: PoseEstimate) -> Found | None:
+    record = depth_record(estimate)
+    if record is None or record["std_share"] is None:
+        return None
+    return Found(100 * record["std_share"], "% of the depth, median")
+
+
 _MORE_LIGHT = "use more light, a longer path, or more frames of it; or another pose.with.group_size"
 TESTS: tuple[Test[PoseEstimate], ...] = (
     Test(
@@ -248,4 +312,6 @@ TESTS: tuple[Test[PoseEstimate], ...] = (
     Test("the expected error of the rotations is large", 5.0, _MORE_LIGHT, _rotation),
     Test("the expected errors are not known", 0, "use a pose estimator that knows them, or more light", _unknown),
     Test("many frames have no pose", 0.5, "see the reasons under `lost`; choose another pose.with.group_size", _lost),
+    Test("many pixels have no depth", 0.5, "use more light, a longer path, or a scene with more texture", _depth_share),
+    Test("the expected error of the depth is large", 10.0, "move farther across the view, or use more light", _depth_std),
 )

@@ -24,7 +24,7 @@ FOCAL_PX = 150.0
 N_POSES = 320
 _MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
 # Depth, and left, top, right and bottom edge, in m: the farthest first.
-_PLANES = ((6.0, (-4, -4, 4, 4)), (3.5, (-1.6, -1.0, -0.5, 0.6)), (4.2, (0.4, -1.2, 1.6, 0.1)), (3.0, (-0.3, 0.2, 1.0, 1.1)))
+PLANES = ((6.0, (-4, -4, 4, 4)), (3.5, (-1.6, -1.0, -0.5, 0.6)), (4.2, (0.4, -1.2, 1.6, 0.1)), (3.0, (-0.3, 0.2, 1.0, 1.1)))
 
 
 def true_poses(travels: bool = True) -> FloatArray:
@@ -44,13 +44,13 @@ def capture(travels: bool = True, distortion: tuple[float, float, float, float] 
     ideal = Camera(_MATRIX, np.array(distortion)).ideal(pixels)
     rng = np.random.default_rng(4)
     textures = []
-    for depth, (left, top, right, bottom) in _PLANES:
+    for depth, (left, top, right, bottom) in PLANES:
         size = round(FOCAL_PX * (bottom - top) / depth), round(FOCAL_PX * (right - left) / depth)
         textures.append(np.clip(1 + 5 * (cv2.GaussianBlur(rng.uniform(0, 1, size), (0, 0), 1.2) - 0.5), 0.1, 3))
     frames = np.empty((N_POSES, *POSES_SHAPE), np.uint8)
     for frame, pose in enumerate(true_poses(travels)):
         flux = np.zeros(POSES_SHAPE)
-        for (depth, (left, top, right, bottom)), texture in zip(_PLANES, textures, strict=True):
+        for (depth, (left, top, right, bottom)), texture in zip(PLANES, textures, strict=True):
             height, width = texture.shape
             to_world = np.array([[(right - left) / width, 0, left], [0, (bottom - top) / height, top], [0, 0, depth]])
             to_frame = _MATRIX @ (pose[:, :3] @ to_world + np.outer(pose[:, 3], [0, 0, 1]))

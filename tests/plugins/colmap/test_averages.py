@@ -22,7 +22,7 @@ pytest.importorskip("pycolmap")
 
 from photonpano_colmap.averages import AveragesEstimator
 from photonpano_colmap.hooks import ColmapAveragesConfig
-from photonpano_colmap.reconstruction import Halves, Piece, Readings, Reconstruction, pose_noise, reconstruct
+from photonpano_colmap.reconstruction import FreeFocal, Halves, Piece, Readings, Reconstruction, pose_noise, reconstruct
 
 SIZE = 20
 MATRIX = camera_matrix(FOCAL_PX, (79.5, 63.5))
@@ -54,6 +54,25 @@ def test_camera_that_only_turns_is_offered_rotations(monkeypatch: pytest.MonkeyP
         estimated(MemorySource(np.zeros((N_POSES, *POSES_SHAPE))))
     assert "of 300 keypoints in an average (the median) 100 match another average" in str(caught.value)
     assert "motion: {model: rotation}" in str(caught.value)
+
+
+def test_wrong_focal_length_is_doubted_and_the_right_one_is_not() -> None:
+    # A camera with an eighth of the focal length bends the scene until it fits nearly as well.
+    estimate, _ = estimated(capture(), CameraGuess(FOCAL_PX / 8))
+    doubt = estimate.doubts[0]
+    assert doubt.what == "the averages contradict the focal length"
+    assert "px fits, 18.75 px is given" in doubt.where
+    level = estimate.levels[0]
+    free = FreeFocal(level["free_focal_px"], level["std_free_focal_px"])
+    assert free.doubt_of(FOCAL_PX) is None
+    assert abs(free.focal_px / FOCAL_PX - 1) < 0.06
+
+
+def test_focal_length_without_poses_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Reconstruction((), np.full(16, 300), np.full(16, 100), FreeFocal(150.0, 6.0, 16))
+    monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
+    with pytest.raises(LocationError, match=r"camera.focal_px = 5000, and does with 150 ± 6 px: correct it, or leave it out"):
+        estimated(MemorySource(np.zeros((N_POSES, *POSES_SHAPE))), CameraGuess(5000.0))
 
 
 def test_full_disk_ends_the_run_before_colmap_reads_half_of_a_picture() -> None:

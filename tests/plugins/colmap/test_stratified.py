@@ -10,7 +10,7 @@ import pytest
 from photonpano import FrameSpan, Group, StageContext
 from photonpano.execution.context import Quiet
 from photonpano.geometry import Camera, positions_of, rotation_matrices
-from photonpano_poses import CameraGuess, pose_errors
+from photonpano_poses import CameraGuess, between, imaged, lens_of, pose_errors
 from photonpano_poses.testing import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
 
 pytest.importorskip("pycolmap")
@@ -18,9 +18,6 @@ pytest.importorskip("gtsam")
 
 from photonpano_colmap.exposures import (
     Path,
-    between,
-    imaged,
-    lens_of,
     merge_through_depth,
     moves,
     posed,

@@ -8,18 +8,19 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import photonpano
 import photonpano_poses
-from photonpano import Config, FrameSpan, InputError, Reason, discover, hookimpl, run
+from photonpano import Config, FrameSpan, InputError, PluginError, Reason, discover, hookimpl, run
 from photonpano.pipeline.run import RunResult
 from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import changed_files
 from photonpano.specs import Plan, parse_spec
-from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, PoseEstimatorContribution, ScenePoints
+from photonpano_poses import CameraGuess, DepthMap, LostFrames, PosedView, PoseEstimate, PoseEstimatorContribution, ScenePoints
 
 N_FRAMES, LOST = 300, FrameSpan(280, 300)
 CATALOG = discover()
@@ -159,6 +160,40 @@ def test_other_files_hold_the_same_poses(finished: RunResult, tmp_path: Path) ->
     exported = photonpano_poses.export(folder, "tum", tmp_path / "poses", every=2)
     assert exported.n_frames == LOST.start / 2
     np.testing.assert_allclose(np.loadtxt(tmp_path / "poses" / "trajectory.txt"), tum[::2])
+
+
+def with_flat_depth(estimate: PoseEstimate) -> PoseEstimate:
+    """Give each view a wall at the depth of 5, of which the upper half is not known."""
+    inverse_depth = np.full((128, 160), 0.2, np.float32)
+    inverse_depth[:64] = np.nan
+    std, flux = inverse_depth / 20, np.full((128, 160), 0.5, np.float32)
+    return replace(estimate, depth=tuple(DepthMap(view, inverse_depth, std, flux) for view in range(5)))
+
+
+def test_depth_is_written_for_other_programs(plan_of: Callable[..., Plan], tmp_path: Path) -> None:
+    record, folder = run(plan_of(with_flat_depth)).record, tmp_path / "run"
+    poses = estimate_of(None, CameraGuess()).camera_from_world[: LOST.start]
+    length = np.linalg.norm(np.diff(-np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3]), axis=0), axis=1).sum()
+    depth, std = (cv2.imread(str(folder / "depth" / f"exposure_050{end}.tif"), cv2.IMREAD_ANYDEPTH) for end in ("", "_std"))
+    assert depth.dtype == std.dtype == np.float32
+    np.testing.assert_array_equal(depth[:64], 0)
+    np.testing.assert_allclose(depth[64:], 5 / length, rtol=1e-5)
+    np.testing.assert_allclose(std[64:], 0.25 / length, rtol=1e-5)
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    assert [each["depth_file_path"] for each in frames] == [f"depth/exposure_{start:03}.tif" for start in range(0, 250, 50)]
+    assert record["poses"]["depth"]["share"] == 0.5
+    for name, last in (("points.ply", b"property float std\n"), ("splats.ply", b"property float rot_3\n")):
+        header, body = (folder / name).read_bytes().split(b"end_header\n", 1)
+        assert header.endswith(last)
+        number = int(header.split(b"element vertex ")[1].split()[0])
+        assert 64 * 160 < number < 5 * 64 * 160
+        assert len(body) == number * sum(4 if line.startswith(b"property float") else 1 for line in header.split(b"\n")[3:-1])
+    assert all(
+        text in (folder / "report.html").read_text()
+        for text in ("viewpoint", 'data-source="data:image/png', "pixels with depth")
+    )
+    with pytest.raises(PluginError, match="that of the view 9, and there are 5"):
+        run(plan_of(lambda it: replace(it, depth=(replace(with_flat_depth(it).depth[0], view=9),))), overwrite=True)
 
 
 def test_doubts_and_lost_frames_are_in_record_report_and_warnings(plan_of: Callable[..., Plan], tmp_path: Path) -> None:
