@@ -27,7 +27,7 @@ from photonpano.geometry import Canvas
 from photonpano.merging.accumulate import bytes_of_light
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.colour import channels_of, composed
-from photonpano.merging.panorama import RenderedPanorama, Thumbnail, plan_canvas, render_tiles, tiles_of
+from photonpano.merging.panorama import BYTES_PER_PIXEL, RenderedPanorama, Thumbnail, plan_canvas, render_tiles, tiles_of
 from photonpano.merging.warping import by_homographies
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.motion.level import Recorder
@@ -35,7 +35,9 @@ from photonpano.photometry import balanced, picture_of
 from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.run_folder import RunFolder
 from photonpano.plugins.contributions import ExporterContribution, RendererContribution
-from photonpano.record.contents import MAPS
+from photonpano.record.contents import HALVES, MAPS
+from photonpano.residuals.detail import Detail
+from photonpano.residuals.halves import detail_between, halves_in_time, reduced
 from photonpano.specs.plan import Plan
 from photonpano.values import FrameSpan, Homography, Journal, Panorama, PanoramaRows
 
@@ -112,6 +114,23 @@ def _rendered(
         std=gathered.std,
         dynamic_range=dynamic_range,
     )
+
+
+def write_halves(
+    folder: RunFolder, plan: Plan, source: Source, *, motion: FrameMotion, canvas: Canvas, context: Context
+) -> Detail:
+    """Write the panoramas of the first and the last half of the frames that saw each place; return the detail that they share.
+
+    They lie on the canvas of the panorama, or on the largest that fits into memory.
+    """
+    canvas = reduced(canvas, int(plan.run.memory) / (BYTES_PER_PIXEL * channels_of(source)))
+    sums = halves_in_time(source, motion, canvas, plan.render.tolerance_px, context)
+    for name, (lit, weight) in zip(HALVES, sums.squeeze(-1) if sums.shape[-1] == 1 else sums, strict=True):
+        flux = np.divide(lit, weight, out=np.full_like(lit, np.nan), where=weight > 0)
+        half = composed(Panorama(flux, weight, canvas.transform), source)
+        with folder.writing():
+            tifffile.imwrite(folder.staging / name, half.flux, metadata=None)
+    return detail_between(sums, source, motion, canvas)
 
 
 @contextmanager

@@ -31,13 +31,13 @@ from photonpano.pipeline.follow import followed
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.obstacles import naming_obstacles, order_warning, run_others
 from photonpano.pipeline.passes import build_refiners, refine
-from photonpano.pipeline.rendering import render_into
+from photonpano.pipeline.rendering import render_into, write_halves
 from photonpano.pipeline.run_folder import RunFolder, run_folder, write_exposures
 from photonpano.pipeline.state import State
 from photonpano.pipeline.summary import require_photons
 from photonpano.plugins.contributions import RunKindContribution
 from photonpano.record.contents import capture_files, fingerprint
-from photonpano.record.run_json import level_record, peak_memory_bytes, record_of, started_record, verdict_of
+from photonpano.record.run_json import detail_record, level_record, peak_memory_bytes, record_of, started_record, verdict_of
 from photonpano.record.schema import CaptureRecord, RunRecord
 from photonpano.report import OpenCapture, render_failure, render_report
 from photonpano.report.notebook import ShownReport, run_html
@@ -172,6 +172,9 @@ def make_panorama(run: BegunRun) -> None:
         if plan.output.keep == "exposures":
             with folder.writing():
                 write_exposures(folder.staging, state.results, panorama.white_flux, context)
+        detail = explained.halves.detail
+        if plan.output.keep == "halves":
+            detail = write_halves(folder, plan, source, motion=explained.motion, canvas=panorama.canvas, context=context)
     record = record_of(
         run.started_record(),
         plan,
@@ -182,6 +185,7 @@ def make_panorama(run: BegunRun) -> None:
         rendered=chosen,
         findings=findings,
     )
+    record["detail"] = detail_record(detail)
     light, capture = light_of(source), OpenCapture(source, state.results)
     run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)
 

@@ -28,6 +28,7 @@ from photonpano.specs.plan import Plan
 
 RECORD = "run.json"
 MAPS = ("panorama.tiff", "coverage.tiff", "panorama-std.tiff")  # flux, frames, and standard deviation of the flux of each pixel
+HALVES = ("panorama-first.tiff", "panorama-last.tiff")  # by the first and the last half of the frames that saw each place
 REPORT = "report.html"
 
 

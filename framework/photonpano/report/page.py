@@ -87,6 +87,7 @@ def _unexplained(record: RunRecord, explained: Explained, panorama: RenderedPano
         "shifts_are_drawn": figures.significant_shifts(residuals) is not None,
         "shifts_over_time": figures.shifts_over_time(residuals, record["source"]["frame_rate_hz"]),
         "halves_over_time": figures.halves_over_time(explained.halves, residuals.spans[-1].stop),
+        "detail_over_frequency": figures.detail_over_frequency(record.get("detail")),
         "light_over_time": figures.light_over_time(residuals),
         "span_frames": int(np.median([len(span) for span in residuals.spans])),
     }

@@ -85,6 +85,7 @@ def test_run_prints_only_verdict_paths_and_warnings_into_pipe(finished: Path) ->
     assert (finished / "run.out").read_text() == (
         f"verdict   {record['verdict']['status']}\n{''.join(refined)}"
         f"found     homographies, from groups of {record['levels'][-1]['group_frames']} frames\n"
+        f"detail    down to {record['detail']['finest_px']:.2g} px is real: all that the grid holds\n"
         f"range     {decibels:.0f} dB, of {measurable:.0f} dB that the frames over a pixel can measure; "
         f"{100 * panorama['saturated_share']:.2g} % of the pixels are saturated\n"
         f"panorama  {finished}/run/panorama.png\nreport    {finished}/run/report.html\n"
