@@ -117,6 +117,8 @@ _CONTENTS = {
     "panorama.png": "the panorama to look at, 8 bits",
     "coverage.tiff": "the number of frames that saw each pixel of the panorama, float32",
     "panorama-std.tiff": "the standard deviation of the flux of each pixel, float32",
+    "first-frame.tiff": "the first frame that saw each pixel, uint32; 4294967295 where none did",
+    "last-frame.tiff": "the last frame that saw each pixel, uint32; 4294967295 where none did",
     "trajectory.npz": "the motion of every frame",
     "light.npz": "the gain of the light in each frame",
     "layers.npz": "which parts of the frames show the background, and which something that hides it",

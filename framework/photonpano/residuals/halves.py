@@ -130,7 +130,7 @@ def halves_of(source: Source, motion: FrameMotion, canvas: Canvas, context: Cont
     if len(spans) < 4:
         return Halves.none()
     blocks = _blocks(source, motion, spans, canvas=canvas, tolerance_px=_TOLERANCE_PX, context=context)
-    scale = _scale_of(canvas)
+    scale = canvas.scale
     widest_px = max(motion.frame_shape) / 2 * scale
     # Of the two parts of the first half, and of the second: flux times weight, and weight.
     sums = np.zeros((4, 2, *canvas.shape, channels_of(source)), np.float32)
@@ -155,11 +155,6 @@ def _alternating(span: FrameSpan, n_colours: int) -> list[FrameSpan]:
     number = 2 * min(_CUTS + 1, len(span) // (2 * _FEWEST_FRAMES * n_colours))  # a pixel has one colour in a frame
     starts = np.linspace(span.start, span.stop, number + 1).round().astype(int).tolist()
     return [FrameSpan(*ends) for ends in pairwise(starts)] if number else []
-
-
-def _scale_of(canvas: Canvas) -> float:
-    """Return the pixels of a canvas per pixel of the reference frame, in its middle."""
-    return float(canvas.transform[0, 0] / (1 if canvas.camera_matrix is None else canvas.camera_matrix[0, 0]))
 
 
 def halves_in_time(source: Source, motion: FrameMotion, canvas: Canvas, tolerance_px: float, context: Context) -> FluxImage:
@@ -196,7 +191,7 @@ def detail_between(sums: FluxImage, source: Source, motion: FrameMotion, canvas:
         variance[..., index] = noise.std(mean[..., index], frames[..., index]) ** 2
     variance *= frames * (1 / weight).sum(axis=0)
     ratio = float(np.sqrt(np.mean((first - last)[seen] ** 2 / variance[seen]))) if seen.any() else np.nan
-    return detail_of(first, last, frames, seen, scale=_scale_of(canvas), noise=ratio)
+    return detail_of(first, last, frames, seen, scale=canvas.scale, noise=ratio)
 
 
 def reduced(canvas: Canvas, most_pixels: float) -> Canvas:
