@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -135,7 +136,16 @@ def run_folder(directory: Path, *, overwrite: bool = False, inputs: Sequence[Pat
             raise OutputError(
                 f"{directory}: the run folder cannot be written to ({error.strerror}); choose another one with --output"
             ) from error
+        _require_temporary(directory.parent)
         yield RunFolder(directory, staging)
+
+
+def _require_temporary(folder: Path) -> None:
+    """Let temporary files lie in a folder where the system has no place for them, as in a container that is read-only."""
+    try:
+        tempfile.gettempdir()
+    except FileNotFoundError:
+        tempfile.tempdir = str(folder)
 
 
 def _of_camera(motion: FrameMotion) -> dict[str, NDArray[Any]]:

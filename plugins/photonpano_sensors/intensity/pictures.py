@@ -76,6 +76,11 @@ class ImageFolderSource(IntensitySource):
         form = self._pictures.form
         shape = self._pictures.n_frames, form.height, form.width
         super().__init__(config, shape, None, Encoding.full(form.bits))
+        pictures = f'tifffile.imread("{config.path}")'
+        if config.path.is_dir():
+            files = f'sorted(pathlib.Path("{config.path}").iterdir(), key=lambda file: (len(file.name), file.name))'
+            pictures = f"[cv2.imread(str(file), -1) for file in {files}]"
+        self.refuse_binary(config.path, pictures)
 
     def close(self) -> None:
         """Close files."""

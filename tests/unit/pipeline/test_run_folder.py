@@ -9,6 +9,7 @@ import resource
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -251,6 +252,18 @@ def test_run_folder_keeps_old_files_when_the_disk_is_full(old: Path, result: str
         "Make room, or choose another folder with --output"
     )
     assert files_in(old.parent) == before
+
+
+def test_temporary_files_lie_beside_the_run_folder_where_the_system_has_no_place(
+    old: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nowhere() -> str:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "gettempdir", nowhere)
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    with run_folder(old, overwrite=True):
+        assert tempfile.tempdir == str(old.parent)
 
 
 @pytest.mark.parametrize("number", range(16))
