@@ -9,8 +9,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from typing import Any
+
+import cv2
 
 from photonpano.capture import capture_of
 from photonpano.compiling import notify_on_first_compile
@@ -258,6 +261,7 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
     if plan.kind is not None and (how.keep or how.from_level is not None):
         no_levels = f"a run with `{plan.kind.section}` has no levels to keep or to go on from"
         raise InputError(f"{no_levels}: leave out --keep-work and --from-level")
+    _require_opencv()
     observers, read = Observers(plan.observers, plan.output.directory), [*capture_files(plan), *filter(None, [plan.file])]
     with (
         observers.watching(plan.document) as finished,
@@ -281,6 +285,16 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
             with _work(run, how) as run.work, _reporting_failure(run):
                 yield run
         finished(run.record)
+
+
+def _require_opencv() -> None:
+    """Refuse another OpenCV than the required one: of two distributions, that which was installed last is imported."""
+    name = "opencv-python-headless"
+    if not version(name).startswith(cv2.__version__):
+        others = sorted({*packages_distributions()["cv2"]} - {name})
+        remove = f"`pip uninstall {' '.join([*others, name])}` and then `pip install {name}`"
+        of = f" of {listed(others)}" if others else ""
+        raise InputError(f"OpenCV {cv2.__version__}{of} is imported instead of {name} {version(name)}: run {remove}")
 
 
 def failure_path(directory: Path) -> Path:
@@ -309,6 +323,10 @@ def _reporting_failure(run: BegunRun) -> Iterator[None]:
         logger.debug("the report of an earlier failure could not be removed: %s", error)
     try:
         yield
+    except KeyboardInterrupt as error:
+        if run.work is not None:
+            error.add_note("the same command with --resume goes on")
+        raise
     except (LocationError, CanvasTooLargeError, PluginError) as error:
         levels = {result.level.number: level_record(result) for result in run.levels}
         record: RunRecord = {

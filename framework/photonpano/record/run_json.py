@@ -304,7 +304,7 @@ def detail_record(found: Detail | None) -> DetailRecord | None:
     finest, *of_parts = found.finest_px
     return {
         "finest_px": finest,
-        "grid_px": found.grid_px,
+        "grid_px": float(1 / found.frequencies[-1]),
         "frequencies": found.frequencies.tolist(),
         "halves": found.halves[0].tolist(),
         "scene": found.scene[0].tolist(),

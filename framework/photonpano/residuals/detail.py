@@ -49,11 +49,6 @@ class Detail:
         """The period of the finest real detail of each row, in px of a frame; None if there is none."""
         return [finest_period(self.frequencies, each) for each in self.scene]
 
-    @property
-    def grid_px(self) -> float:
-        """The shortest period along the axes of the grid, in px of a frame."""
-        return float(1 / self.frequencies[-1])
-
 
 def finest_period(frequencies: FloatArray, correlation: FloatArray) -> float | None:
     """Return the period at which a correlation falls below what is real; that of the last frequency if it does not fall."""

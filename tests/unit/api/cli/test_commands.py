@@ -166,3 +166,11 @@ def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any
     assert invoke("convert", "cube.npy", "cube.npy", "--overwrite").exit_code == 0
     assert cube.read_bytes() == before
     truth.unlink()
+
+
+def test_check_refuses_the_capture_as_output(cube: Path, invoke: Callable[..., Any]) -> None:
+    source = "source: {use: packed-npy, with: {path: cube.npy}}"
+    Path("wrong.yaml").write_text(f"version: 1\n{source}\noutput: {{directory: cube.npy}}\n")
+    result = invoke("check", "wrong.yaml")
+    assert result.exit_code == 1
+    assert f"{cube.absolute()} cannot be written, since {cube.absolute()}, which is read, lies in it" in result.stderr
