@@ -315,16 +315,12 @@ def detail_over_frequency(detail: DetailRecord | None) -> str | None:
         return None
     with plain_figure(WIDTH_IN, 2.6) as figure:
         [axes] = add_axes(figure, Margins(top=0.35))
-        axes.axhline(0, color=MUTED, linewidth=1)
         axes.axhline(REAL, color=MUTED, linewidth=1, linestyle="--")
         axes.plot(detail["frequencies"][1:], detail["scene"][1:], color=SERIES[0], label="all frames and the scene")
         axes.plot(detail["frequencies"][1:], detail["halves"][1:], color=SERIES[1], label="both halves")
         if detail["finest_px"] is not None:
             axes.axvline(1 / detail["finest_px"], color=MUTED, linewidth=1, linestyle="--")
-        axes.set_xlim(0, detail["frequencies"][-1])
-        axes.set_ylim(-0.1, 1.05)
-        axes.set_xlabel("frequency (periods per px)")
-        axes.set_ylabel("correlation")
+        axes.set(xlim=(0, detail["frequencies"][-1]), ylim=(-0.1, 1.05), xlabel="periods per px", ylabel="correlation")
         axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, columnspacing=1.2)
         return svg_of(figure, "detail")
 

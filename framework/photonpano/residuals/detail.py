@@ -31,18 +31,23 @@ class Detail:
     frequencies: FloatArray  # (K,) cycles per px of a frame
     halves: FloatArray  # (R, K) correlation; no row where the halves share no square
     frames: FloatArray  # (R,) mean number of frames that saw a pixel
+    # from 0 to 1: 1 where the frames in which a place is in view show it at one place of the grid of the sensor, along an axis
+    phase: float = 0.0
     # root mean square difference of the halves, in units of what the part of `panorama-std` by photons explains; NaN where
     # they share no pixel
-    noise: float
+    noise: float = 1.0
 
     @property
     def scene(self) -> FloatArray:
         """The expected correlation of the picture of all frames with the scene: (R, K).
 
         Where the halves correlate by c, a picture with the light of both correlates with the scene by `sqrt(2 c / (1 + c))`.
+        Beyond 1/2 period per px, both may also show coarser structure, that of frequency 1 - f, at a place of the grid that
+        they share: natural scenes, and the area of a pixel, pass it on `(f / (1 - f))^2` times as strongly.
         """
-        common = np.clip(self.halves, 0, 1)
-        return np.asarray(np.sqrt(2 * common / (1 + common)))
+        common, beyond = np.clip(self.halves, 0, 1), np.clip(self.frequencies, 0.5, 0.999)
+        aliased = np.where(self.frequencies > 0.5, self.phase * (beyond / (1 - beyond)) ** 2, 0)
+        return np.asarray(np.sqrt(2 * common / (1 + common) / (1 + aliased**2)))
 
     @property
     def finest_px(self) -> list[float | None]:
@@ -62,16 +67,16 @@ def finest_period(frequencies: FloatArray, correlation: FloatArray) -> float | N
     return float(1 / (frequencies[ring - 1] + share * (frequencies[ring] - frequencies[ring - 1])))
 
 
-def detail_of(first: FluxImage, last: FluxImage, frames: FluxImage, seen: BoolArray, *, scale: float, noise: float) -> Detail:
+def detail_of(first: FluxImage, last: FluxImage, frames: FluxImage, seen: BoolArray, scale: float = 1, **rest: float) -> Detail:
     """Correlate pictures of two halves of the frames: (H, W, C) each, on a canvas of `scale` px for one of a frame.
 
-    `frames` (H, W, C) are those of both that saw a pixel, `seen` (H, W, C) where it was seen by both; `noise` as in `Detail`.
+    `frames` (H, W, C) are those of both that saw a pixel, `seen` (H, W, C) where both did; `rest` are `noise` and `phase`.
     """
     side = _SQUARE_PX
     while side > min(seen.shape[:2]):
         side //= 2
     frequencies = np.arange(side // 2 + 1) / side * scale
-    nothing = Detail(frequencies, np.zeros((0, len(frequencies))), np.zeros(0), noise)
+    nothing = Detail(frequencies, np.zeros((0, len(frequencies))), np.zeros(0), **rest)
     if side < _SMALLEST_PX:
         return nothing
     rows = range(0, seen.shape[0] - side + 1, side // 2)
@@ -86,7 +91,7 @@ def detail_of(first: FluxImage, last: FluxImage, frames: FluxImage, seen: BoolAr
     wide = np.pad(sums, ((0, 0), (0, 0), (1, 1)), mode="edge")
     sums = wide[..., :-2] + wide[..., 1:-1] + wide[..., 2:]  # single rings have few samples
     halves = sums[:, 0] / np.sqrt(np.maximum(sums[:, 1] * sums[:, 2], 1e-30))
-    return Detail(frequencies, halves, np.array([weights[part].mean() for part in (order, *parts)]), noise)
+    return Detail(frequencies, halves, np.array([weights[part].mean() for part in (order, *parts)]), **rest)
 
 
 def _spectra(first: FluxImage, last: FluxImage, frames: FluxImage, seen: BoolArray) -> tuple[FloatArray, FloatArray]:

@@ -19,7 +19,7 @@ import numpy as np
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.execution.context import Context
-from photonpano.geometry import Canvas, rescaling
+from photonpano.geometry import Canvas, corners, rescaling, transform_points
 from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.merging.colour import channels_of, in_colours
 from photonpano.merging.panorama import MergeRenderer
@@ -38,6 +38,7 @@ _MARGIN_PX = 4  # around the places of frames that were looked at, for those bet
 _FEWEST_FRAMES = 4  # of a block
 _LEAST_LIGHT = 0.5  # of each picture, in frames of the mean light that saw a pixel: where the light falls, frames count less
 _MOST_PIXELS = 4e6  # of the canvas; a larger one is reduced
+_PHASES = 1000  # instants at which it is looked where frames lie on the grid of the sensor
 _SAMPLED = 5  # frames of a block at which it is looked where they lie
 _SQUARE_PX = 16  # squares whose noise is independent, for each pixel by which pictures are smoothed
 _DARKEST = 1e-4  # least flux of which the noise is taken
@@ -191,7 +192,11 @@ def detail_between(sums: FluxImage, source: Source, motion: FrameMotion, canvas:
         variance[..., index] = noise.std(mean[..., index], frames[..., index]) ** 2
     variance *= frames * (1 / weight).sum(axis=0)
     ratio = float(np.sqrt(np.mean((first - last)[seen] ** 2 / variance[seen]))) if seen.any() else np.nan
-    return detail_of(first, last, frames, seen, scale=canvas.scale, noise=ratio)
+    in_view = max(1, round(len(motion.span) * seen.sum() / max(frames[seen].sum(), 1)))  # times that a place is in view
+    instants = np.linspace(motion.span.start, motion.span.stop - 1, min(len(motion.span), _PHASES)).round()
+    phases = np.exp(2j * np.pi * transform_points(motion.trajectory.at(instants), corners(motion.frame_shape)))
+    phase = np.mean([abs(each.mean(axis=0)).mean(axis=0).max() for each in np.array_split(phases, min(in_view, len(phases)))])
+    return detail_of(first, last, frames, seen, scale=canvas.scale, noise=ratio, phase=float(phase))
 
 
 def reduced(canvas: Canvas, most_pixels: float) -> Canvas:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -27,6 +28,7 @@ class Case(NamedTuple):
     error_px: float  # standard deviation of the error of the motion along an axis
     lasting: float  # frames over which that is correlated
     scale: float
+    height_px: float = 8  # of the path
 
 
 CASES = {
@@ -47,7 +49,7 @@ def seen(case: Case, seed: int = 0) -> tuple[Detail, float | None]:
     scene = np.exp(0.7 * texture / texture.std())
     by_pixels = cv2.blur((case.flux * scene / scene.mean()).astype(np.float32), (FINER, FINER), anchor=(0, 0))
     time = np.linspace(0, 1, N_FRAMES)
-    path = np.stack([10 + 110 * time + 1.5 * np.sin(40 * time), 20 + 8 * np.sin(7 * time)], axis=1)
+    path = np.stack([10 + 110 * time + 1.5 * np.sin(40 * time), 20 + case.height_px * np.sin(7 * time)], axis=1)
     to_scene = np.diag([FINER, FINER, 1.0])
     true = np.array([translation(*place) for place in path])
     frames = detected(seen_along(by_pixels, to_scene @ true, SHAPE), seed)
@@ -79,7 +81,7 @@ def seen(case: Case, seed: int = 0) -> tuple[Detail, float | None]:
 
     start = {"initial_simplex": [[0, 0], [0.5, 0], [0, 0.5]], "xatol": 0.02}
     aligned = true_picture(minimize(unlike, [0, 0], method="Nelder-Mead", options=start).x)
-    real = detail_of(flux, aligned, sums[:, 1].sum(axis=0), everywhere, scale=case.scale, noise=1)
+    real = detail_of(flux, aligned, sums[:, 1].sum(axis=0), everywhere, case.scale)
     return detail_between(sums, source, motion, canvas), finest_period(real.frequencies, real.halves[0])
 
 
@@ -89,6 +91,15 @@ def test_detail_is_that_which_the_panorama_shares_with_the_true_scene(name: str)
     assert true_px is not None
     assert true_px > 1.05 / found.frequencies[-1]  # the grid does not decide
     assert found.finest_px[0] == pytest.approx(true_px, rel=0.1)
+
+
+def test_what_the_grid_of_the_sensor_makes_of_the_scene_is_not_detail() -> None:
+    """Rows of pixels along the path see each place at one phase: both halves show the same aliasing."""
+    found, true_px = seen(Case(0.5, 0, 1, 2, 0))
+    assert found.phase == pytest.approx(1, abs=0.01)
+    assert true_px is not None
+    assert 0.95 * true_px < (found.finest_px[0] or 0) < 1.3 * true_px
+    assert (replace(found, phase=0.0).finest_px[0] or 0) < 0.8 * true_px
 
 
 def test_halves_differ_by_photon_noise_and_by_more_where_the_motion_is_off() -> None:
@@ -106,18 +117,18 @@ def test_fewer_frames_show_less_detail() -> None:
 
 def test_noise_holds_no_detail() -> None:
     first, last = np.random.default_rng(0).normal(size=(2, 128, 192, 1)).astype(np.float32)
-    found = detail_of(first, last, np.ones_like(first), np.ones_like(first, dtype=bool), scale=1, noise=1)
+    found = detail_of(first, last, np.ones_like(first), np.ones_like(first, dtype=bool))
     assert found.finest_px[0] is None
 
 
 def test_same_pictures_show_all_that_the_grid_holds() -> None:
     same = np.random.default_rng(0).normal(size=(40, 50, 1)).astype(np.float32)
-    found = detail_of(same, same, np.ones_like(same), np.ones_like(same, dtype=bool), scale=1, noise=1)
+    found = detail_of(same, same, np.ones_like(same), np.ones_like(same, dtype=bool))
     assert found.finest_px == [2.0]
 
 
 @pytest.mark.parametrize("shape", [(10, 200, 1), (64, 64, 1)], ids=["low", "unseen"])
 def test_no_square_that_both_halves_saw_gives_no_detail(shape: tuple[int, ...]) -> None:
     image = np.ones(shape, np.float32)
-    found = detail_of(image, image, image, np.zeros(shape, dtype=bool), scale=1, noise=np.nan)
+    found = detail_of(image, image, image, np.zeros(shape, dtype=bool))
     assert found.finest_px == []
