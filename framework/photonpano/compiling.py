@@ -5,12 +5,15 @@ Plugins may use `compiled` for their own loops. Modules that use it import numba
 
 from __future__ import annotations
 
+import inspect
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import event
+from numba.core import caching, event
 
 __all__ = ["compiled", "notify_on_first_compile"]
 
@@ -32,7 +35,37 @@ def compiled(function: Function) -> Function:
     # As cache=True, which raises where no folder can be written to: then each process compiles the function for itself.
     with suppress(RuntimeError):
         dispatcher.enable_caching()
+    if not os.access(Path(inspect.getfile(function)).parent, os.W_OK):
+        dispatcher._cache = _SharedCode(function, dispatcher._cache)
     return cast("Function", dispatcher)
+
+
+class _Beside(caching.InTreeCacheLocator):
+    """The folder beside a module that only its owner writes to."""
+
+    def ensure_cache_path(self) -> None:
+        """Ask for nothing: it is read only."""
+
+
+class _BesideImpl(caching.CompileResultCacheImpl):
+    _locator_classes = [_Beside]  # noqa: RUF012  # as the base class has it
+
+
+class _SharedCode(caching.FunctionCache):
+    """Machine code that another user has kept beside a module, as in an image of a container; `own` keeps what is missing."""
+
+    _impl_class = _BesideImpl
+
+    def __init__(self, function: Callable[..., object], own: Any) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        self._own = own
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        return self._own.load_overload(sig, target_context) if found is None else found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        self._own.save_overload(sig, data)
 
 
 @contextmanager

@@ -42,6 +42,7 @@ from photonpano.reading import (
     any_npy_header,
     arrived_frames,
     as_written,
+    eight_frames_are_first,
     frames_are_last,
     has_channels,
     is_gzip,
@@ -281,9 +282,9 @@ def _header(config: _AnyConfig) -> NpyHeader:
     path, header = config.path, any_npy_header(config.path)
     axes = "frames, height, bytes of a row"
     if isinstance(config, PackedNpyConfig):
-        if header.dtype != np.uint8:
-            seen = _seen(path, header)
-            remedy = "pack frames of zeros and ones with numpy.packbits(cube, axis=-1)" if seen is None else seen.remedy(path)
+        if header.dtype != np.uint8 and len(header.shape) > 2 and min(header.shape) > 0:
+            pack, seen = "pack frames of zeros and ones with numpy.packbits(cube != 0, axis=-1)", _seen(path, header)
+            remedy = pack if seen is None else seen.remedy(path)
             raise InputError(f"{path} holds {header.dtype} values, not bytes of eight pixels; {remedy}")
     else:
         axes = "height, width, frames" if config.frame_axis == "last" else "frames, height, width"
@@ -391,6 +392,9 @@ def _seen(path: Location, header: NpyHeader, channel: int | None = None) -> _See
     if header.dtype != np.uint8:
         return None
     for axis, eight in _EIGHT.items():
+        if axis == 2 and frames_are_last(samples, shape, axis) and eight_frames_are_first(samples):
+            packed = "numpy.packbits(numpy.unpackbits(numpy.load(path), axis=0), axis=-1)"
+            return _Seen("", {}, f"has eight frames in a byte, along the first axis of {shape}", packed)
         if frames_are_last(samples, shape, axis):
             frames_first = f"numpy.moveaxis(numpy.unpackbits(numpy.load(path), axis={axis}), -1, 0)"
             alike = f"has its frames along the last axis of {shape}, where values are most alike"

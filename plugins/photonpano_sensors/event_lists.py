@@ -253,8 +253,9 @@ def _table(path: Path) -> _Table:
         rows = np.load(path, "r", allow_pickle=False)
     if rows.dtype.names:
         return _Table(list(rows.dtype.names), lambda used: {name: rows[name] for name in used})
-    if rows.ndim != 2 or rows.shape[1] < _FEWEST:
-        raise InputError(f"{path} has the shape {rows.shape}; a list of photons has a row for each, of frame or time, x and y")
+    if rows.ndim != 2 or rows.shape[1] < _FEWEST or rows.dtype == bool:
+        found = f"{rows.dtype} of the shape {rows.shape}"
+        raise InputError(f"{path} holds {found}; a list of photons has a row for each, of frame or time, x and y")
     return _Table([str(number) for number in range(rows.shape[1])], lambda used: {name: rows[:, int(name)] for name in used})
 
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from photonpano import FinishedPanorama, FluxImage
 
 _MAPS = ("flux", "weight", "std", "saturated")
+_FLUX = "photons per pixel per frame"
+_UNITS = {"flux": _FLUX, "weight": "frames", "std": _FLUX, "saturated": "1 for a pixel that was lit in every frame"}
 _CHUNK = 256  # sides of a chunk, in px, which viewers read one by one; in colour, half as high
 _SHARD_COLUMNS = 16 * _CHUNK  # columns of the chunks that share a file; a file holds one row of chunks, of all channels
 _FILLED = 1e-6  # frames as which known flux without frames counts
@@ -45,7 +47,8 @@ class OmeZarrExporter:
         }
         # Neuroglancer opens no image with a unit that it does not know, and degrees are one. So axes have no units.
         unit = "pixel of the reference frame" if panorama.projection == "planar" else "degree"
-        zarr.create_group(path, attributes={"ome": ome, "photonpano": {"projection": panorama.projection, "unit": unit}})
+        about = {"projection": panorama.projection, "unit": unit, "channels": _UNITS, "capture": panorama.capture}
+        zarr.create_group(path, attributes={"ome": ome, "photonpano": about})
 
 
 def halved(maps: FluxImage) -> FluxImage:

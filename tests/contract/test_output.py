@@ -39,12 +39,27 @@ def trajectory(folder: Path) -> dict[str, np.ndarray]:
         return dict(archive)
 
 
+def test_maps_say_what_they_hold(folder: Path, small_capture: Path) -> None:
+    for name, content in {
+        "panorama": "flux",
+        "coverage": "number of frames",
+        "first-frame": "number of the first frame",
+    }.items():
+        with tifffile.TiffFile(folder / f"{name}.tiff") as file:
+            (about,) = file.shaped_metadata
+        assert about["content"].startswith(content)
+        assert about["pixels_per_frame_pixel"] == pytest.approx(1, rel=0.1)
+        assert about["capture"] == small_capture.name
+
+
 def test_run_folder_holds_exactly_the_promised_files(folder: Path) -> None:
     assert {file.name for file in folder.iterdir()} == {
         "panorama.tiff",
         "panorama-std.tiff",
         "panorama.png",
         "coverage.tiff",
+        "first-frame.tiff",
+        "last-frame.tiff",
         "trajectory.npz",
         "run.json",
         "report.html",

@@ -10,9 +10,15 @@ import sys
 import time
 from pathlib import Path
 
-from photonpano import batch
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from photonpano import InputError, batch, load_spec, run
+from photonpano.api.cli.app import app
 from photonpano.capture.writing import truth_path
 
+HEADLESS = "opencv-python-headless"
 SPEC = {"version": 1, "source": {"use": "auto"}, "resample": {"with": {"group_size": 40}}, "levels": 1, "refine": []}
 INTERRUPTED = """\
 import sys, time
@@ -89,3 +95,21 @@ def test_interrupted_batch_keeps_what_is_finished(tiny_capture: Path, tmp_path: 
     assert "[1/3] a: " in err
     assert statuses(tmp_path / "out") == ["done", "interrupted", "interrupted"]
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"a", "begun", "summary.csv", "summary.html"}
+
+
+def test_interrupted_run_says_how_to_go_on(tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("photonpano.pipeline.run.estimate", interrupted)
+    result = CliRunner().invoke(app, ["run", str(tiny_capture), "--output", str(tmp_path / "run")])
+    assert result.exit_code == 130
+    assert result.stderr.endswith("under its final name; the same command with --resume goes on\n")
+
+
+def test_another_opencv_is_refused(tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "__version__", "4.11.0")
+    monkeypatch.setattr("photonpano.pipeline.run.packages_distributions", lambda: {"cv2": ["opencv-python", HEADLESS]})
+    remove = f"run `pip uninstall opencv-python {HEADLESS}` and then `pip install {HEADLESS}`"
+    with pytest.raises(InputError, match=f"^OpenCV 4.11.0 of opencv-python is imported instead of {HEADLESS} 5.*: {remove}$"):
+        run(load_spec(tiny_capture, output=tmp_path / "run"))

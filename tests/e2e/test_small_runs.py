@@ -90,6 +90,17 @@ def test_naive_average_is_less_accurate(run: Callable, three_levels: np.ndarray,
     assert error_px(naive.homographies) > 1.3 * error_px(three_levels)
 
 
+def test_halves_are_kept_at_the_scale_of_the_panorama(run: Callable) -> None:
+    result = run("output.keep=halves", "levels=1", "render.scale=2")
+    whole, first, last = (tifffile.imread(result.directory / f"panorama{part}.tiff") for part in ("", "-first", "-last"))
+    seen = np.isfinite(whole) & np.isfinite(first) & np.isfinite(last)
+    assert first.shape == last.shape == whole.shape
+    assert seen.mean() > 0.5
+    assert result.record["detail"]["grid_px"] == 1
+    assert np.corrcoef((first + last)[seen], whole[seen])[0, 1] > 0.97
+    assert np.corrcoef(first[seen], last[seen])[0, 1] < 0.97  # each has photons of its own
+
+
 @pytest.fixture(scope="module")
 def kept(run: Callable) -> Any:
     return run("output.keep=exposures", "levels=2")

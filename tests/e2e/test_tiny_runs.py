@@ -83,7 +83,8 @@ def test_run_without_report_keeps_its_results(
     assert warning.startswith("the report could not be drawn (")
     assert warning.endswith("); all other files of the run are written")
     assert json.loads((tmp_path / "run" / "run.json").read_text()) == json.loads(json.dumps(record))
-    assert set(record["files"]) == {"trajectory.npz", "panorama.tiff", "panorama-std.tiff", "coverage.tiff", "panorama.png"}
+    maps = {"panorama.tiff", "panorama-std.tiff", "coverage.tiff", "first-frame.tiff", "last-frame.tiff"}
+    assert set(record["files"]) == {"trajectory.npz", "panorama.png", *maps}
     assert photonpano.verify(tmp_path / "run").problems == ()
 
 

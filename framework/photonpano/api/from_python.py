@@ -15,6 +15,7 @@ from photonpano.errors import InputError
 from photonpano.execution.context import Progress
 from photonpano.files.folders import atomic_path, require_new
 from photonpano.pipeline.run import RunResult, run
+from photonpano.reading import frames_are_last
 from photonpano.specs import parse_spec
 from photonpano.values import FrameSpan
 
@@ -74,7 +75,7 @@ def panorama(
 def _require_frames(array: NDArray[Any]) -> None:
     if array.ndim != 3 or not array.size:
         raise InputError(f"frames: expected an array of shape (frames, height, width), got {array.shape}")
-    if array.shape[2] > 4 * max(array.shape[:2]):
+    if array.shape[2] > 4 * max(array.shape[:2]) or frames_are_last([array[:128]], array.shape):
         raise InputError(
             f"frames: expected an array of shape (frames, height, width), and {array.shape} seems to have the frames last; "
             "pass np.moveaxis(frames, -1, 0)"

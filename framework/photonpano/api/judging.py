@@ -12,7 +12,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from photonpano.api.command import command, json_lines, require_trust, verdict_lines
+from photonpano.api.command import command, json_lines, logger, require_trust, verdict_lines
 from photonpano.api.run_folders import opened_run
 from photonpano.capture import capture_of
 from photonpano.capture.writing import truth_path
@@ -23,7 +23,7 @@ from photonpano.evaluation import (
     load_run_trajectory,
 )
 from photonpano.evaluation import evaluate as evaluate_folder
-from photonpano.evaluation.inputs import RunTrajectory, kind_of_run
+from photonpano.evaluation.inputs import RunTrajectory, kind_of_run, load_truth
 from photonpano.evaluation.run_scores import motion_difference, on_canvas, reduced
 from photonpano.execution.context import Context, Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
@@ -237,7 +237,7 @@ def compare(
         names = ["/".join(each[-length:]) for each in parts]
         if len(set(names)) == len(names):
             break
-    compared = _compared(runs_read, names, _truth(truth, runs_read[0]))
+    compared = _compared(runs_read, names, _truth(truth, runs_read))
     with atomic_path(page) as temporary:
         temporary.write_text(render_comparison(compared, page), encoding="utf-8")
     return Comparison(page, tuple(names), tuple(run.mean_difference_px for run in compared))
@@ -278,11 +278,17 @@ def _require_same_capture(first: _Run, other: _Run) -> None:
         raise InputError(f"{' and '.join(described)}, after other corrections; compare runs with the same frames")
 
 
-def _truth(given: Path | str | None, run: _Run) -> Path | None:
-    """Return the truth that was given, or that lies beside the capture."""
+def _truth(given: Path | str | None, runs: Sequence[_Run]) -> Path | None:
+    """Return the truth that was given, or that lies beside the capture of runs and is one of theirs."""
     if given is not None:
         return Path(given)
-    return next((beside for file in run.files[:1] if (beside := truth_path(file)).is_file()), None)
+    beside = next((beside for file in runs[0].files[:1] if (beside := truth_path(file)).is_file()), None)
+    try:
+        if beside is not None and len(load_truth(beside).homographies) == len(runs[0].motion.homographies):
+            return beside
+    except InputError as error:
+        logger.warning(f"{error}; the runs are compared without it")
+    return None
 
 
 def _compared(runs: Sequence[_Run], names: Sequence[str], truth: Path | None) -> list[ComparedRun]:

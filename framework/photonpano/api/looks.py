@@ -15,9 +15,9 @@ from photonpano.corrections import HotPixels, without_still_pixels
 from photonpano.errors import InputError
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
-from photonpano.files.folders import require_new
+from photonpano.files.folders import atomic_path, require_new
 from photonpano.files.paths import Url
-from photonpano.notebooks import facts, from_here
+from photonpano.notebooks import facts
 from photonpano.pipeline.components import build_source, foreseen_decisions
 from photonpano.pipeline.obstacles import order_warning
 from photonpano.pipeline.summary import require_photons, saturated_share, summarise
@@ -95,6 +95,11 @@ class CaptureInfo:
         """Frames, size and rate as one value."""
         return StreamInfo(self.n_frames, self.height, self.width, self.frame_rate_hz, self.kind, self.bit_depth)
 
+    @property
+    def spec_yaml(self) -> str:
+        """The spec to start from as YAML."""
+        return "\n".join(f"{section}: {flow(value)}" for section, value in self.spec.items())
+
     def rows(self) -> list[tuple[str, str]]:
         """Return what was found, in words: pairs of a name and what it is."""
         speed, size = self.speed_px, self.group_size
@@ -120,12 +125,13 @@ def _lines_of_info(found: CaptureInfo, *, as_json: bool = False) -> Iterator[str
     yield columns(found.rows())
     for warning in found.warnings:
         warn(warning)
-    spec = "\n".join(f"{section}: {flow(value)}" for section, value in found.spec.items())
-    yield f"\nA spec to start from:\n\n{spec}"
+    yield f"\nA spec to start from:\n\n{found.spec_yaml}"
 
 
-@command("cube.npy --with frame_rate_hz=96800", _lines_of_info, plan="capture")
-def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
+@command("cube.npy --with frame_rate_hz=96800 --write scan.yaml", _lines_of_info, plan="capture")
+def info(
+    plan: Plan, catalog: Catalog | None = None, *, write: Path | str | None = None, overwrite: bool = False
+) -> CaptureInfo:
     """Summarise a capture: size, brightness and speed, and a spec to start from.
 
     Reads some thousands of frames, spread over the capture.
@@ -133,10 +139,15 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
     Args:
         plan: of the capture, from `capture_plan` or `load_spec`; its corrections are applied.
         catalog: what can be chosen; by default what the installed plugins offer.
+        write: a file for the spec to start from.
+        overwrite: replace the file that is there under this name.
 
     Raises:
         InputError: the capture cannot be read.
+        OutputError: the file is there already, or cannot be written.
     """
+    if write is not None:
+        require_new(Path(write), overwrite)
     with build_source(plan) as read:
         marked = without_still_pixels(read)
         source = marked if plan.corrects_itself else read
@@ -147,7 +158,8 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
         with build_source(replace(plan, corrections=(*plan.corrections, HotPixels()))) as other:
             hot = read.valid & ~other.valid
         still = read.valid & ~marked.valid
-        keys = _relative(plan.source.config.model_dump(exclude_defaults=True))
+        folder = Path.cwd() if write is None else Path(write).absolute().parent
+        keys = _relative(plan.source.config.model_dump(exclude_defaults=True), folder)
         spec: dict[str, Any] = {"version": 1, "source": {"use": plan.source.contribution.name, "with": keys}}
         if not plan.corrects_itself:
             spec["corrections"] = plan.document["corrections"]
@@ -175,6 +187,9 @@ def info(plan: Plan, catalog: Catalog | None = None) -> CaptureInfo:
             warnings=(),
             spec=spec,
         )
+        if write is not None:
+            with atomic_path(Path(write)) as temporary:
+                temporary.write_text(found.spec_yaml + "\n", encoding="utf-8")
         return replace(found, warnings=tuple(_warnings(source, found, float(hot[source.valid].mean()))))
 
 
@@ -214,14 +229,14 @@ def _warnings(source: Source, found: CaptureInfo, hot_left: float) -> Iterator[s
         yield found.group_size_reason
 
 
-def _relative(value: Any) -> Any:
-    """Return plain data with its paths relative to the current folder, where they lie in it."""
+def _relative(value: Any, folder: Path) -> Any:
+    """Return plain data with its paths relative to a folder, where they lie in it."""
     if isinstance(value, dict):
-        return {key: _relative(item) for key, item in value.items()}
+        return {key: _relative(item, folder) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_relative(item) for item in value]
+        return [_relative(item, folder) for item in value]
     if isinstance(value, Path):
-        return str(from_here(value))
+        return str(value.relative_to(folder) if value.is_relative_to(folder) else value)
     if isinstance(value, Url):
         return str(value)
     return value

@@ -29,12 +29,19 @@ from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import BYTES_PER_PIXEL, RenderedPanorama, box_of, plan_canvas
 from photonpano.motion.frame_motion import view_of
 from photonpano.pipeline.film import Film, merged
-from photonpano.pipeline.rendering import naming_key_of_canvas, render_into
+from photonpano.pipeline.rendering import naming_key_of_canvas, render_into, write_halves
 from photonpano.pipeline.run_folder import run_folder as writing_run_folder
 from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import capture_files, fingerprint
 from photonpano.record.picture_files import advancing, require_writable, write_pictures
-from photonpano.record.run_json import decision_records, library_versions, panorama_record, peak_memory_bytes, plugin_records
+from photonpano.record.run_json import (
+    decision_records,
+    detail_record,
+    library_versions,
+    panorama_record,
+    peak_memory_bytes,
+    plugin_records,
+)
 from photonpano.record.schema import RunRecord
 from photonpano.report.notebook import run_html
 from photonpano.text import byte_size, counted
@@ -125,7 +132,12 @@ def render(
         rendered = render_into(
             written, opened.plan, opened.source, vignette=opened.vignette, motion=opened.motion, context=context
         )
-        record = written.commit(_record(opened, *rendered, time.perf_counter() - start))
+        record = _record(opened, *rendered, time.perf_counter() - start)
+        if opened.plan.output.keep == "halves":
+            canvas = rendered[0].canvas
+            halves = write_halves(written, opened.plan, opened.source, motion=opened.motion, canvas=canvas, context=context)
+            record["detail"] = detail_record(halves)
+        record = written.commit(record)
     return RenderResult(opened.plan.output.directory, record)
 
 

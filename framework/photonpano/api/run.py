@@ -12,7 +12,7 @@ from photonpano.api.command import CHANGES, SPEC, WrongArgumentError, command, l
 from photonpano.execution.context import Progress
 from photonpano.pipeline.run import END_AFTER_S, RunResult, run
 from photonpano.record.run_json import findings_of
-from photonpano.record.schema import PanoramaRecord, RunRecord
+from photonpano.record.schema import DetailRecord, PanoramaRecord, RunRecord
 from photonpano.specs import load_spec
 from photonpano.text import byte_size, counted, duration, share
 
@@ -39,6 +39,8 @@ def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
             yield f"refined   {refinement['change_px']:.2g} px on average by {refinement['use']}: {refinement['rounds'][0]}"
     if record.get("levels"):
         yield f"found     {_found(record)}"
+    if detail := record.get("detail"):
+        yield f"detail    {_detail(detail)}"
     if line := _range(record.get("panorama")):
         yield f"range     {line}"
     yield from (f"{name:<9} {text}" for name, text in result.rows)
@@ -133,6 +135,16 @@ def _found(record: RunRecord) -> str:
     if findings.hidden_share:
         parts.append(f"{share(findings.hidden_share)} of the frames left out, as what moves or is near")
     return "; ".join(parts)
+
+
+def _detail(detail: DetailRecord) -> str:
+    """Describe the finest detail that is real."""
+    finest_px, grid_px = detail["finest_px"], detail["grid_px"]
+    if finest_px is None:
+        return "none is real: the first and the last frames that saw a place share no more than noise"
+    if finest_px <= grid_px:
+        return f"down to {grid_px:.2g} px is real: all that the grid holds"
+    return f"down to {finest_px:.2g} px is real: the first and the last frames that saw a place share it"
 
 
 def _range(panorama: PanoramaRecord | None) -> str:

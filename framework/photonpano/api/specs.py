@@ -13,11 +13,12 @@ import typer
 from photonpano.api.command import CHANGES, SPEC, command
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, PhotonpanoError
-from photonpano.files.folders import atomic_path, require_new
+from photonpano.files.folders import atomic_path, require_harmless, require_new
 from photonpano.pipeline.components import foreseen_groups, open_source, scale_of
 from photonpano.plugins.contributions import KINDS
 from photonpano.plugins.description import flow
 from photonpano.plugins.registry import Catalog, discover
+from photonpano.record.contents import capture_files
 from photonpano.specs import Plan, json_schema, load_spec
 from photonpano.specs.yaml_reader import joined
 from photonpano.text import byte_size, counted, duration
@@ -36,6 +37,7 @@ def _check(spec: Path, changes: Sequence[str] = ()) -> Iterator[str]:
     stages against its size, and samples the frames of packed .npy files: what depends on all frames stays open.
     """
     plan = load_spec(spec, changes)
+    require_harmless(plan.output.directory, capture_files(plan))
     with open_source(plan, look=False) as source:
         what = (
             f"{plan.kind.name} by {plan.finder.contribution.name}"

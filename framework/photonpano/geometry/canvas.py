@@ -95,6 +95,11 @@ class Canvas:
         return self.height, self.width
 
     @property
+    def scale(self) -> float:
+        """Pixels of the canvas per pixel of the reference frame, in its middle."""
+        return float(self.transform[0, 0] / (1 if self.camera_matrix is None else self.camera_matrix[0, 0]))
+
+    @property
     def planar(self) -> bool:
         """Whether a homography maps the reference plane to the canvas."""
         return self.projection == "planar"

@@ -367,5 +367,7 @@ class RenderedPanorama:
     coverage_share: float  # share of the pixels that were seen
     seconds: float  # time of rendering and writing
     std: FluxImage  # of the flux of a pixel, averaged down as the thumbnail
+    # (2, h, w) the first and the last frame that saw pixels, every `reduction`th of them: see `seen_frames`
+    seen_frames: NDArray[np.uint32]
     dynamic_range: DynamicRange  # the range of flux, with what its noise depends on
     never_seen_share: float = 0.0  # share whose background no frame showed

@@ -27,7 +27,8 @@ from photonpano.geometry import Canvas
 from photonpano.merging.accumulate import bytes_of_light
 from photonpano.merging.canvas_noise import CanvasNoise, DynamicRange
 from photonpano.merging.colour import channels_of, composed
-from photonpano.merging.panorama import RenderedPanorama, Thumbnail, plan_canvas, render_tiles, tiles_of
+from photonpano.merging.panorama import BYTES_PER_PIXEL, RenderedPanorama, Thumbnail, plan_canvas, render_tiles, tiles_of
+from photonpano.merging.seen_frames import seen_frames
 from photonpano.merging.warping import by_homographies
 from photonpano.motion.frame_motion import FrameMotion, view_of
 from photonpano.motion.level import Recorder
@@ -35,7 +36,9 @@ from photonpano.photometry import balanced, picture_of
 from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.run_folder import RunFolder
 from photonpano.plugins.contributions import ExporterContribution, RendererContribution
-from photonpano.record.contents import MAPS
+from photonpano.record.contents import HALVES, MAPS, name_of_capture
+from photonpano.residuals.detail import Detail
+from photonpano.residuals.halves import detail_between, halves_in_time, reduced
 from photonpano.specs.plan import Plan
 from photonpano.values import FrameSpan, Homography, Journal, Panorama, PanoramaRows
 
@@ -58,7 +61,7 @@ def render_into(
     renderer.require_seen(panorama.coverage_share)
     folder.write_results(panorama, motion)
     for exporter in exporters:
-        exporter.export(StoredPanorama.of(folder.staging, panorama), folder.staging)
+        exporter.export(StoredPanorama.of(folder.staging, panorama, name_of_capture(plan)), folder.staging)
     with folder.writing():
         if vignette is not None:
             write_vignette(folder.staging, vignette)
@@ -80,7 +83,7 @@ def _rendered(
     canvas = plan_canvas(*shown, settings.scale, memory, bytes_per_pixel, settings.extent, view)
     tiles, reduction = tiles_of(canvas, memory, bytes_per_pixel)
     noise = CanvasNoise.of(source, motion.trajectory, motion.span, canvas, motion.std_px)
-    gathered, dynamic_range = Thumbnail(canvas, reduction), DynamicRange(noise=noise)
+    gathered, dynamic_range, seen = Thumbnail(canvas, reduction), DynamicRange(noise=noise), []
     rendered = render_tiles(
         renderer, source, motion.trajectory, motion.span, tiles=tiles, tolerance_px=settings.tolerance_px, context=context
     )
@@ -90,8 +93,10 @@ def _rendered(
         for rows, found in noise.of_tile(part.flux, part.weight, tile.top, tile.left):
             dynamic_range.add(part.flux[rows], part.weight[rows], found.photons)
             std[rows] = found.whole
-        folder.write_tile(tile, part, std, canvas)
+        frames = seen_frames(source, motion.trajectory, motion.span, tile.canvas)
+        folder.write_tile(tile, (part.flux, part.weight, std, *frames), canvas, name_of_capture(plan))
         gathered.add(tile, part, std)
+        seen.append(frames[:, ::reduction, ::reduction])
     if settings.extent != "panorama" and not gathered.coverage_share:
         raise ExtentError("no frame that was located shows it; choose a part of the panorama")
     thumbnail = gathered.panorama
@@ -110,8 +115,26 @@ def _rendered(
         coverage_share=share,
         seconds=seconds,
         std=gathered.std,
+        seen_frames=np.concatenate(seen, axis=2 if canvas.width > canvas.height else 1),
         dynamic_range=dynamic_range,
     )
+
+
+def write_halves(
+    folder: RunFolder, plan: Plan, source: Source, *, motion: FrameMotion, canvas: Canvas, context: Context
+) -> Detail:
+    """Write the panoramas of the first and the last half of the frames that saw each place; return the detail that they share.
+
+    They lie on the canvas of the panorama, or on the largest that fits into memory.
+    """
+    canvas = reduced(canvas, int(plan.run.memory) / (BYTES_PER_PIXEL * channels_of(source)))
+    sums = halves_in_time(source, motion, canvas, plan.render.tolerance_px, context)
+    for name, (lit, weight) in zip(HALVES, sums.squeeze(-1) if sums.shape[-1] == 1 else sums, strict=True):
+        flux = np.divide(lit, weight, out=np.full_like(lit, np.nan), where=weight > 0)
+        half = composed(Panorama(flux, weight, canvas.transform), source)
+        with folder.writing():
+            tifffile.imwrite(folder.staging / name, half.flux, metadata=None)
+    return detail_between(sums, source, motion, canvas)
 
 
 @contextmanager
@@ -196,11 +219,12 @@ class StoredPanorama:
     white_flux: float  # flux that is white in the picture
     noise: CanvasNoise
     projection: str = "planar"
+    capture: str = ""  # name of its file
 
     @classmethod
-    def of(cls, folder: Path, panorama: RenderedPanorama) -> StoredPanorama:
+    def of(cls, folder: Path, panorama: RenderedPanorama, capture: str = "") -> StoredPanorama:
         """Open the maps of a panorama in a folder."""
-        flux, weight, std = (tifffile.memmap(folder / name, mode="r") for name in MAPS)
+        flux, weight, std = (tifffile.memmap(folder / name, mode="r") for name in list(MAPS)[:3])
         canvas, noise = panorama.canvas, panorama.dynamic_range.noise
         return cls(
             flux=flux,
@@ -210,6 +234,7 @@ class StoredPanorama:
             white_flux=panorama.white_flux,
             noise=noise,
             projection=canvas.projection,
+            capture=capture,
         )
 
     @property

@@ -9,8 +9,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from typing import Any
+
+import cv2
 
 from photonpano.capture import capture_of
 from photonpano.compiling import notify_on_first_compile
@@ -31,13 +34,13 @@ from photonpano.pipeline.follow import followed
 from photonpano.pipeline.observers import Observers
 from photonpano.pipeline.obstacles import naming_obstacles, order_warning, run_others
 from photonpano.pipeline.passes import build_refiners, refine
-from photonpano.pipeline.rendering import render_into
+from photonpano.pipeline.rendering import render_into, write_halves
 from photonpano.pipeline.run_folder import RunFolder, run_folder, write_exposures
 from photonpano.pipeline.state import State
 from photonpano.pipeline.summary import require_photons
 from photonpano.plugins.contributions import RunKindContribution
 from photonpano.record.contents import capture_files, fingerprint
-from photonpano.record.run_json import level_record, peak_memory_bytes, record_of, started_record, verdict_of
+from photonpano.record.run_json import detail_record, level_record, peak_memory_bytes, record_of, started_record, verdict_of
 from photonpano.record.schema import CaptureRecord, RunRecord
 from photonpano.report import OpenCapture, render_failure, render_report
 from photonpano.report.notebook import ShownReport, run_html
@@ -172,6 +175,9 @@ def make_panorama(run: BegunRun) -> None:
         if plan.output.keep == "exposures":
             with folder.writing():
                 write_exposures(folder.staging, state.results, panorama.white_flux, context)
+        detail = explained.halves.detail
+        if plan.output.keep == "halves":
+            detail = write_halves(folder, plan, source, motion=explained.motion, canvas=panorama.canvas, context=context)
     record = record_of(
         run.started_record(),
         plan,
@@ -182,6 +188,7 @@ def make_panorama(run: BegunRun) -> None:
         rendered=chosen,
         findings=findings,
     )
+    record["detail"] = detail_record(detail)
     light, capture = light_of(source), OpenCapture(source, state.results)
     run.end(record, lambda record: render_report(record, explained, panorama, light, capture), verdict)
 
@@ -254,6 +261,7 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
     if plan.kind is not None and (how.keep or how.from_level is not None):
         no_levels = f"a run with `{plan.kind.section}` has no levels to keep or to go on from"
         raise InputError(f"{no_levels}: leave out --keep-work and --from-level")
+    _require_opencv()
     observers, read = Observers(plan.observers, plan.output.directory), [*capture_files(plan), *filter(None, [plan.file])]
     with (
         observers.watching(plan.document) as finished,
@@ -277,6 +285,16 @@ def begun_run(plan: Plan, progress: Progress, how: Continuation, *, overwrite: b
             with _work(run, how) as run.work, _reporting_failure(run):
                 yield run
         finished(run.record)
+
+
+def _require_opencv() -> None:
+    """Refuse another OpenCV than the required one: of two distributions, that which was installed last is imported."""
+    name = "opencv-python-headless"
+    if not version(name).startswith(cv2.__version__):
+        others = sorted({*packages_distributions()["cv2"]} - {name})
+        remove = f"`pip uninstall {' '.join([*others, name])}` and then `pip install {name}`"
+        of = f" of {listed(others)}" if others else ""
+        raise InputError(f"OpenCV {cv2.__version__}{of} is imported instead of {name} {version(name)}: run {remove}")
 
 
 def failure_path(directory: Path) -> Path:
@@ -305,6 +323,10 @@ def _reporting_failure(run: BegunRun) -> Iterator[None]:
         logger.debug("the report of an earlier failure could not be removed: %s", error)
     try:
         yield
+    except KeyboardInterrupt as error:
+        if run.work is not None:
+            error.add_note("the same command with --resume goes on")
+        raise
     except (LocationError, CanvasTooLargeError, PluginError) as error:
         levels = {result.level.number: level_record(result) for result in run.levels}
         record: RunRecord = {

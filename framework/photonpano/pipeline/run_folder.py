@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -27,7 +28,6 @@ from photonpano.photometry import tone_mapped
 from photonpano.record.contents import MAPS, RECORD, REPORT, content_of, contents_of, names_of_results, recorded_json
 from photonpano.record.picture_files import photo_sphere, png_of, with_xmp
 from photonpano.record.schema import RunRecord
-from photonpano.values import FluxImage, Panorama
 
 SHOWN_FILES = 3  # files that a message names
 
@@ -50,11 +50,12 @@ class RunFolder:
                 "Make room, or choose another folder with --output"
             ) from error
 
-    def write_tile(self, tile: Tile, rendered: Panorama, std: FluxImage, canvas: Canvas) -> None:
-        """Write a part of panorama.tiff, coverage.tiff and panorama-std.tiff (float32); the parts make up the canvas."""
+    def write_tile(self, tile: Tile, maps: Sequence[NDArray[Any]], canvas: Canvas, capture: str) -> None:
+        """Write parts of the `MAPS` of a panorama, which make up the canvas, as TIFF that says what it holds, and of what."""
         with self.writing():
-            for name, image in zip(MAPS, (rendered.flux, rendered.weight, std), strict=True):
-                _write_box(self.staging / name, image, tile, canvas)
+            for (name, content), image in zip(MAPS.items(), maps, strict=True):
+                about = {"content": content, "pixels_per_frame_pixel": canvas.scale, "capture": capture}
+                _write_box(self.staging / name, image, tile, canvas=canvas, about=about)
 
     def write_results(self, panorama: RenderedPanorama, motion: FrameMotion) -> None:
         """Write panorama.png (8 bits, sRGB) and trajectory.npz."""
@@ -135,7 +136,16 @@ def run_folder(directory: Path, *, overwrite: bool = False, inputs: Sequence[Pat
             raise OutputError(
                 f"{directory}: the run folder cannot be written to ({error.strerror}); choose another one with --output"
             ) from error
+        _require_temporary(directory.parent)
         yield RunFolder(directory, staging)
+
+
+def _require_temporary(folder: Path) -> None:
+    """Let temporary files lie in a folder where the system has no place for them, as in a container that is read-only."""
+    try:
+        tempfile.gettempdir()
+    except FileNotFoundError:
+        tempfile.tempdir = str(folder)
 
 
 def _of_camera(motion: FrameMotion) -> dict[str, NDArray[Any]]:
@@ -197,7 +207,7 @@ def _require_same_capture(directory: Path, inputs: Sequence[Path]) -> None:
         return  # the others are files of corrections
 
 
-def _write_box(path: Path, image: FluxImage, tile: Tile, canvas: Canvas) -> None:
+def _write_box(path: Path, image: NDArray[Any], tile: Tile, *, canvas: Canvas, about: dict[str, Any]) -> None:
     """Write a box of pixels into a TIFF file, which the first one lays out; (H, W, 3) as red, green and blue of each pixel."""
     pixel = int(np.prod(image.shape[2:]))
     if not path.exists():
@@ -205,7 +215,7 @@ def _write_box(path: Path, image: FluxImage, tile: Tile, canvas: Canvas) -> None
         if room > shutil.disk_usage(path.parent).free:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         shape, kind = (*canvas.shape, *image.shape[2:]), "minisblack" if image.ndim == 2 else "rgb"
-        tifffile.imwrite(path, shape=shape, dtype=np.float32, photometric=kind, metadata=None)
+        tifffile.imwrite(path, shape=shape, dtype=image.dtype, photometric=kind, metadata=about)
     with tifffile.TiffFile(path) as file:
         start = file.pages.first.dataoffsets[0]
     with path.open("rb+") as stream:

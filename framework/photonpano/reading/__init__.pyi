@@ -25,6 +25,7 @@ from .npy import OtherOrder as OtherOrder
 from .npy import PixelOrder as PixelOrder
 from .npy import any_npy_header as any_npy_header
 from .npy import arrived_frames as arrived_frames
+from .npy import eight_frames_are_first as eight_frames_are_first
 from .npy import frames_are_last as frames_are_last
 from .npy import gzipped_npy_header as gzipped_npy_header
 from .npy import has_channels as has_channels

@@ -526,6 +526,15 @@ def frames_are_last(samples: Sequence[NDArray[Any]], shape: Sequence[int], packe
     return other is not None and other.order.packed_along == "height"
 
 
+def eight_frames_are_first(samples: Sequence[NDArray[Any]]) -> bool:
+    """Return whether the frames of bytes that hold eight of them lie along the first axis, or else along the last.
+
+    Neighbours along both axes of the image are about equally alike, those along the axis of the frames more or less than that.
+    """
+    first, second, last = (_correlation([np.bitwise_count(each) for each in samples], axis)[0] for axis in range(3))
+    return abs(second - last) < abs(first - second)
+
+
 def _blocks(frames: NDArray[Any], block: Sequence[int]) -> NDArray[np.float64]:
     """Return the means of blocks of values: (n, rows, columns) becomes smaller by the sides of a block."""
     shape = [length // side for length, side in zip(frames.shape, block, strict=True)]

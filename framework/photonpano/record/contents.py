@@ -27,7 +27,16 @@ from photonpano.record.schema import CaptureRecord, FileContent, FileRecord
 from photonpano.specs.plan import Plan
 
 RECORD = "run.json"
-MAPS = ("panorama.tiff", "coverage.tiff", "panorama-std.tiff")  # flux, frames, and standard deviation of the flux of each pixel
+_FLUX = "photons per pixel per frame"
+# What maps of the panorama hold of each pixel, as their files say it.
+MAPS = {
+    "panorama.tiff": f"flux, {_FLUX}",
+    "coverage.tiff": "number of frames",
+    "panorama-std.tiff": f"standard deviation of the flux, {_FLUX}",
+    "first-frame.tiff": "number of the first frame, from 0",
+    "last-frame.tiff": "number of the last frame, from 0",
+}
+HALVES = ("panorama-first.tiff", "panorama-last.tiff")  # by the first and the last half of the frames that saw each place
 REPORT = "report.html"
 
 
@@ -123,6 +132,11 @@ def fingerprint(plan: Plan, source: Source) -> CaptureRecord:
 def capture_files(plan: Plan) -> list[Path]:
     """Return the files and folders that a plan names, for its source, corrections, motion and pairs; URLs are none."""
     return [path for path in _locations(plan) if isinstance(path, Path)]
+
+
+def name_of_capture(plan: Plan) -> str:
+    """Return the name of the file or folder of a capture; that of a source without files."""
+    return next((str(each).rstrip("/").rpartition("/")[2] for each in _locations(plan)), plan.source.contribution.name)
 
 
 def _locations(plan: Plan) -> list[Location]:

@@ -30,6 +30,7 @@ from photonpano.record.schema import (
     CameraRecord,
     CaptureRecord,
     DecisionRecord,
+    DetailRecord,
     FailureRecord,
     LevelRecord,
     MotionRecord,
@@ -42,6 +43,7 @@ from photonpano.record.schema import (
     RunRecord,
     VerdictRecord,
 )
+from photonpano.residuals.detail import Detail
 from photonpano.residuals.findings import Findings
 from photonpano.residuals.halves import Agreements
 from photonpano.residuals.refinement import Explained, Refinement
@@ -292,6 +294,24 @@ def refinement_record(refinement: Refinement) -> RefinementRecord:
         "rounds": list(refinement.rounds),
         "change_px": refinement.change_px,
         "kept_out": refinement.kept_out or None,
+    }
+
+
+def detail_record(found: Detail | None) -> DetailRecord | None:
+    """Describe the finest detail that is real; None where no place was seen often enough."""
+    if found is None or not len(found.halves):
+        return None
+    finest, *of_parts = found.finest_px
+    return {
+        "finest_px": finest,
+        "grid_px": float(1 / found.frequencies[-1]),
+        "frequencies": found.frequencies.tolist(),
+        "halves": found.halves[0].tolist(),
+        "scene": found.scene[0].tolist(),
+        "parts": [
+            {"frames": float(frames), "finest_px": each} for frames, each in zip(found.frames[1:], of_parts, strict=True)
+        ],
+        "noise": _number(found.noise),
     }
 
 

@@ -174,6 +174,24 @@ class AgreementRecord(TypedDict):
     angle_deg: float | None
 
 
+class DetailRecord(TypedDict):
+    """The finest real detail, see `Detail`: as a period in px of a frame, None if there is none.
+
+    `grid_px` is the shortest period that the grid holds. Of each of `frequencies`, in cycles per px, `halves` is the
+    correlation of the first and the last half of the frames, and `scene` that of all frames with the scene, which follows from
+    it. `parts` are thirds of the panorama, from that which few frames saw. `noise` is the root mean square difference of the
+    halves in units of what photon noise explains, None where they share nothing.
+    """
+
+    finest_px: float | None
+    grid_px: float
+    frequencies: Sequence[float]
+    halves: Sequence[float]
+    scene: Sequence[float]
+    parts: Sequence[Mapping[str, float | None]]
+    noise: float | None
+
+
 class ReasonRecord(TypedDict):
     """Why a run is doubtful: the number that decided, the largest that is trusted, where, and what to do."""
 
@@ -241,6 +259,7 @@ class RunRecord(TypedDict):
     `created` is an ISO 8601 time. `motion` and `panorama` are None where a run has none, as one of another kind, which has
     what it found under the name of its kind instead. `findings` are those of a panorama, by the names of the fields of
     `Findings`.
+    `detail` is None where the capture is too short for halves.
     `peak_memory_bytes` is None where the system does not report it.
     `capture` is the fingerprint of what was read; `files` lists the other files of the run folder.
     `rendered_from` is the run folder whose motion was rendered again, None where the motion was estimated.
@@ -262,6 +281,7 @@ class RunRecord(TypedDict):
     refinements: Sequence[RefinementRecord]
     halves: Sequence[AgreementRecord]
     stretches: Sequence[AgreementRecord]
+    detail: NotRequired[DetailRecord | None]
     verdict: VerdictRecord | None
     panorama: PanoramaRecord | None
     warnings: Sequence[str]

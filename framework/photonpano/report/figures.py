@@ -26,6 +26,7 @@ from photonpano.geometry import (
 from photonpano.merging.accumulate import amplitudes_on
 from photonpano.merging.panorama import RenderedPanorama
 from photonpano.motion.frame_motion import FrameMotion
+from photonpano.record.schema import DetailRecord
 from photonpano.report.drawing import (
     BAD,
     INK,
@@ -48,6 +49,7 @@ from photonpano.report.drawing import (
     svg_path,
 )
 from photonpano.residuals.block_sums import BLOCK_PX, M, R
+from photonpano.residuals.detail import REAL
 from photonpano.residuals.halves import Halves
 from photonpano.residuals.measure import Residuals
 from photonpano.values import FloatArray, FluxImage, Group, Light, SpanResiduals, true_spans
@@ -305,6 +307,22 @@ def halves_over_time(halves: Halves, n_frames: int) -> str | None:
         for axes in (agree, tie):
             mark_frames(axes, 0, n_frames)
         return svg_of(figure, "halves")
+
+
+def detail_over_frequency(detail: DetailRecord | None) -> str | None:
+    """Draw how the halves of the frames correlate by spatial frequency, and what that says of all; None if it is not known."""
+    if not detail:
+        return None
+    with plain_figure(WIDTH_IN, 2.6) as figure:
+        [axes] = add_axes(figure, Margins(top=0.35))
+        axes.axhline(REAL, color=MUTED, linewidth=1, linestyle="--")
+        axes.plot(detail["frequencies"][1:], detail["scene"][1:], color=SERIES[0], label="all frames and the scene")
+        axes.plot(detail["frequencies"][1:], detail["halves"][1:], color=SERIES[1], label="both halves")
+        if detail["finest_px"] is not None:
+            axes.axvline(1 / detail["finest_px"], color=MUTED, linewidth=1, linestyle="--")
+        axes.set(xlim=(0, detail["frequencies"][-1]), ylim=(-0.1, 1.05), xlabel="periods per px", ylabel="correlation")
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, columnspacing=1.2)
+        return svg_of(figure, "detail")
 
 
 def light_over_time(residuals: Residuals) -> str | None:

@@ -87,6 +87,7 @@ def _unexplained(record: RunRecord, explained: Explained, panorama: RenderedPano
         "shifts_are_drawn": figures.significant_shifts(residuals) is not None,
         "shifts_over_time": figures.shifts_over_time(residuals, record["source"]["frame_rate_hz"]),
         "halves_over_time": figures.halves_over_time(explained.halves, residuals.spans[-1].stop),
+        "detail_over_frequency": figures.detail_over_frequency(record.get("detail")),
         "light_over_time": figures.light_over_time(residuals),
         "span_frames": int(np.median([len(span) for span in residuals.spans])),
     }
@@ -116,6 +117,8 @@ _CONTENTS = {
     "panorama.png": "the panorama to look at, 8 bits",
     "coverage.tiff": "the number of frames that saw each pixel of the panorama, float32",
     "panorama-std.tiff": "the standard deviation of the flux of each pixel, float32",
+    "first-frame.tiff": "the first frame that saw each pixel, uint32; 4294967295 where none did",
+    "last-frame.tiff": "the last frame that saw each pixel, uint32; 4294967295 where none did",
     "trajectory.npz": "the motion of every frame",
     "light.npz": "the gain of the light in each frame",
     "layers.npz": "which parts of the frames show the background, and which something that hides it",

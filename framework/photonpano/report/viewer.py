@@ -15,6 +15,7 @@ from photonpano.contracts.protocols import Source
 from photonpano.geometry import Canvas, inverse, outline_of, rescaling
 from photonpano.merging.colour import channels_of
 from photonpano.merging.panorama import RenderedPanorama
+from photonpano.merging.seen_frames import NEVER
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.photometry import balanced, tone_mapped
@@ -105,9 +106,12 @@ def panorama_maps(panorama: RenderedPanorama) -> list[dict[str, Any]]:
         weight, relative = weight.sum(axis=-1), relative.mean(axis=-1)
     seen = weight > 0
     percent = np.where(seen & np.isfinite(relative), relative, np.nan)
+    first, last = (np.where(each < NEVER, each, np.nan) for each in panorama.seen_frames)
     return [
         _map("Coverage", np.where(seen, weight, np.nan), "frames", box=box, colours="viridis", low=0.0),
         _map("Uncertainty", percent, "% of the flux", box=box, colours="magma"),
+        _map("First seen", first, "(frame)", box=box, colours="viridis"),
+        _map("Last seen", last, "(frame)", box=box, colours="viridis"),
     ]
 
 

@@ -19,12 +19,14 @@ import numpy as np
 from photonpano.capture import capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.execution.context import Context
-from photonpano.geometry import Canvas, rescaling
+from photonpano.geometry import Canvas, corners, rescaling, transform_points
+from photonpano.merging.canvas_noise import CanvasNoise
 from photonpano.merging.colour import channels_of, in_colours
 from photonpano.merging.panorama import MergeRenderer
 from photonpano.merging.warping import footprints_of
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.photometry import frame_variance
+from photonpano.residuals.detail import Detail, detail_of
 from photonpano.values import BoolArray, FloatArray, FluxImage, FrameSpan, Panorama, Response
 
 _CUTS = 32
@@ -36,6 +38,7 @@ _MARGIN_PX = 4  # around the places of frames that were looked at, for those bet
 _FEWEST_FRAMES = 4  # of a block
 _LEAST_LIGHT = 0.5  # of each picture, in frames of the mean light that saw a pixel: where the light falls, frames count less
 _MOST_PIXELS = 4e6  # of the canvas; a larger one is reduced
+_PHASES = 1000  # instants at which it is looked where frames lie on the grid of the sensor
 _SAMPLED = 5  # frames of a block at which it is looked where they lie
 _SQUARE_PX = 16  # squares whose noise is independent, for each pixel by which pictures are smoothed
 _DARKEST = 1e-4  # least flux of which the noise is taken
@@ -72,6 +75,7 @@ class Halves:
 
     cuts: Agreements  # the frames before each cut, and those after it
     stretches: Agreements  # each of the stretches into which the capture is divided, and all frames that are not in it
+    detail: Detail | None = None  # that the first and the last frames at each place have in common; None where there is no cut
 
     @classmethod
     def none(cls) -> Halves:
@@ -122,22 +126,18 @@ class _Agreement(NamedTuple):
 
 def halves_of(source: Source, motion: FrameMotion, canvas: Canvas, context: Context) -> Halves:
     """Compare the halves of a capture along a motion across up to 32 cuts, and 33 stretches with all others, on any canvas."""
-    span, canvas = motion.span, _reduced(canvas)
-    number = 2 * min(_CUTS + 1, len(span) // (2 * _FEWEST_FRAMES * channels_of(source)))  # a pixel has one colour in a frame
-    if number < 4:
+    canvas = reduced(canvas, _MOST_PIXELS)
+    spans = _alternating(motion.span, channels_of(source))
+    if len(spans) < 4:
         return Halves.none()
-    starts = np.linspace(span.start, span.stop, number + 1).round().astype(int).tolist()
-    with context.progress.stage("halves", len(span) * channels_of(source), "frames") as advance:
-        blocks = [
-            _block(source, motion, FrameSpan(*ends), canvas=canvas, context=context, advance=advance)
-            for ends in pairwise(starts)
-        ]
-    scale = canvas.transform[0, 0] / (1 if canvas.camera_matrix is None else canvas.camera_matrix[0, 0])
+    blocks = _blocks(source, motion, spans, canvas=canvas, tolerance_px=_TOLERANCE_PX, context=context)
+    scale = canvas.scale
     widest_px = max(motion.frame_shape) / 2 * scale
     # Of the two parts of the first half, and of the second: flux times weight, and weight.
     sums = np.zeros((4, 2, *canvas.shape, channels_of(source)), np.float32)
     for index, block in enumerate(blocks):
         _add(sums[2 + index % 2], block, 1)
+    detail = detail_between(_in_time(blocks, sums.shape[2:]), source, motion, canvas)
     pairs = list(zip(blocks[::2], blocks[1::2], strict=True))
     compared = partial(_compared, response=source.response, widest_px=widest_px)
     of_stretches = [compared(_beside(pair, sums[2:])) for pair in pairs]
@@ -147,21 +147,91 @@ def halves_of(source: Source, motion: FrameMotion, canvas: Canvas, context: Cont
             _add(sums[part], block, 1)
             _add(sums[2 + part], block, -1)
         of_cuts.append(compared(sums))
-    return Halves(Agreements.of(starts[2:-1:2], of_cuts, scale), Agreements.of(starts[:-1:2], of_stretches, scale))
+    starts = [each.start for each in spans[::2]]
+    return Halves(Agreements.of(starts[1:], of_cuts, scale), Agreements.of(starts, of_stretches, scale), detail)
 
 
-def _reduced(canvas: Canvas) -> Canvas:
-    factor = float(np.sqrt(_MOST_PIXELS / (canvas.height * canvas.width)))
+def _alternating(span: FrameSpan, n_colours: int) -> list[FrameSpan]:
+    """Divide a span into an even number of blocks, 66 at most, which alternate between the parts of a half."""
+    number = 2 * min(_CUTS + 1, len(span) // (2 * _FEWEST_FRAMES * n_colours))  # a pixel has one colour in a frame
+    starts = np.linspace(span.start, span.stop, number + 1).round().astype(int).tolist()
+    return [FrameSpan(*ends) for ends in pairwise(starts)] if number else []
+
+
+def halves_in_time(source: Source, motion: FrameMotion, canvas: Canvas, tolerance_px: float, context: Context) -> FluxImage:
+    """Merge the first and the last half of the frames that saw each place: (2, 2, H, W, C) sums of flux and weight."""
+    spans = _alternating(motion.span, channels_of(source)) or [motion.span]
+    blocks = _blocks(source, motion, spans, canvas=canvas, tolerance_px=tolerance_px, context=context)
+    return _in_time(blocks, (*canvas.shape, channels_of(source)))
+
+
+def _in_time(blocks: Sequence[_Block], shape: tuple[int, ...]) -> FluxImage:
+    """Add blocks up to two halves of the frames that saw each place.
+
+    Where the camera moves, other pixels show a place in the last half, and motion that is wrong displaces it. Even and odd
+    frames would share such errors, and what the grid of the sensor makes of the scene.
+    """
+    total, seen, sums = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros((2, 2, *shape), np.float32)
+    for block in blocks:
+        total[block.part] += block.weight
+    for block in blocks:
+        early = seen[block.part] + block.weight / 2 < total[block.part] / 2
+        for half, own in zip(sums, (early, ~early), strict=True):
+            _add(half, block._replace(lit=block.lit * own, weight=block.weight * own), 1)
+        seen[block.part] += block.weight
+    return sums
+
+
+def detail_between(sums: FluxImage, source: Source, motion: FrameMotion, canvas: Canvas) -> Detail:
+    """Find the detail that two halves share, given their (2, 2, H, W, C) sums of flux and weight on a canvas."""
+    lit, weight = sums[:, 0], np.maximum(sums[:, 1], np.float32(1e-6))
+    seen, (first, last), frames = np.asarray((weight >= _LEAST_LIGHT).all(axis=0)), lit / weight, weight.sum(axis=0)
+    mean, variance = lit.sum(axis=0) / frames, np.zeros_like(frames)
+    for index, colour in enumerate(capture_of(source).colours().values() or [source]):
+        noise = CanvasNoise.of(colour, motion.trajectory, motion.span, canvas)
+        variance[..., index] = noise.std(mean[..., index], frames[..., index]) ** 2
+    variance *= frames * (1 / weight).sum(axis=0)
+    ratio = float(np.sqrt(np.mean((first - last)[seen] ** 2 / variance[seen]))) if seen.any() else np.nan
+    in_view = max(1, round(len(motion.span) * seen.sum() / max(frames[seen].sum(), 1)))  # times that a place is in view
+    instants = np.linspace(motion.span.start, motion.span.stop - 1, min(len(motion.span), _PHASES)).round()
+    phases = np.exp(2j * np.pi * transform_points(motion.trajectory.at(instants), corners(motion.frame_shape)))
+    phase = np.mean([abs(each.mean(axis=0)).mean(axis=0).max() for each in np.array_split(phases, min(in_view, len(phases)))])
+    return detail_of(first, last, frames, seen, scale=canvas.scale, noise=ratio, phase=float(phase))
+
+
+def reduced(canvas: Canvas, most_pixels: float) -> Canvas:
+    """Return a canvas with fewer px for one of a frame, if it has more pixels than these."""
+    factor = float(np.sqrt(most_pixels / (canvas.height * canvas.width)))
     if factor >= 1:
         return canvas
     height, width = (max(int(factor * each), 1) for each in canvas.shape)
     return replace(canvas, height=height, width=width, transform=rescaling(factor) @ canvas.transform)
 
 
-def _block(
-    source: Source, motion: FrameMotion, block: FrameSpan, *, canvas: Canvas, context: Context, advance: Callable[[int], None]
+def _blocks(
+    source: Source,
+    motion: FrameMotion,
+    spans: Sequence[FrameSpan],
+    *,
+    canvas: Canvas,
+    tolerance_px: float,
+    context: Context,
+) -> list[_Block]:
+    """Merge the frames of each span on the part of the canvas that they cover."""
+    with context.progress.stage("halves", len(motion.span) * channels_of(source), "frames") as advance:
+        merged = partial(_block, source, motion, canvas, MergeRenderer(context.in_order), tolerance_px, advance)
+        return [merged(span) for span in spans]
+
+
+def _block(  # noqa: PLR0917
+    source: Source,
+    motion: FrameMotion,
+    canvas: Canvas,
+    renderer: MergeRenderer,
+    tolerance_px: float,
+    advance: Callable[[int], None],
+    block: FrameSpan,
 ) -> _Block:
-    """Merge the frames of a block on the part of the canvas that they cover."""
     along = motion.trajectory.at(np.linspace(block.start, block.stop - 1, _SAMPLED).round())
     footprints = footprints_of(canvas, capture_of(source).camera, along, motion.frame_shape)
     rows = _around((each.rows for each in footprints), canvas.height)
@@ -170,7 +240,7 @@ def _block(
     part = canvas.part(columns.start, rows.start, rows.stop - rows.start, columns.stop - columns.start)
 
     def of_colour(each: Source) -> Panorama:
-        return MergeRenderer(context.in_order).render(each, motion.trajectory, block, part, _TOLERANCE_PX, advance)
+        return renderer.render(each, motion.trajectory, block, part, tolerance_px, advance)
 
     picture = in_colours(source, of_colour)
     flux, weight = (each.reshape(*part.shape, -1) for each in (picture.flux, picture.weight))

@@ -191,7 +191,8 @@ def recognised_source(section: Written, spec: Spec) -> Written | None:
             # The path is named once; each line begins with its last part.
             near = _near_misses(spec, keys, path)
             lines = [f"{name}: {line.replace(str(path), path.name or str(path), 1)}" for name, line in near]
-            lines = [*(lines or _known_endings(spec.catalog)), *failures]
+            endings = f"the names of files of captures end in {listed(known_endings(spec.catalog))}"
+            lines = [*(lines or [endings]), *failures]
             message = "\n  ".join([f"no source recognises {path}, {_contents(path)}; name the one that reads it", *lines])
             if isinstance(path, Url) and len({line for _, line in near}) == 1:  # such as that there is nothing
                 message = near[0][1]
@@ -261,11 +262,10 @@ def _near_misses(spec: Spec, keys: Written, path: Location) -> list[tuple[str, s
     return problems or needing
 
 
-def _known_endings(catalog: Catalog) -> list[str]:
-    """Return a clause with the endings of the files of all sources."""
+def known_endings(catalog: Catalog) -> list[str]:
+    """Return the endings of the files of all sources."""
     sources = [each.contribution for each in catalog.rows if isinstance(each.contribution, SourceContribution)]
-    endings = sorted({suffix for source in sources for suffix in source.suffixes})
-    return [f"the names of files of captures end in {listed(endings)}"] if endings else []
+    return sorted({suffix for source in sources for suffix in source.suffixes})
 
 
 def _contents(path: Location) -> str:

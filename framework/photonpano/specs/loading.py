@@ -9,7 +9,7 @@ from typing import Any
 from photonpano.errors import Problem, SpecError
 from photonpano.files.paths import Location, location, refusal
 from photonpano.plugins.registry import Catalog, discover
-from photonpano.specs.builtin import ask_sources
+from photonpano.specs.builtin import ask_sources, known_endings
 from photonpano.specs.plan import Plan, Spec
 from photonpano.specs.resolution import resolve
 from photonpano.specs.yaml_reader import Place, Written, from_python, given, joined, read_yaml
@@ -51,7 +51,7 @@ def load_spec(
             arriving=arriving,
         )
     except SpecError:
-        if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not ask_sources(catalog, path)[0]:
+        if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not _is_capture(catalog, path):
             raise
     source = {"use": "auto", "with": {"path": path.name}}
     return parse_spec(
@@ -63,6 +63,11 @@ def load_spec(
         catalog=catalog,
         arriving=arriving,
     )
+
+
+def _is_capture(catalog: Catalog, path: Path) -> bool:
+    """Return whether a file is a capture, or is called like one: what no source recognises is refused as such."""
+    return bool(ask_sources(catalog, path)[0]) or path.suffix.lower() in known_endings(catalog)
 
 
 def parse_spec(

@@ -165,7 +165,7 @@ def _without_panorama(root: Written, spec: Spec, kind: RunKindContribution) -> W
             spec.wrong_key(root.at(key), message)
     keys = {
         ("output", "formats"): f"there is no panorama to write; {kind.name} are written in all their formats",
-        ("output", "keep"): "exposures are those of the levels of a panorama; remove it, or write exposures: true",
+        ("output", "keep"): "exposures and halves are those of a panorama; remove it, or write exposures: true",
         ("run", "executor"): f"{kind.name} are found in threads of one process",
         ("run", "time_limit"): f"a {kind.component.kind.replace('-', ' ')} cannot end early; remove it",
     }

@@ -210,10 +210,11 @@ class OutputSettings(Config):
         False,
         description="of a run without a panorama: whether its exposures are written, as pictures in images/",
     )
-    keep: Literal["exposures"] | None = Field(
+    keep: Literal["exposures", "halves"] | None = Field(
         None,
         description="exposures writes the exposures of each level of a panorama into exposures/: linear flux, and pictures; "
-        "each level is merged once more for that",
+        "each level is merged once more for that. halves writes panorama-first.tiff and panorama-last.tiff, of the first and "
+        "the last half of the frames that saw each place, which are merged once more, and finds the real detail at this scale",
     )
 
 

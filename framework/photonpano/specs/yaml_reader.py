@@ -254,6 +254,8 @@ class _Reader:
                     merged = Written(merged.laid_over(source).data, replace(place, is_readable=is_readable))
             elif key_node.tag != f"{TAG}str":
                 got = (f"{key}; quote it" if key else "nothing") if isinstance(key, str) else "a list or a mapping"
+                if isinstance(key, str) and key.isdigit() and item.value == "":
+                    got = f"{key}; in {{...}}, a comma ends a value: write numbers without commas"
                 self.report(key_node, where, f"a key is text, got {got}")
             elif key in content:
                 line = content[key].place.line

@@ -5,6 +5,7 @@ The headers of raw frames are .cih, text, or .cihx, which contains XML.
 
 from __future__ import annotations
 
+import logging
 import re
 import struct
 from collections.abc import Callable, Iterable
@@ -41,8 +42,9 @@ _MOST_SQUEEZED = 4096
 _DAMAGED = "is damaged: it is not a TIFF file that can be read; copy it again"
 _MOST_BYTES = 4 * 1024**2  # headers have a few kB; larger files are something else
 _BITS = (8, 12, 16)
+logger = logging.getLogger("photonpano.fastcam-mraw")
 _COUNT = re.compile(r"\d{1,9}")
-_RATE = re.compile(r"\d{1,9}(\.\d{1,9})?")
+_RATE = re.compile(r"\d{1,9}(\.\d{1,9})?(e\+?\d)?", re.IGNORECASE)
 # The keys of .cih and .cihx files.
 _KEYS = {
     "width": ("Image Width", "imageDataInfo/resolution/width"),
@@ -76,6 +78,11 @@ class ImageFolderSource(IntensitySource):
         form = self._pictures.form
         shape = self._pictures.n_frames, form.height, form.width
         super().__init__(config, shape, None, Encoding.full(form.bits))
+        pictures = f'tifffile.imread("{config.path}")'
+        if config.path.is_dir():
+            files = f'sorted(pathlib.Path("{config.path}").iterdir(), key=lambda file: (len(file.name), file.name))'
+            pictures = f"[cv2.imread(str(file), -1) for file in {files}]"
+        self.refuse_binary(config.path, pictures)
 
     def close(self) -> None:
         """Close files."""
@@ -247,6 +254,11 @@ class FastcamMrawSource(IntensitySource):
         flat, position = levels.reshape(-1), span.start * frame_bytes
         if self._header.bits != 12:
             self._files.read(self._path, position, flat.view(np.uint8))
+            if (highest := int(flat.max())) >> self._header.encoding.bits:
+                bits = f"the lower {self._header.encoding.bits} bits are used"
+                raise InputError(
+                    f"{self._path} has levels up to {highest}, and its header says that {bits}; correct the header"
+                )
             return
         packed = np.empty(len(span) * frame_bytes, np.uint8)
         self._files.read(self._path, position, packed)
@@ -280,6 +292,9 @@ def open_recording(path: Path) -> tuple[Path, Header]:
             f"{mraw} is cut short: {header.n_frames} frames of {header.height}x{header.width} pixels of {header.bits} bits, as "
             f"{header_path.name} promises, are {needed} bytes, the file has {size}; copy or record it again"
         )
+    if size >= needed + header.frame_bytes:
+        promised = f"{header_path.name} promises {header.n_frames:,}, which are read"
+        logger.warning(f"{mraw} holds {size // header.frame_bytes:,} frames, and {promised}; is it of another recording?")
     return mraw, header
 
 
@@ -369,7 +384,7 @@ def _header(path: Path, value_of: Callable[[str], str | None]) -> Header:
     effective = count("effective bits")
     if effective > bits:
         raise InputError(f"{path}: pixels of {bits} bits cannot hold {effective} effective ones")
-    rate, step = (value_of("rate") or "").strip(), (value_of("step") or "").strip()
+    rate, step = (value_of("rate") or "").strip().replace(",", ""), (value_of("step") or "").strip()
     rate_hz = float(rate) if _RATE.fullmatch(rate) else 0.0
     every = int(step) if _COUNT.fullmatch(step) else 1
     side = value("effective side").lower()

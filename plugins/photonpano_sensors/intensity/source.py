@@ -19,6 +19,8 @@ from photonpano_sensors.intensity.contributions import IntensityConfig, Response
 Levels: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 _PART_BYTES = 4 * 1024**2  # bytes of the frames that are read at once for a sum
+_LOOKED_AT = 3  # frames by which binary ones are told from grey ones
+_BITS = [0, 255], [0, 65535], [16, 235]  # the levels of these
 _MOST_COUNT = 2**32 - 1
 _BLOCK_PIXELS = 4096  # pixels summed at once: their sums stay in the L1 cache
 _HIGHEST = 2**16 - 1  # the highest linear level
@@ -45,6 +47,18 @@ class IntensitySource(Closing, ABC):
     @abstractmethod
     def _read(self, span: FrameSpan, levels: Levels) -> None:
         """Fill (n, H, W) with the levels of a span as they are in the file; raises an `InputError` if they cannot be read."""
+
+    def refuse_binary(self, path: Path, pictures: str) -> None:
+        """Refuse frames of zeros and ones with an `InputError`; `pictures` is Python code that reads all of them."""
+        try:
+            values = np.unique([self._levels_of(each) for each in self.info.spread(_LOOKED_AT, 1)])
+        except InputError:  # a damaged frame is refused when it is read
+            return
+        if len(values) == 2 and values.tolist() in _BITS:
+            self.close()
+            saved = f'numpy.save("cube.npy", numpy.packbits(numpy.array({pictures}) > 99, axis=-1))'
+            only = f"binary frames, of {values[0]} and {values[1]} only"
+            raise InputError(f"{path} holds {only}, which are no grey levels; in Python, save them for packed-npy: {saved}")
 
     def frames(self, span: FrameSpan) -> Levels:
         """Return the frames of a span, in linear levels: (n, H, W)."""

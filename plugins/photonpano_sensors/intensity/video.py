@@ -5,6 +5,7 @@ An index of the frames is made from the packets of the video, without decoding t
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from photonpano.reading import missing_file, reading
 from photonpano_sensors.intensity.contributions import VideoConfig, refuse_mdat
 from photonpano_sensors.intensity.source import Encoding, IntensitySource, Levels
 
+logger = logging.getLogger("photonpano.video")
 _KEPT_BYTES = 256 * 1024**2  # size of the cache of decoded frames
 
 
@@ -36,6 +38,9 @@ class VideoSource(IntensitySource):
         index = index_of(config.path)
         super().__init__(config, (len(index.times), index.height, index.width), index.frame_rate_hz, index.encoding)
         self.decoded = DecodedFrames(index, context.threads, _KEPT_BYTES)
+        self.refuse_binary(
+            config.path, f'[each.to_ndarray(format="gray") for each in av.open("{config.path}").decode(video=0)]'
+        )
 
     def close(self) -> None:
         """Close the file."""
@@ -247,6 +252,12 @@ def index_of(path: Path) -> VideoIndex:
                 f"{path} is cut short: it promises {stream.frames} frames and holds {len(times)}; export or copy it again"
             )
         order = np.argsort(times)
+        tick_s = float(stream.time_base or 0)
+        step_s = _step_s(path, times[order] * tick_s, tick_s)
+        lasts_s = (container.duration or 0) / av.time_base if "matroska" in container.format.name else 0.0
+        if len(container.streams) == 1 and times.max() * tick_s + 2 * step_s < lasts_s:  # sound may be longer than pictures
+            ends = f"its frames end after {times.max() * tick_s:.3g} s"
+            raise InputError(f"{path} is cut short: it promises {lasts_s:.3g} s, and {ends}; export or copy it again")
         keys = np.flatnonzero(np.array([key for _, key in found])[order])
         if not len(keys) or keys[0]:
             raise InputError(f"{path} does not begin with a frame that stands alone; export it again")
@@ -258,7 +269,10 @@ def index_of(path: Path) -> VideoIndex:
         encoding = Encoding(bits, 16.0 * 2 ** (bits - 8), 235.0 * 2 ** (bits - 8))
         if context.color_range == _JPEG_RANGE or _FULL_RANGE.match(pixel_format):
             encoding = Encoding.full(bits)
-        rate = stream.average_rate
+        rate = float(stream.average_rate or 0)
+        # Where the header does not say the rate, FFmpeg takes the clock of the file for it.
+        if rate and step_s and not 0.5 < rate * step_s < 2:
+            rate = 1 / step_s
         return VideoIndex(
             path=path,
             times=times[order].astype(np.int64),
@@ -267,8 +281,24 @@ def index_of(path: Path) -> VideoIndex:
             width=context.width,
             pixel_format=pixel_format,
             encoding=encoding,
-            frame_rate_hz=float(rate) if rate else None,
+            frame_rate_hz=rate or None,
         )
+
+
+def _step_s(path: Path, times_s: NDArray[np.float64], tick_s: float) -> float:
+    """Return the time from frame to frame, 0 if it is not known; gaps are a warning."""
+    steps = np.diff(times_s)
+    if not len(steps):
+        return 0.0
+    gaps = steps > 1.5 * np.median(steps) + tick_s
+    step_s = float(steps[~gaps].mean())
+    if gaps.any():
+        first = int(np.argmax(gaps))
+        logger.warning(
+            f"{path}: times of frames have gaps, {gaps.sum()} in all: {1000 * steps[first]:.3g} ms after frame {first}, and "
+            f"{1000 * step_s:.3g} ms elsewhere; frames may be missing there"
+        )
+    return step_s
 
 
 @contextmanager

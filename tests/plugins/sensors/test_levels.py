@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -100,3 +101,42 @@ def test_flux_of_saturated_pixels_is_a_lower_bound(tmp_path: Path, curve: Any) -
     with FastcamMrawSource(FastcamMrawConfig(path=tmp_path / "a.cih", response=response)) as source:
         flux = source.response.flux((source.counts(FrameSpan(0, 2)) / 2).astype(np.float32), 2)
     np.testing.assert_allclose(flux, [[500, 0], [500, 500]], rtol=1e-5)
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Callable[..., Path]:
+    def recorded(levels: np.ndarray, rate: str = "1000", side: str = "Lower") -> Path:
+        """Write a recording of two frames of 2x2 px of 16 bits, of which 12 are effective, and return its header."""
+        (tmp_path / "a.cih").write_text(
+            "File Format : MRaw\nTotal Frame : 2\nImage Width : 2\nImage Height : 2\nColor Bit : 16\n"
+            f"Record Rate(fps) : {rate}\nEffectiveBit Depth : 12\nEffectiveBit Side : {side}\n"
+        )
+        levels.astype("<u2").tofile(tmp_path / "a.mraw")
+        return tmp_path / "a.cih"
+
+    return recorded
+
+
+@pytest.mark.parametrize(("rate", "expected_hz"), [("60,000", 60_000), ("1.0e5", 100_000), ("2.5E+3", 2500), ("fast", None)])
+def test_frame_rate_of_a_header_is_read_as_people_write_it(
+    recorded: Callable[..., Path], rate: str, expected_hz: float | None
+) -> None:
+    with FastcamMrawSource(FastcamMrawConfig(path=recorded(np.zeros((2, 2, 2)), rate))) as source:
+        assert source.info.frame_rate_hz == expected_hz
+
+
+def test_more_frames_than_the_header_promises_are_a_warning(
+    recorded: Callable[..., Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    with FastcamMrawSource(FastcamMrawConfig(path=recorded(np.zeros((4, 2, 2))))) as source:
+        assert source.info.n_frames == 2
+    assert "a.mraw holds 4 frames, and a.cih promises 2, which are read" in caplog.text
+
+
+def test_levels_that_contradict_the_effective_bits_are_refused(recorded: Callable[..., Path]) -> None:
+    wrong = "levels up to 65520, and its header says that the lower 12 bits are used; correct"
+    source = FastcamMrawSource(FastcamMrawConfig(path=recorded(np.full((2, 2, 2), 4095 << 4))))
+    with source, pytest.raises(InputError, match=wrong):
+        source.counts(FrameSpan(0, 2))
+    with FastcamMrawSource(FastcamMrawConfig(path=recorded(np.full((2, 2, 2), 4095 << 4), side="Higher"))) as source:
+        assert source.counts(FrameSpan(0, 2)).max() == 2 * 65520

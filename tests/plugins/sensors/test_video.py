@@ -1,19 +1,24 @@
 from __future__ import annotations
 
+import contextlib
+import pathlib
 from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from photonpano import FrameSpan, InputError, SourceContext
-from photonpano_sensors.intensity.contributions import ResponseConfig, VideoConfig
+from photonpano_sensors.intensity.contributions import ImageFolderConfig, ResponseConfig, VideoConfig
 
 pytest.importorskip("av")
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from photonpano_sensors.intensity.pictures import ImageFolderSource
 from photonpano_sensors.intensity.video import DecodedFrames, VideoSource, index_of
 
 
@@ -113,3 +118,56 @@ def test_truncated_frame_is_refused_when_read(moving: Callable, write_video: Cal
         with pytest.raises(InputError, match=rf"^frame \d+ of {path} is damaged or missing; export or copy it again$"):
             source.counts(source.info.span)
         assert source.counts(FrameSpan(0, 1)).any()
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Callable[..., Path]:
+    def film(name: str, frames: Iterable[int] = range(40), levels: int = 200) -> Path:
+        """Write an MKV of random levels whose times are those of some frames at 30 Hz."""
+        import av
+
+        rng = np.random.default_rng(0)
+        with av.open(str(tmp_path / name), "w") as container:
+            stream = container.add_stream("ffv1", rate=30)
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "gray"
+            stream.codec_context.time_base = Fraction(1, 1000)
+            for number in frames:
+                frame = av.VideoFrame.from_ndarray(rng.integers(0, levels, (48, 64)).astype(np.uint8), format="gray")
+                frame.pts, frame.time_base = round(number * 1000 / 30), Fraction(1, 1000)
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+        return tmp_path / name
+
+    return film
+
+
+def test_matroska_that_is_cut_short_is_refused(film: Callable[..., Path]) -> None:
+    whole = film("film.mkv").read_bytes()
+    cut = film("cut.mkv")
+    cut.write_bytes(whole[: int(0.6 * len(whole))])
+    with pytest.raises(InputError, match=r"cut.mkv is cut short: it promises 1.33 s, and its frames end after 0.\d+ s; export"):
+        index_of(cut)
+
+
+def test_gaps_between_frames_are_a_warning(film: Callable[..., Path], caplog: pytest.LogCaptureFixture) -> None:
+    gap = film("gap.mkv", [*range(20), *range(25, 40)])
+    assert index_of(gap).frame_rate_hz == pytest.approx(30, rel=0.01)
+    assert "times of frames have gaps, 1 in all: 200 ms after frame 19, and 33.3 ms elsewhere" in caplog.text
+    caplog.clear()
+    index_of(film("even.mkv"))
+    assert not caplog.text
+
+
+def test_binary_frames_are_no_grey_levels(tmp_path: Path) -> None:
+    """The line of the message saves them."""
+    frames = np.random.default_rng(0).random((12, 16, 24)) < 0.5
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for number, frame in enumerate(frames):
+        cv2.imwrite(str(folder / f"{number}.png"), frame.astype(np.uint8) * 255)
+    with pytest.raises(InputError, match="holds binary frames, of 0 and 255 only") as caught:
+        ImageFolderSource(ImageFolderConfig(path=folder))
+    line = str(caught.value).partition("packed-npy: ")[2]
+    with contextlib.chdir(tmp_path):
+        exec(line, {"numpy": np, "cv2": cv2, "pathlib": pathlib})
+    np.testing.assert_array_equal(np.unpackbits(np.load(tmp_path / "cube.npy"), axis=-1), frames)

@@ -95,6 +95,7 @@ def test_coordinates_are_those_of_the_reference_frame(tmp_path: Path, projection
         covered = np.arange(2**level)
         x, y = 5 * 2**level + covered.mean(), 3 * 2**level + covered.mean()
         assert canvas @ [at[2] * per_unit, at[1] * per_unit, 1] == pytest.approx([x, y, 1])
+    assert attributes["photonpano"]["channels"]["flux"] == "photons per pixel per frame"
     assert attributes["photonpano"]["unit"] == ("degree" if projection == "spherical" else "pixel of the reference frame")
 
 

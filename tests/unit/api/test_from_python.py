@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from photonpano import InputError, SpecError, panorama, run
+from photonpano.geometry import translation
+from photonpano.testing.captures import detected, seen_along, textured
 
 pytestmark = pytest.mark.usefixtures("without_report")
 KEYS: dict[str, Any] = {"levels": 1, "refine": [], "motion": {"model": "translation"}}
@@ -74,3 +76,11 @@ def test_wrong_key_is_named(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match="motoin: unknown key; did you mean 'motion'"):
         panorama(np.ones((4, 20, 24), bool), output=tmp_path / "run", motoin={})
     assert not list(tmp_path.iterdir())
+
+
+def test_frames_along_the_last_axis_are_named_also_where_they_are_few(tmp_path: Path) -> None:
+    """An array of 300 frames of 96x128 px has the shape of 96 frames of 128x300 px."""
+    path = np.array([translation(5 + 0.2 * frame, 10) for frame in range(300)])
+    frames = detected(seen_along(textured((120, 200), 0.4).astype(np.float32), path, (96, 128)))
+    with pytest.raises(InputError, match=r"and \(96, 128, 300\) seems to have the frames last"):
+        panorama(np.moveaxis(frames, 0, -1), output=tmp_path / "run")

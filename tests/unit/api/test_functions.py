@@ -7,7 +7,19 @@ import numpy as np
 import pytest
 
 import photonpano
-from photonpano import Config, Plan, RefinerContribution, capture_plan, convert, discover, explain, parse_spec
+from photonpano import (
+    Config,
+    OutputError,
+    Plan,
+    RefinerContribution,
+    capture_plan,
+    convert,
+    discover,
+    explain,
+    info,
+    load_spec,
+    parse_spec,
+)
 from photonpano.api.cli.app import commands
 from photonpano.record.run_json import plugin_records
 
@@ -60,3 +72,15 @@ def test_refiners_are_explained_and_recorded_with_their_plugins(capture: Plan) -
         {"stage": "refine", "use": "drift", "plugin": __name__, "version": "unreleased"}
     ]
     assert "refine: []  # default" in explain(parse_spec(spec)).splitlines()
+
+
+def test_info_writes_a_spec_to_start_from(capture: Plan, tmp_path: Path) -> None:
+    """Its paths count from its own folder."""
+    Path("specs").mkdir()
+    for file, path in (("scan.yaml", "cube.npy"), ("specs/scan.yaml", str(tmp_path / "cube.npy"))):
+        found = info(capture, write=file)
+        assert found.spec["source"]["with"] == {"path": path, "width": 13, "frame_rate_hz": 100}
+        assert Path(file).read_text() == found.spec_yaml + "\n"
+        assert load_spec(file).source.config == capture.source.config
+    with pytest.raises(OutputError, match="is there already; choose another name, or replace it with --overwrite"):
+        info(capture, write="scan.yaml")

@@ -91,7 +91,7 @@ def copied(small_run: RunResult, tmp_path: Path) -> Path:
 
 def test_verify_accepts_a_finished_run(small_run: RunResult) -> None:
     found = verify(small_run.directory)
-    assert (found.n_files, found.problems, found.capture) == (6, (), "the same frames")
+    assert (found.n_files, found.problems, found.capture) == (8, (), "the same frames")
     assert found.n_bytes == sum(path.stat().st_size for path in small_run.directory.iterdir() if path.name != "run.json")
 
 
@@ -218,3 +218,19 @@ def test_panorama_is_moved_onto_the_common_canvas_with_one_white() -> None:
     np.testing.assert_array_equal(moved, picture[4:24, 10:40])
     darker = on_canvas(picture, canvas, np.eye(3), common, (1.0, 2.0))
     assert (darker < moved)[moved > 20].all()
+
+
+@pytest.mark.parametrize("foreign", [{"a": np.zeros(3)}, {"homographies": np.eye(3)[None], "frame_shape": np.array([2, 2])}])
+def test_foreign_truth_beside_the_capture_does_not_end_a_comparison(
+    small_run: RunResult, small_capture: Path, foreign: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    capture = Path(shutil.copy(small_capture, tmp_path / "cube.npy"))
+    np.savez(tmp_path / "cube.truth.npz", **foreign)
+    runs = []
+    for name in ("one", "two"):
+        folder = Path(shutil.copytree(small_run.directory, tmp_path / name))
+        record = json.loads((folder / "run.json").read_text())
+        record["capture"]["files"][0]["path"] = str(capture)
+        (folder / "run.json").write_text(json.dumps(record))
+        runs.append(folder)
+    assert compare(runs, tmp_path / "page.html").page.exists()

@@ -9,6 +9,7 @@ import resource
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -35,7 +36,17 @@ PANORAMA = Panorama(FLUX, np.where(np.isnan(FLUX), np.float32(0), np.float32(7))
 STD = np.full_like(FLUX, 0.1)
 CANVAS = Canvas(60, 90, PANORAMA.canvas)
 PICTURE = np.arange(60 * 90, dtype=np.uint8).reshape(60, 90)
-FILES = {"panorama.tiff", "panorama-std.tiff", "panorama.png", "coverage.tiff", "trajectory.npz", "run.json", "report.html"}
+FILES = {
+    "panorama.tiff",
+    "panorama-std.tiff",
+    "panorama.png",
+    "coverage.tiff",
+    "first-frame.tiff",
+    "last-frame.tiff",
+    "trajectory.npz",
+    "run.json",
+    "report.html",
+}
 MOTION = FrameMotion(
     trajectory=KnownMotion(lambda _: np.eye(3)),
     span=FrameSpan(0, 500),
@@ -45,6 +56,8 @@ MOTION = FrameMotion(
     reference=250,
     frame_shape=(48, 64),
 )
+SEEN = np.zeros((2, *PANORAMA.flux.shape[:2]), np.uint32)
+MAPS = PANORAMA.flux, PANORAMA.weight, STD, *SEEN
 RANGE = DynamicRange(noise=CanvasNoise(response=BinaryResponse()))
 RENDERED = RenderedPanorama(
     canvas=CANVAS,
@@ -55,12 +68,13 @@ RENDERED = RenderedPanorama(
     coverage_share=0.9,
     seconds=2.0,
     std=STD,
+    seen_frames=SEEN,
     dynamic_range=RANGE,
 )
 RECORD: Any = {"photonpano": "0", "spec": {}, "warnings": ["a line"] * 2000}
 
 WRITERS: Mapping[str, Callable[[RunFolder], object]] = {
-    "panorama": lambda folder: folder.write_tile(Tile(0, 0, CANVAS), PANORAMA, STD, CANVAS),
+    "panorama": lambda folder: folder.write_tile(Tile(0, 0, CANVAS), MAPS, CANVAS, "cube.npy"),
     "results": lambda folder: folder.write_results(RENDERED, MOTION),
     "record": lambda folder: folder.commit(RECORD),
 }
@@ -238,6 +252,18 @@ def test_run_folder_keeps_old_files_when_the_disk_is_full(old: Path, result: str
         "Make room, or choose another folder with --output"
     )
     assert files_in(old.parent) == before
+
+
+def test_temporary_files_lie_beside_the_run_folder_where_the_system_has_no_place(
+    old: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nowhere() -> str:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "gettempdir", nowhere)
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    with run_folder(old, overwrite=True):
+        assert tempfile.tempdir == str(old.parent)
 
 
 @pytest.mark.parametrize("number", range(16))

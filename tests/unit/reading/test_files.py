@@ -9,15 +9,18 @@ import pytest
 from pydantic import BaseModel
 
 from photonpano import FrameSpan, InputError
+from photonpano.geometry import translation
 from photonpano.reading import (
     FrameFile,
     FrameLayout,
     PackedFileSource,
+    eight_frames_are_first,
     files_in,
     frames_are_last,
     read_json,
     unpacked_content,
 )
+from photonpano.testing.captures import detected, seen_along, textured
 
 
 def test_files_in_returns_natural_order(tmp_path: Path) -> None:
@@ -101,3 +104,12 @@ def test_last_axis_is_that_of_the_frames_where_values_are_most_alike(clouds: Cal
         assert not frames_are_last([content], content.shape)
         moved = last(content)
         assert frames_are_last([moved], moved.shape)
+
+
+@pytest.mark.parametrize("flux", [0.05, 0.4])
+def test_axis_of_bytes_that_hold_eight_frames_is_found(flux: float) -> None:
+    scene = textured((70, 140), flux, seed=2).astype(np.float32)
+    path = np.array([translation(5 + 0.15 * frame, 5 + 3 * np.sin(frame / 60)) for frame in range(400)])
+    frames = detected(seen_along(scene, path, (56, 64)))
+    assert eight_frames_are_first([np.packbits(frames, axis=0)])
+    assert not eight_frames_are_first([np.packbits(np.moveaxis(frames, 0, -1), axis=-1)])

@@ -73,6 +73,7 @@ def make_results(n_frames: int = N_FRAMES) -> tuple[FrameMotion, RenderedPanoram
         coverage_share=share,
         seconds=4.18,
         std=std,
+        seen_frames=np.stack([weight, weight + 1]).astype(np.uint32),
         dynamic_range=RANGE,
     )
 

@@ -255,3 +255,15 @@ def test_bad_spec_is_marked_by_editors(path, validator):
     document = data(path)
     if document is not None:
         assert validator.is_valid(document) == (path.stem in BEYOND_A_SCHEMA)
+
+
+def test_capture_that_no_source_recognises_is_refused_as_a_capture(tmp_path: Path) -> None:
+    np.save(tmp_path / "none.npy", np.zeros((0, 8, 2), np.uint8))
+    with pytest.raises(SpecError, match=r"packed-npy: none\.npy is empty"):
+        load_spec(tmp_path / "none.npy")
+
+
+def test_comma_in_a_number_is_named(catalog: Catalog, tmp_path: Path) -> None:
+    text = "version: 1\nsource: {use: packed-npy, with: {path: a.npy, frame_rate_hz: 96,800}}\n"
+    with pytest.raises(SpecError, match=r"got 800; in \{...\}, a comma ends a value: write numbers without commas"):
+        parse_spec(text, catalog=catalog)

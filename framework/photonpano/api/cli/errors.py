@@ -73,8 +73,9 @@ def reported(*, debug: bool = False) -> Iterator[None]:
         called.__cause__ = error
         raise typer.Exit(print_error(called, debug)) from error
     except KeyboardInterrupt as error:
-        typer.echo(INTERRUPTED, err=True)
-        log_shown(logging.ERROR, INTERRUPTED.strip())
+        message = "; ".join([INTERRUPTED, *getattr(error, "__notes__", ())])
+        typer.echo(message, err=True)
+        log_shown(logging.ERROR, message.strip())
         number = error.args[0] if isinstance(error, Signalled) else signal.SIGINT
         raise typer.Exit(SIGNALLED + number) from error
     except OSError as error:

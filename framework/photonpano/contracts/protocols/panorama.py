@@ -71,6 +71,10 @@ class FinishedPanorama(Protocol):
         """Of the canvas: planar, cylindrical or spherical."""
 
     @property
+    def capture(self) -> str:
+        """Name of the file or folder of the capture, or of its source."""
+
+    @property
     def white_flux(self) -> float:
         """Flux that is white in panorama.png, photons per pixel per frame."""
 

@@ -85,6 +85,7 @@ def test_run_prints_only_verdict_paths_and_warnings_into_pipe(finished: Path) ->
     assert (finished / "run.out").read_text() == (
         f"verdict   {record['verdict']['status']}\n{''.join(refined)}"
         f"found     homographies, from groups of {record['levels'][-1]['group_frames']} frames\n"
+        f"detail    down to {record['detail']['finest_px']:.2g} px is real: all that the grid holds\n"
         f"range     {decibels:.0f} dB, of {measurable:.0f} dB that the frames over a pixel can measure; "
         f"{100 * panorama['saturated_share']:.2g} % of the pixels are saturated\n"
         f"panorama  {finished}/run/panorama.png\nreport    {finished}/run/report.html\n"
@@ -165,3 +166,11 @@ def test_convert_onto_itself_keeps_capture(cube: Path, invoke: Callable[..., Any
     assert invoke("convert", "cube.npy", "cube.npy", "--overwrite").exit_code == 0
     assert cube.read_bytes() == before
     truth.unlink()
+
+
+def test_check_refuses_the_capture_as_output(cube: Path, invoke: Callable[..., Any]) -> None:
+    source = "source: {use: packed-npy, with: {path: cube.npy}}"
+    Path("wrong.yaml").write_text(f"version: 1\n{source}\noutput: {{directory: cube.npy}}\n")
+    result = invoke("check", "wrong.yaml")
+    assert result.exit_code == 1
+    assert f"{cube.absolute()} cannot be written, since {cube.absolute()}, which is read, lies in it" in result.stderr
