@@ -14,9 +14,10 @@ import tifffile
 
 import photonpano
 from photonpano.capture.writing import truth_path
+from photonpano.errors import InputError
 from photonpano.evaluation import Evaluation, corner_errors
 from photonpano.photometry import tone_mapped
-from photonpano.pipeline.run import RunResult
+from photonpano.pipeline.run import RunResult, judge
 from photonpano.specs import Plan, parse_spec
 
 SHAPE = (128, 160)
@@ -151,3 +152,21 @@ def test_run_whose_time_is_over_ends_with_the_motion_known_by_then(run: Callable
     assert decision["value"].startswith("further levels, corrections")
     assert [warning for warning in result.record["warnings"] if "are left out, since 1e-06 s were over" in warning]
     assert not [each for each in run("run.time_limit=9999").record["warnings"] if "run.time_limit" in each]
+
+
+def test_capture_that_changes_while_it_is_read_is_refused(
+    small_spec: dict[str, Any], small_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = tmp_path / "capture.npy"
+    capture.write_bytes(small_capture.read_bytes())
+    source = {**small_spec["source"], "with": {**small_spec["source"]["with"], "path": str(capture)}}
+
+    def judged_late(*found: Any) -> Any:
+        frames = np.load(capture, mmap_mode="r+")
+        frames[150:] = 0
+        return judge(*found)
+
+    monkeypatch.setattr("photonpano.pipeline.run.judge", judged_late)
+    with pytest.raises(InputError, match=r"capture\.npy was changed while it was read; run it again as soon as nothing writes"):
+        photonpano.run(parse_spec(small_spec | {"source": source}, overrides=["levels=1"], output=tmp_path / "run"))
+    assert not (tmp_path / "run").exists()

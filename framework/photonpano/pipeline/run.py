@@ -39,7 +39,7 @@ from photonpano.pipeline.run_folder import RunFolder, run_folder, write_exposure
 from photonpano.pipeline.state import State
 from photonpano.pipeline.summary import require_photons
 from photonpano.plugins.contributions import RunKindContribution
-from photonpano.record.contents import capture_files, fingerprint
+from photonpano.record.contents import capture_files, fingerprint, frames_sha256, name_of_capture
 from photonpano.record.run_json import detail_record, level_record, peak_memory_bytes, record_of, started_record, verdict_of
 from photonpano.record.schema import CaptureRecord, RunRecord
 from photonpano.report import OpenCapture, render_failure, render_report
@@ -227,6 +227,12 @@ class BegunRun:
         """The fingerprint of the capture."""
         return fingerprint(self.plan, self.source)
 
+    def require_unchanged(self) -> None:
+        """Raise `InputError` if frames of the capture are others than when the run began."""
+        if frames_sha256(self.source) != self.capture["frames_sha256"]:
+            name = name_of_capture(self.plan)
+            raise InputError(f"{name} was changed while it was read; run it again as soon as nothing writes to it")
+
     @property
     def context(self) -> Context:
         """How the run computes: with its progress, its checkpoints, and observers of levels."""
@@ -245,6 +251,7 @@ class BegunRun:
 
     def end(self, record: RunRecord, draw: Callable[[RunRecord], str], verdict: Verdict | None = None) -> None:
         """Put the files of the run into its folder, and then the report that `draw` makes of the record."""
+        self.require_unchanged()
         record = self.folder.commit(record)
         if self.work is not None:
             self.work.finish()
@@ -328,6 +335,7 @@ def _reporting_failure(run: BegunRun) -> Iterator[None]:
             error.add_note("the same command with --resume goes on")
         raise
     except (LocationError, CanvasTooLargeError, PluginError) as error:
+        run.require_unchanged()
         levels = {result.level.number: level_record(result) for result in run.levels}
         record: RunRecord = {
             **run.started_record(),
