@@ -59,7 +59,10 @@ def _in_attempts(plan: Plan, source: Source, attempts: list[Journal], context: C
         error = unlocated
     others: list[tuple[str, str, int]] = []
     if started == "none" and plan.motion.prior is None:
-        others += [(f"motion: {{start: {each}}}", each, 1) for each in ("constant-velocity", "smooth-path")]
+        others.append(("motion: {start: constant-velocity}", "constant-velocity", 1))
+        # A motion that blurs groups is too fast to be found from rest.
+        if isinstance(error, UntiedError) and not error.blurred:
+            others.append(("motion: {start: smooth-path}", "smooth-path", 1))
     chosen = any(isinstance(each, str) for each in foreseen_groups(plan, source))
     if chosen and isinstance(error, UntiedError) and error.blurred:
         others += [(f"1/{times} of the group size", started, times) for times in _SHORTENED]
