@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from photonpano import InputError
 from photonpano.geometry import Camera, Canvas, rotation_matrices
 from photonpano_poses.files import Poses
 from photonpano_poses.hugin import hugin, hugin_lens
@@ -87,3 +88,8 @@ def test_the_residual_of_the_lens_has_its_tangential_distortion() -> None:
     tangential = hugin_lens(Camera(MATRIX, np.array([-0.1, 0.02, 0.001, 0])), SHAPE)
     assert radial.shift_px == (1.5, -1.0)
     assert radial.residual_px < 0.02 < 0.04 < tangential.residual_px
+
+
+def test_lens_that_folds_the_frame_over_is_refused() -> None:
+    with pytest.raises(InputError, match="folds the image over within its frame, which Hugin cannot describe"):
+        hugin_lens(Camera(MATRIX, np.array([-3.0, 0, 0, 0])), SHAPE)
