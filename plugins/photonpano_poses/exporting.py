@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from photonpano.evaluation import RunTrajectory, load_run_trajectory
 from photonpano.execution.context import Progress, usual
 from photonpano.execution.threads import one_thread_inside, thread_count
 from photonpano.files.folders import atomic_folder, require_new
-from photonpano.geometry import Camera, canvas_of_box, nearest_rotations, outline_of, positions_of
+from photonpano.geometry import Camera, Canvas, canvas_of_box, nearest_rotations, outline_of, positions_of
 from photonpano.pipeline.film import Film
 from photonpano.plugins.registry import Catalog
 from photonpano.record.contents import capture_files, require_one_run
@@ -28,9 +28,19 @@ from photonpano.record.picture_files import Picture, advancing, write_pngs
 from photonpano.record.run_json import read_record
 from photonpano.text import counted
 from photonpano.values import FloatArray
-from photonpano_poses.files import POSE_FORMATS, PoseFormat, Poses, ply, read_colmap
+from photonpano_poses.files import Poses, colmap, nerfstudio, openmvg, ply, read_colmap, tum
+from photonpano_poses.hugin import hugin
 from photonpano_poses.scores import RunPoses, has_poses, load_run_poses
 
+PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "openmvg", "pto", "tum"]
+# Each returns the content of files by name.
+POSE_FORMATS: Mapping[PoseFormat, Callable[[Poses], dict[str, str]]] = {
+    "colmap": colmap,
+    "nerfstudio": nerfstudio,
+    "openmvg": openmvg,
+    "pto": hugin,
+    "tum": tum,
+}
 PosedPictures = tuple[Poses, Iterator[Picture]]  # pictures are (H, W) or (H, W, 3), red first
 
 
@@ -191,8 +201,8 @@ def export(  # noqa: PLR0913
 
     Args:
         run_folder: written by `run`, with the model `rotation` or with `pose`.
-        file_format: "colmap" (a text model), "nerfstudio" (transforms.json), "openmvg" (sfm_data.json) or "tum" (times and
-            quaternions).
+        file_format: "colmap" (a text model), "nerfstudio" (transforms.json), "openmvg" (sfm_data.json), "pto" (a project of
+            Hugin, with images) or "tum" (times and quaternions).
         output: the folder of the files.
         every: 1 for all located frames, or pictures; 2 for every other, and so on.
         frame_rate_hz: for the times of "tum", in Hz; by default that of the capture.
@@ -220,10 +230,16 @@ def export(  # noqa: PLR0913
     if bits not in (8, 16):
         raise InputError(f"bits: expected 8 or 16, got {bits}")
     if images and file_format == "tum":
-        raise InputError("the format tum has no pictures; leave out --images, or choose colmap, nerfstudio or openmvg")
+        raise InputError("the format tum has no pictures; leave out --images, or choose colmap, nerfstudio, openmvg or pto")
     if not images and (bits != 8 or undistorted or capture is not None):
         raise InputError("--bits, --undistorted and --capture are about pictures; add --images")
     folder, output = Path(run_folder), Path(output)
+    if file_format == "pto" and not images:
+        raise InputError("a project of Hugin is one of pictures, from which it makes a panorama; add --images")
+    if file_format == "pto" and has_poses(folder):
+        raise InputError(
+            f"{folder} is of a camera that travels, and Hugin knows cameras that only turn; choose another --format"
+        )
     require_new(output, overwrite, [folder])
     poses = _poses(folder, every, frame_rate_hz, needs_seconds=file_format == "tum")
     with ExitStack() as stack:
@@ -241,6 +257,8 @@ def export(  # noqa: PLR0913
                 folder, output, every=every, bits=bits, capture=capture, catalog=catalog, undistorted=undistorted
             )
             poses, pictures = stack.enter_context(made)
+        if file_format == "pto":
+            poses = replace(poses, canvas=_canvas(folder))
         files = {name: text.encode() for name, text in POSE_FORMATS[file_format](poses).items()}
         if images and file_format == "colmap":
             files = {f"sparse/0/{name}": text for name, text in files.items()}
@@ -256,6 +274,13 @@ def export(  # noqa: PLR0913
             write_pngs(written / "images", advancing(pictures, advance), [Path(name).stem for name in poses.names])
     paths = tuple(output / name for name in files)
     return ExportedPoses(paths, len(poses.names), output / "images" if images else None)
+
+
+def _canvas(folder: Path) -> Canvas:
+    """Return the pixel grid of the panorama of a run, which has one."""
+    panorama = read_record(folder)["panorama"]
+    assert panorama is not None
+    return load_run_trajectory(folder).canvas_of((panorama["height"], panorama["width"]))
 
 
 def _poses(folder: Path, every: int, frame_rate_hz: float | None, needs_seconds: bool) -> Poses:

@@ -9,23 +9,21 @@ Convention:
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import FloatArray, FluxImage, InputError, LocationError
-from photonpano.geometry import Camera, positions_of
+from photonpano.geometry import Camera, Canvas, positions_of
 from photonpano.photometry import srgb_to_linear, tone_mapped
 from photonpano_poses.contract import PoseEstimate, ScenePoints
 
 if TYPE_CHECKING:  # it compiles loops over pixels
     from photonpano_poses.depth import Surface
-
-PoseFormat: TypeAlias = Literal["colmap", "nerfstudio", "openmvg", "tum"]
 
 _GRAPHICS = np.diag([1.0, -1.0, -1.0])  # axes of a camera in OpenGL, x right, y up, z back, to ours
 _WHITE_QUANTILE = 0.995  # quantile of the flux of points, or of an exposure, that is white
@@ -48,6 +46,7 @@ class Poses:
     observed: tuple[tuple[NDArray[np.intp], FloatArray], ...] = ()
     points: ScenePoints | None = None  # of the scene; None if they are not known
     have_depth: bool = False  # whether there is a depth map for each image
+    canvas: Canvas | None = None  # of the panorama of a camera that only turned; None if it is not needed
 
     @property
     def places(self) -> FloatArray:
@@ -173,15 +172,6 @@ def openmvg(poses: Poses) -> dict[str, str]:
 def _keyed(values: Sequence[Any]) -> list[dict[str, Any]]:
     """Return values as cereal writes a map from their places."""
     return [{"key": key, "value": value} for key, value in enumerate(values)]
-
-
-# Each returns the content of files by name.
-POSE_FORMATS: Mapping[PoseFormat, Callable[[Poses], dict[str, str]]] = {
-    "colmap": colmap,
-    "nerfstudio": nerfstudio,
-    "openmvg": openmvg,
-    "tum": tum,
-}
 
 
 def read_colmap(folder: Path, camera: Camera, frame_shape: tuple[int, int]) -> Poses:

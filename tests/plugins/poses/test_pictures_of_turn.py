@@ -73,10 +73,11 @@ def matches(first: Any, second: Any) -> tuple[Any, Any]:
         (
             "tum",
             {"images": True},
-            "the format tum has no pictures; leave out --images, or choose colmap, nerfstudio or openmvg",
+            "the format tum has no pictures; leave out --images, or choose colmap, nerfstudio, openmvg or pto",
         ),
         ("colmap", {"undistorted": True}, "--bits, --undistorted and --capture are about pictures; add --images"),
         ("colmap", {"images": True, "bits": 12}, "bits: expected 8 or 16, got 12"),
+        ("pto", {}, "a project of Hugin is one of pictures, from which it makes a panorama; add --images"),
     ],
 )
 def test_pictures_that_cannot_be_made_are_refused(

@@ -160,6 +160,8 @@ def test_other_files_hold_the_same_poses(finished: RunResult, tmp_path: Path) ->
     exported = photonpano_poses.export(folder, "tum", tmp_path / "poses", every=2)
     assert exported.n_frames == LOST.start / 2
     np.testing.assert_allclose(np.loadtxt(tmp_path / "poses" / "trajectory.txt"), tum[::2])
+    with pytest.raises(InputError, match="is of a camera that travels, and Hugin knows cameras that only turn; choose another"):
+        photonpano_poses.export(folder, "pto", tmp_path / "project", images=True)
 
 
 def with_flat_depth(estimate: PoseEstimate) -> PoseEstimate:
