@@ -255,7 +255,8 @@ def _held_out(estimate: PoseEstimate) -> float | None:
 def _in_patches(values: FloatArray) -> FloatArray:
     """Return the sums of (H, W) values over squares of 8 px."""
     height, width = (size // _PATCH_PX for size in values.shape)
-    return values[: height * _PATCH_PX, : width * _PATCH_PX].reshape(height, _PATCH_PX, width, _PATCH_PX).sum(axis=(1, 3))
+    whole = values[: height * _PATCH_PX, : width * _PATCH_PX]
+    return np.asarray(whole.reshape(height, _PATCH_PX, width, _PATCH_PX).sum(axis=(1, 3)))
 
 
 def poses_warnings(estimate: PoseEstimate) -> list[str]:
