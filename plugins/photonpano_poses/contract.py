@@ -54,6 +54,8 @@ class DepthMap:
     inverse_depth: NDArray[np.float32]  # (H, W) float32, one over the depth along the optical axis; NaN where it is not known
     std: NDArray[np.float32]  # (H, W) float32, its expected error; NaN where it is not known
     flux: FluxImage  # (H, W) float32, flux of the other exposures at this depth, photons per pixel per frame
+    flux_nearer: FluxImage  # (H, W) float32, the same for an inverse depth that is larger by 3 std
+    flux_farther: FluxImage  # (H, W) float32, the same for one that is smaller by 3 std
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +195,7 @@ def _require_depth(depth: DepthMap, n_views: int, frame_shape: tuple[int, int]) 
     require_instance(depth, DepthMap)
     if not 0 <= depth.view < n_views:
         raise BrokenContract(f"a depth map is that of the view {depth.view}, and there are {n_views}")
-    for name in ("inverse_depth", "std", "flux"):
+    for name in ("inverse_depth", "std", "flux", "flux_nearer", "flux_farther"):
         require_array(f"{name} of a depth map", getattr(depth, name), frame_shape, "float32")
     known = np.isfinite(depth.inverse_depth)
     if not ((depth.inverse_depth[known] > 0).all() and (depth.std[known] >= 0).all()):

@@ -131,9 +131,11 @@ def _depth_of(key: int, seen: _Seen, estimate: PoseEstimate, camera: Camera, sha
     # Where both ends of a baseline are not known, neither is the scale of what is seen from there.
     scale = np.float32(np.sqrt(2) * estimate.std_position[int(views[key].instant)] * camera.focal_px / parallax)
     std = np.sqrt(std**2 + _spread(inverse_depth) ** 2 + (scale * inverse_depth) ** 2)
-    predicted = np.empty(shape, np.float32)
-    _predict(seen.flux[others], weights, turns, shifts, inverse_depth, lens, predicted)
-    return DepthMap(key, inverse_depth, std, predicted)
+    predicted, nearer, farther = np.empty((3, *shape), np.float32)
+    off = _AGREE * std
+    for depth, flux in ((inverse_depth, predicted), (inverse_depth + off, nearer), (inverse_depth - off, farther)):
+        _predict(seen.flux[others], weights, turns, shifts, depth, lens, flux)
+    return DepthMap(key, inverse_depth, std, predicted, nearer, farther)
 
 
 def _spread(inverse_depth: Image) -> Image:

@@ -40,7 +40,8 @@ from photonpano_poses.page import render_pose_report
 from photonpano_poses.scores import PoseScore, evaluate_poses
 
 _SHOWN_LOST = 3  # spans of lost frames that a warning names
-_MEDIAN_OF_NORMAL = 0.6745  # of the absolute value of a standard normal number
+_TELLING = 16.0  # squared distance of two predictions, in units of photon noise, that photons tell apart
+_PATCH_PX = 8  # side of the patches whose depth is held against photons that were left out
 _FEW = 0.1  # if fewer positions lie within 3 expected errors, the truth is probably of another capture
 logger = logging.getLogger("photonpano")
 
@@ -224,21 +225,38 @@ def depth_record(estimate: PoseEstimate) -> dict[str, Any] | None:
         "exposures": len(estimate.depth),
         "share": float(np.mean(known)),
         "std_share": float(np.median(relative)) if len(relative) else None,
-        "held_out_ratio": _held_out(estimate),
+        "held_out_share": _held_out(estimate),
     }
 
 
 def _held_out(estimate: PoseEstimate) -> float | None:
-    """Return the median distance of the photons of keys from what the others predict, in units of photon noise."""
-    ratios = []
+    """Return the share of patches whose photons, which were left out, prefer another depth; None if no patch can tell.
+
+    Compared are the deviances, sum((k - m)^2 / v), of the photons k from what the other exposures predict, m, at the depth
+    that was found and at 3 expected errors nearer and farther; v is the variance of photon noise. If the found depth is right,
+    the difference has the mean A = sum((m' - m)^2 / v) and the variance 4 A, so that patches with A > 16 can tell: chance
+    makes 2 % of them prefer m'.
+    """
+    telling, prefer = 0, 0
     for each in estimate.depth:
         view = estimate.views[each.view]
-        flux, known = view.flux(), np.isfinite(each.inverse_depth) & (each.flux > 0)
+        flux, others = view.flux(), (each.flux_nearer, each.flux_farther)
+        known = np.isfinite(each.inverse_depth) & np.isfinite(flux) & np.isfinite(others).all(axis=0) & (each.flux > 0)
         # Of binary frames, and nearly so of counts.
-        std = np.sqrt(np.expm1(each.flux) / len(view.span))
-        ratios.append((np.abs(flux - each.flux) / std)[known & np.isfinite(flux)])
-    ratio = np.concatenate(ratios)
-    return float(np.median(ratio) / _MEDIAN_OF_NORMAL) if len(ratio) else None
+        weight = len(view.span) / np.expm1(np.where(known, each.flux, 1))
+        found = _in_patches(np.where(known, weight * (flux - each.flux) ** 2, 0))
+        told = [_in_patches(np.where(known, weight * (other - each.flux) ** 2, 0)) > _TELLING for other in others]
+        better = [_in_patches(np.where(known, weight * (flux - other) ** 2, 0)) < found for other in others]
+        telling += int(np.any(told, axis=0).sum())
+        prefer += int((np.array(told) & better).any(axis=0).sum())
+    return prefer / telling if telling else None
+
+
+def _in_patches(values: FloatArray) -> FloatArray:
+    """Return the sums of (H, W) values over squares of 8 px."""
+    height, width = (size // _PATCH_PX for size in values.shape)
+    whole = values[: height * _PATCH_PX, : width * _PATCH_PX]
+    return np.asarray(whole.reshape(height, _PATCH_PX, width, _PATCH_PX).sum(axis=(1, 3)))
 
 
 def poses_warnings(estimate: PoseEstimate) -> list[str]:
@@ -293,6 +311,11 @@ def _depth_share(estimate: PoseEstimate) -> Found | None:
     return None if record is None else Found(1 - record["share"], "share of the pixels of key exposures")
 
 
+def _depth_held_out(estimate: PoseEstimate) -> Found | None:
+    share = _held_out(estimate)
+    return None if share is None else Found(share, "share of the patches of key exposures that can tell")
+
+
 def _depth_std(estimate: PoseEstimate) -> Found | None:
     record = depth_record(estimate)
     if record is None or record["std_share"] is None:
@@ -313,5 +336,11 @@ TESTS: tuple[Test[PoseEstimate], ...] = (
     Test("the expected errors are not known", 0, "use a pose estimator that knows them, or more light", _unknown),
     Test("many frames have no pose", 0.5, "see the reasons under `lost`; choose another pose.with.group_size", _lost),
     Test("many pixels have no depth", 0.5, "use more light, a longer path, or a scene with more texture", _depth_share),
+    Test(
+        "photons that were left out prefer another depth, by 3 expected errors",
+        0.25,
+        "the depth is likely wrong: check the focal length and the lens, or use a longer path",
+        _depth_held_out,
+    ),
     Test("the expected error of the depth is large", 10.0, "move farther across the view, or use more light", _depth_std),
 )

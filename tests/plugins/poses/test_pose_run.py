@@ -169,7 +169,7 @@ def with_flat_depth(estimate: PoseEstimate) -> PoseEstimate:
     inverse_depth = np.full((128, 160), 0.2, np.float32)
     inverse_depth[:64] = np.nan
     std, flux = inverse_depth / 20, np.full((128, 160), 0.5, np.float32)
-    return replace(estimate, depth=tuple(DepthMap(view, inverse_depth, std, flux) for view in range(5)))
+    return replace(estimate, depth=tuple(DepthMap(view, inverse_depth, std, flux, flux, flux) for view in range(5)))
 
 
 def test_depth_is_written_for_other_programs(plan_of: Callable[..., Plan], tmp_path: Path) -> None:
