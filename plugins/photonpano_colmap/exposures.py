@@ -32,7 +32,7 @@ from photonpano.filtering import exceeding_noise
 from photonpano.geometry import Camera, inverse, positions_of, rotation_matrices, rotation_vectors, scaled_ahead
 from photonpano.merging import PhotonSum, chunks_of
 from photonpano.photometry import flux_std
-from photonpano_poses import Lens, between, imaged, lens_of
+from photonpano_poses import Lens, between, lens_of, seen_at
 
 _NOISE_PX = 0.1  # standard error of the shift of a span that determines its length, within the limits below
 _SHORTEST, _LONGEST = 6, 32  # frames of a span
@@ -231,13 +231,7 @@ def _add(  # noqa: PLR0917
     for y in range(height):
         row, counts_of, weight_of = inverse_depth[y], counts[y], weight[y]
         for x in range(width):
-            q, px, py = row[x], lens.ideal[y, x, 0], lens.ideal[y, x, 1]
-            depth = turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] + q * shift[2]
-            if not depth > 0:
-                continue
-            u = (turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] + q * shift[0]) / depth
-            v = (turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] + q * shift[1]) / depth
-            u, v = imaged(lens, u, v)
+            u, v, _ = seen_at(lens, turn, shift, lens.ideal[y, x, 0], lens.ideal[y, x, 1], row[x])
             if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
                 continue
             i, j = min(int(u), width - 2), min(int(v), height - 2)
@@ -467,13 +461,8 @@ def _add_residuals(  # noqa: PLR0917
             gain = predicted.gain[row, column]
             if gain == 0:
                 continue
-            q, x, y = predicted.inverse_depth[row, column], lens.ideal[row, column, 0], lens.ideal[row, column, 1]
-            depth = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] + q * shift[2]
-            if not depth > 0:
-                continue
-            u = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] + q * shift[0]) / depth
-            v = (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] + q * shift[1]) / depth
-            u, v = imaged(lens, u, v)
+            q = predicted.inverse_depth[row, column]
+            u, v, _ = seen_at(lens, turn, shift, lens.ideal[row, column, 0], lens.ideal[row, column, 1], q)
             if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
                 continue
             i, j = min(int(u), width - 2), min(int(v), height - 2)

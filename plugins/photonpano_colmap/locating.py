@@ -24,7 +24,7 @@ from photonpano.geometry import Camera, camera_matrix, positions_of
 from photonpano.locating import view_of
 from photonpano_colmap.exposures import Image, PosedExposure, posed, projected
 from photonpano_colmap.reconstruction import without_gauge
-from photonpano_poses import Lens, between, imaged, lens_of
+from photonpano_poses import Lens, between, lens_of, sampled, seen_at
 
 _BLUR_PX = 1.0  # standard deviation of the blur against photon noise
 _HALF = 9  # patches have 19 x 19 pixels, with Gaussian weights
@@ -148,12 +148,9 @@ def _find(  # noqa: PLR0913, PLR0917
             for i in range(-_HALF, _HALF + 1):
                 q_there = q + q_x * i + q_y * j
                 ideal = lens.ideal[int(y) + j, int(x) + i]
-                depth = turn[2, 0] * ideal[0] + turn[2, 1] * ideal[1] + turn[2, 2] + q_there * shift[2]
-                values[n] = _sample(template, x + i, y + j)
+                us[n], vs[n], depth = seen_at(lens, turn, shift, ideal[0], ideal[1], q_there)
+                values[n] = sampled(template, x + i, y + j)
                 known = known and depth > 0 and np.isfinite(values[n])
-                u = (turn[0, 0] * ideal[0] + turn[0, 1] * ideal[1] + turn[0, 2] + q_there * shift[0]) / depth
-                v = (turn[1, 0] * ideal[0] + turn[1, 1] * ideal[1] + turn[1, 2] + q_there * shift[1]) / depth
-                us[n], vs[n] = imaged(lens, u, v)
                 weights[n] = np.exp(-(i * i + j * j) / (2 * (0.6 * _HALF) ** 2))
                 weight += weights[n]
                 n += 1
@@ -164,9 +161,9 @@ def _find(  # noqa: PLR0913, PLR0917
             mean = 0.0
             for t in range(size):
                 at_u, at_v = us[t] + u, vs[t] + v
-                along_x[t] = 0.5 * (_sample(image, at_u + 1, at_v) - _sample(image, at_u - 1, at_v))
-                along_y[t] = 0.5 * (_sample(image, at_u, at_v + 1) - _sample(image, at_u, at_v - 1))
-                residuals[t] = _sample(image, at_u, at_v) - values[t]
+                along_x[t] = 0.5 * (sampled(image, at_u + 1, at_v) - sampled(image, at_u - 1, at_v))
+                along_y[t] = 0.5 * (sampled(image, at_u, at_v + 1) - sampled(image, at_u, at_v - 1))
+                residuals[t] = sampled(image, at_u, at_v) - values[t]
                 mean += weights[t] * residuals[t]
             mean /= weight
             xx, xy, yy, gx, gy, squares = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -195,18 +192,6 @@ def _find(  # noqa: PLR0913, PLR0917
                 hessian[k, 0, 1] = hessian[k, 1, 0] = xy
                 chi_square[k] = squares / weight
                 break
-
-
-@compiled
-def _sample(image: Image, x: float, y: float) -> float:
-    """Return an image at a place, interpolated bilinearly; NaN outside."""
-    height, width = image.shape
-    if not (0 <= x < width - 1 and 0 <= y < height - 1):
-        return np.nan
-    i, j = int(x), int(y)
-    a, b = x - i, y - j
-    upper = (1 - a) * image[j, i] + a * image[j, i + 1]
-    return float((1 - b) * upper + b * ((1 - a) * image[j + 1, i] + a * image[j + 1, i + 1]))
 
 
 _ROBUST = 2.0  # scale of the Cauchy loss, in standard deviations

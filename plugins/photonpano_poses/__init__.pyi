@@ -20,3 +20,5 @@ from .views import Lens as Lens
 from .views import between as between
 from .views import imaged as imaged
 from .views import lens_of as lens_of
+from .views import sampled as sampled
+from .views import seen_at as seen_at

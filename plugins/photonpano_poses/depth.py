@@ -26,7 +26,7 @@ from photonpano.compiling import compiled
 from photonpano.geometry import Camera
 from photonpano.locating import view_of
 from photonpano_poses.contract import DepthMap, PosedView, PoseEstimate
-from photonpano_poses.views import Lens, between, imaged, lens_of
+from photonpano_poses.views import Lens, between, imaged, lens_of, sampled, seen_at
 
 Image = NDArray[np.float32]
 
@@ -37,6 +37,7 @@ _BLUR_PX = 1.0  # standard deviation of the blur against photon noise
 _STEP_PX = 0.5  # parallax from one inverse depth to the next, root mean square
 _FEWEST, _MOST = 48, 128  # inverse depths
 _BEYOND = 0.005  # share of the points that may be nearer, or farther, than the inverse depths reach
+_WIDER = 0.4  # share by which the inverse depths reach beyond the points: what has no texture has none
 _LEAST_POINTS = 8
 # Deviances of neighbours whose inverse depths differ by one step, and by more; the latter falls across edges of the flux.
 _SLOPED, _BROKEN = 2.0, 12.0
@@ -106,7 +107,7 @@ def _depth_of(key: int, seen: _Seen, estimate: PoseEstimate, camera: Camera, sha
     if len(ahead) < _LEAST_POINTS:
         return None
     low, high = np.quantile(1 / ahead, [_BEYOND, 1 - _BEYOND])
-    low, high = 0.6 * low, 1.4 * high
+    low, high = (1 - _WIDER) * low, (1 + _WIDER) * high
     middle = float(np.median(1 / ahead))
     others = _others(key, views, camera, shape, middle)
     if len(others) < _LEAST_SEEN:
@@ -161,19 +162,6 @@ def _others(key: int, views: Sequence[PosedView], camera: Camera, shape: tuple[i
 
 
 @compiled
-def _sampled(image: Image, x: float, y: float) -> float:
-    """Return an image at a place, interpolated bilinearly; NaN outside."""
-    height, width = image.shape
-    if not (0 <= x < width - 1 and 0 <= y < height - 1):
-        return np.nan
-    i, j = int(x), int(y)
-    a, b = np.float32(x - i), np.float32(y - j)
-    one = np.float32(1)
-    upper = (one - a) * image[j, i] + a * image[j, i + 1]
-    return float((one - b) * upper + b * ((one - a) * image[j + 1, i] + a * image[j + 1, i + 1]))
-
-
-@compiled
 def _sweep(  # noqa: PLR0913, PLR0917
     images: Image,
     weights: Image,
@@ -207,7 +195,7 @@ def _sweep(  # noqa: PLR0913, PLR0917
                     if not depth > 0:
                         continue
                     u, w = imaged(lens, (a + steps[d] * shift[0]) / depth, (b + steps[d] * shift[1]) / depth)
-                    value = _sampled(image, u, w)
+                    value = sampled(image, u, w)
                     if value == value:
                         side[0, d] += 1
                         side[1, d] += weight
@@ -317,14 +305,8 @@ def _predict(  # noqa: PLR0917
             px, py, q = lens.ideal[y, x, 0], lens.ideal[y, x, 1], inverse_depth[y, x]
             total, weight = 0.0, 0.0
             for v in range(len(images)):
-                turn, shift = turns[v], shifts[v]
-                depth = turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] + q * shift[2]
-                if not depth > 0:
-                    continue
-                u = (turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] + q * shift[0]) / depth
-                w = (turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] + q * shift[1]) / depth
-                u, w = imaged(lens, u, w)
-                value = _sampled(images[v], u, w)
+                u, w, _ = seen_at(lens, turns[v], shifts[v], px, py, q)
+                value = sampled(images[v], u, w)
                 if value == value:
                     total += weights[v] * value
                     weight += weights[v]
@@ -371,13 +353,7 @@ def _confirm(  # noqa: PLR0917
             q = inverse_depth[y, x]
             if confirmed[y, x] or not q > 0:
                 continue
-            px, py = lens.ideal[y, x, 0], lens.ideal[y, x, 1]
-            depth = turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] + q * shift[2]
-            if not depth > 0:
-                continue
-            u = (turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] + q * shift[0]) / depth
-            v = (turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] + q * shift[1]) / depth
-            u, v = imaged(lens, u, v)
+            u, v, depth = seen_at(lens, turn, shift, lens.ideal[y, x, 0], lens.ideal[y, x, 1], q)
             if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
                 continue
             i, j = int(u + 0.5), int(v + 0.5)

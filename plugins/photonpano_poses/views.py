@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonpano import FloatArray
 from photonpano.compiling import compiled
@@ -58,6 +59,35 @@ def imaged(lens: Lens, x: float, y: float) -> tuple[float, float]:
     across = a * radial + 2 * p1 * a * b + p2 * (square + 2 * a * a)
     down = b * radial + p1 * (square + 2 * b * b) + 2 * p2 * a * b
     return lens.focal * across + lens.centre[0], lens.focal * down + lens.centre[1]
+
+
+@compiled
+def seen_at(  # noqa: PLR0917
+    lens: Lens, turn: FloatArray, shift: FloatArray, x: float, y: float, inverse_depth: float
+) -> tuple[float, float, float]:
+    """Return the pixel of another view that sees what an ideal pixel sees, NaN if none does, and how deep that lies there.
+
+    `turn` and `shift` are those of `between`. The depth there is relative to the depth here.
+    """
+    depth = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] + inverse_depth * shift[2]
+    if not depth > 0:
+        return np.nan, np.nan, depth
+    across = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] + inverse_depth * shift[0]
+    down = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] + inverse_depth * shift[1]
+    u, v = imaged(lens, across / depth, down / depth)
+    return u, v, depth
+
+
+@compiled
+def sampled(image: NDArray[np.float32], x: float, y: float) -> float:
+    """Return an image at a place, interpolated bilinearly; NaN outside."""
+    height, width = image.shape
+    if not (0 <= x < width - 1 and 0 <= y < height - 1):
+        return np.nan
+    i, j = int(x), int(y)
+    a, b = x - i, y - j
+    upper = (1 - a) * image[j, i] + a * image[j, i + 1]
+    return float((1 - b) * upper + b * ((1 - a) * image[j + 1, i] + a * image[j + 1, i + 1]))
 
 
 def between(pose: FloatArray, other: FloatArray, camera_matrix: FloatArray) -> tuple[FloatArray, FloatArray]:

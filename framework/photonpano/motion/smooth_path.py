@@ -19,7 +19,6 @@ from photonpano.compiling import compiled
 from photonpano.contracts.protocols import Source
 from photonpano.errors import LocationError
 from photonpano.execution.context import Context
-from photonpano.geometry import translation
 from photonpano.merging import binning_of
 from photonpano.motion.velocity import Images, halved, span_means, structure_of
 from photonpano.values import FloatArray
@@ -49,11 +48,14 @@ class SmoothPath:
 
     def at(self, frame_indices: ArrayLike) -> FloatArray:
         """Return the homographies of N instants, in frames, to the reference frame: (N, 3, 3)."""
-        shifts = np.atleast_2d(self._shifts(frame_indices) - self._at_reference)
-        return np.array([translation(*each) for each in shifts])
+        shifts = self._shifts(frame_indices) - self._at_reference
+        homographies = np.tile(np.eye(3), (len(shifts), 1, 1))
+        homographies[:, :2, 2] = shifts
+        return homographies
 
     def _shifts(self, instants: ArrayLike) -> FloatArray:
-        return np.asarray(_basis((np.asarray(instants, np.float64) + 0.5) / self._n_frames, len(self._knots)) @ self._knots)
+        shares = (np.atleast_1d(np.asarray(instants, np.float64)) + 0.5) / self._n_frames
+        return np.asarray(BSpline(_ends(len(self._knots)), self._knots, 3)(np.clip(shares, 0, 1)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,8 +213,11 @@ def _placed(image: Images, shift: FloatArray, merged: Images) -> tuple[int, int,
     return top, left, ((b * a), b * (1 - a), (1 - b) * a, (1 - b) * (1 - a))
 
 
-def _basis(instants: ArrayLike, count: int) -> FloatArray:
+def _basis(instants: FloatArray, count: int) -> FloatArray:
     """Return the weights of the knots of a cubic spline at N instants, as shares of the capture: (N, count)."""
-    at = np.clip(np.atleast_1d(instants), 0, 1)
-    ends = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
-    return np.asarray(BSpline.design_matrix(at, ends, 3).toarray())
+    return np.asarray(BSpline.design_matrix(instants, _ends(count), 3).toarray())
+
+
+def _ends(count: int) -> FloatArray:
+    """Return where the pieces of a cubic spline with some knots end, as shares of the capture."""
+    return np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])

@@ -36,7 +36,7 @@ from photonpano.photometry import balanced, picture_of
 from photonpano.pipeline.components import built, stage_context
 from photonpano.pipeline.run_folder import RunFolder
 from photonpano.plugins.contributions import ExporterContribution, RendererContribution
-from photonpano.record.contents import HALVES, MAPS, name_of_capture
+from photonpano.record.contents import HALVES, name_of_capture
 from photonpano.residuals.detail import Detail
 from photonpano.residuals.halves import detail_between, halves_in_time, reduced
 from photonpano.specs.plan import Plan
@@ -224,7 +224,9 @@ class StoredPanorama:
     @classmethod
     def of(cls, folder: Path, panorama: RenderedPanorama, capture: str = "") -> StoredPanorama:
         """Open the maps of a panorama in a folder."""
-        flux, weight, std = (tifffile.memmap(folder / name, mode="r") for name in list(MAPS)[:3])
+        flux, weight, std = (
+            tifffile.memmap(folder / name, mode="r") for name in ("panorama.tiff", "coverage.tiff", "panorama-std.tiff")
+        )
         canvas, noise = panorama.canvas, panorama.dynamic_range.noise
         return cls(
             flux=flux,
