@@ -55,7 +55,7 @@ def test_path_is_found_within_its_error_from_a_few_photons_a_frame(stars: Callab
     np.testing.assert_allclose(homographies[REFERENCE], np.eye(3), atol=1e-12)
     apart = homographies[:, :2, 2] + shifts
     error_px = float(np.sqrt(((apart - apart.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    assert error_px < 1
+    assert error_px < 0.2
     assert 0.6 * error_px < path.std_px < 1.7 * error_px
 
 
