@@ -59,15 +59,15 @@ def pictures(source: Source, spans: Sequence[FrameSpan], style: Style, threads: 
     return in_order(picture, spans, threads)
 
 
-def still_exposure(source: Source, span: FrameSpan) -> FluxImage:
-    """Return the flux of the sum of some frames, without motion: (H, W), or (H, W, 3) in colour; NaN where masked."""
-    still = Chunk(span, np.eye(3))
-    if len(span) == 1:
+def still_exposure(source: Source, *spans: FrameSpan) -> FluxImage:
+    """Return the flux of the sum of spans of frames, without motion: (H, W), or (H, W, 3) in colour; NaN where masked."""
+    still = [Chunk(span, np.eye(3)) for span in spans]
+    if sum(map(len, spans)) == 1:
         # In dimmer light, it has less than the frame of mean light that a flux needs.
         source = replace(capture_of(source), light=None)
 
     def merged(each: Source) -> Panorama:
-        photons = accumulate(each, [still], np.eye(3), each.info.frame_shape)
+        photons = accumulate(each, still, np.eye(3), each.info.frame_shape)
         return Panorama(*photons.estimate(each.response), np.eye(3))
 
     return composed(in_colours(source, merged), source).flux

@@ -37,6 +37,8 @@ TINT = "#ff3d9a"  # over what hides the background; its opacity, and that of its
 _OPACITY, _OUTLINE = 80, 255
 VIEW_PIXELS = 1000  # longer side of the pictures of one instant
 _INSTANTS = 600  # number of frames whose outline is on the page
+# Of a long capture, the average is of spans all over it: so many that one lies less than a pixel from the next on most paths.
+_AVERAGED, _AVERAGED_FRAMES = 2000, 10
 
 
 def viewer_data(
@@ -217,12 +219,13 @@ def views_of_instant(
         return np.asarray(moved[:2] / moved[2])
 
     itself = on(to_frame, pixels)
-    whole = source.info.span
+    averaged = source.info.spread(_AVERAGED, _AVERAGED_FRAMES)
     alone = still_exposure(source, FrameSpan(frame, frame + 1))
     alone *= panorama.white_flux / (float(np.nanmax(alone, initial=0)) or 1.0)  # a lit pixel of a binary frame is white
+    among = "all frames" if len(averaged) == 1 else f"{sum(map(len, averaged)):,} frames of all over the capture"
     found = [
         view("One frame", f"frame {frame:,}", alone, itself, sharp=True),
-        view("Plain average", f"all {len(whole):,} frames, without motion", still_exposure(source, whole), itself),
+        view("Plain average", f"{among}, without motion", still_exposure(source, *averaged), itself),
     ]
     for result in levels:
         index = int(np.flatnonzero(result.located.solution.located)[np.abs(result.located.instants - frame).argmin()])
