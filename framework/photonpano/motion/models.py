@@ -104,7 +104,7 @@ class MotionModel:
     def turning_camera(self, frame_shape: tuple[int, int]) -> Camera | None:
         """Return the camera that locators may use: one that only turns, of a focal length that is given or was found."""
         if self.known is None and self.focal_px is None:
-            if self.kind != "auto":
+            if self.kind not in ("auto", "translation", "euclidean"):
                 return None
             middle = (frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2
             return Camera(camera_matrix(_FAR_FOCAL * max(frame_shape), middle))

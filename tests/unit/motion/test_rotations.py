@@ -310,5 +310,12 @@ def test_locators_get_the_camera_in_px_of_exposures_once_its_focal_length_is_kno
         found = level.turning(model.turning_camera(shape))
         np.testing.assert_allclose(found.locators[0].component.matrix, [[200, 0, 39.5], [0, 200, 31.5], [0, 0, 1]])
         assert found.locators[1] is level.locators[1]
-    for unknown in (MotionModel(kind="rotation"), MotionModel(kind="homography", focal_px=400.0)):
+    for unknown in (MotionModel(kind="rotation"), MotionModel(kind="homography", focal_px=400.0), MotionModel(kind="affine")):
         assert level.turning(unknown.turning_camera(shape)) is level
+
+
+@pytest.mark.parametrize("kind", ["auto", "translation", "euclidean"])
+def test_locators_may_shift_and_roll_the_image_where_no_model_denies_it(make_level: Callable, kind: ModelName) -> None:
+    """Where little light leaves eight numbers of a pair uncertain, its shift and roll are those of a camera far away."""
+    found = make_level(motion=None, locator=_Turning()).turning(MotionModel(kind=kind).turning_camera((128, 160)))
+    assert found.locators[0].component.matrix[0, 0] > 1000 * 160
