@@ -97,8 +97,6 @@ class Aligned:
             self.template,
             self.buffers,
             self.homography,
-            pixels=self.pixels,
-            weights=self.weights,
             noise_ratio=noise_ratio,
             coordinates=_coordinates(shape),
         )

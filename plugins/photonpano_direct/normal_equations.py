@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -428,13 +429,26 @@ def expected_px(information: FloatArray, basis: FloatArray, to_corners: FloatArr
     return float(np.sqrt(squares / 4))
 
 
+_AROUND = 2.0  # standard deviation of the Gaussian within which residuals are averaged, in that of the blur
+
+
+def _local_noise(buffers: Buffers, blur_px: float) -> Image:
+    """Return the mean squared residual around each pixel, over that of all that both images see, weighted: (H, W).
+
+    In the dark, pixels hold less than a photon, and no scale makes noise uniform: a star is noisier than the sky around it.
+    """
+    seen = (buffers.weight > 0).astype(np.float32)
+    squares = seen * np.square(buffers.residual)
+    usual = np.vdot(buffers.weight, squares) / np.count_nonzero(seen)
+    around, share = (cv2.GaussianBlur(each, (0, 0), _AROUND * blur_px) for each in (squares, seen))
+    return np.asarray(around / np.maximum(share * usual, np.float32(1e-20)), np.float32)
+
+
 def information_of(
     moving: Layer,
     buffers: Buffers,
     homography: Homography,
     *,
-    pixels: int,
-    weights: float,
     noise_ratio: float,
     coordinates: Coordinates,
 ) -> tuple[FloatArray, float, float]:
@@ -444,11 +458,12 @@ def information_of(
     buffers come from `residuals_and_moments`, and all are overwritten. `noise_ratio` is the mean squared residual relative to
     that of photon noise.
     """
+    pixels, noise = np.count_nonzero(buffers.weight), _local_noise(buffers, moving.blur_px)
     _, hessian, common = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
-    # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights and positions
-    # hardly change within the blur, so M needs only blurred gradients.
+    # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights, noise and
+    # positions hardly change within the blur, so M needs only blurred gradients.
     np.multiply(buffers.weight, buffers.weight, out=buffers.weight)
-    np.multiply(buffers.weight, np.float32(pixels / weights), out=buffers.weight)
+    np.multiply(buffers.weight, noise, out=buffers.weight)
     scatter, root = _hessian(moving.smoothed, moving.smoothed, buffers.weight), np.zeros((8, 8))
     if not _cholesky(scatter, root):
         return PRIOR.copy(), np.inf, 0.0

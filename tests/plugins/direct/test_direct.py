@@ -23,7 +23,7 @@ from photonpano.geometry import (
     transform_points,
     translation,
 )
-from photonpano.locating import NO_TEXTURE, NOTHING_SEEN
+from photonpano.locating import NO_TEXTURE, NOTHING_SEEN, turn_slopes
 from photonpano.photometry import BinaryResponse, IntensityResponse
 from photonpano_direct.hooks import DirectConfig
 from photonpano_direct.locator import DirectLocator
@@ -85,6 +85,27 @@ def test_structure_in_one_per_cent_of_the_frame_is_found_and_gradients_alone_are
         assert isinstance(
             register(photographed(sky, 2 * n), photographed(sky[::-1].copy() if n % 2 else sky, 2 * n + 1), STILL), NotLocated
         )
+
+
+def test_information_of_few_stars_predicts_scatter_though_no_scale_makes_their_noise_uniform() -> None:
+    """A pixel of the sky holds 0.005 photons, and one of a star up to 5: pairs of the sky alone would say much less noise."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    stars = sum(
+        np.exp(-((x - left) ** 2 + (y - top) ** 2) / (2 * 1.5**2))
+        for left, top in ((60, 50), (170, 40), (100, 120), (190, 110))
+    )
+    sky, camera, squares = 5e-5 + 0.05 * np.asarray(stars), Camera.of(1e6, SHAPE).matrix, list[float]()
+    locator = LOCATOR.turning(camera)
+    for seed in range(24):
+        moving, fixed = (locator.describe(photographed(sky, 2 * seed + each)) for each in (0, 1))
+        located = locator.register(moving, fixed, translation(0.3, -0.2))
+        assert isinstance(located, Located), located
+        assert located.information is not None
+        moves, middle = turn_slopes(located.homography, camera), corners(SHAPE).mean(axis=0)[None]
+        covariance = moves @ np.linalg.inv(moves.T @ located.information @ moves) @ moves.T
+        to_middle, away = jacobian(located.homography, middle)[0], (transform_points(located.homography, middle) - middle)[0]
+        squares.append(float(away @ np.linalg.inv(to_middle @ covariance @ to_middle.T) @ away) / 2)
+    assert 0.5 < np.mean(squares) < 2
 
 
 def test_direct_reaches_cramer_rao_bound_within_40_percent(seen_from: Callable, street: np.ndarray, bounds: ModuleType) -> None:
