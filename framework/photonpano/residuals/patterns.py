@@ -16,6 +16,7 @@ from photonpano.values import FloatArray, FluxImage
 _INSTANTS = 64  # instants of the motion at which the effect of a lens is computed
 _SIGNIFICANT = 4.0  # standard deviations by which the scatter must exceed that of noise
 _SMALLEST_PX = 0.02  # shaking by less than this stays within spans
+_TOLD = 1e-3  # least share of what rows tell of their shift that is of a step
 _FREQUENCIES = 256  # at which the spectrum is computed, up to half a cycle per frame
 
 
@@ -102,33 +103,54 @@ class PartsApart(NamedTuple):
     sigmas: float
 
 
-def parts_apart(slopes: FluxImage) -> list[PartsApart]:
-    """Return how far odd rows lie beside even ones, and one half of the sensor beside the other, the same of columns.
+def parts_apart(slopes: FluxImage) -> PartsApart | None:
+    """Return the parts of the sensor that lie beside each other most clearly; None where nothing shows it.
 
-    Each row has a shift of its own, along x and along y, by the slopes (4, H, W) of its pixels. What a cubic polynomial over
-    the rows explains, such as a rolling shutter, is no difference of parts.
+    They are odd rows and even ones, or rows and those before them, or columns; in the whole frame, or in a half of it, as
+    where one quadrant is late. Each row has a shift of its own, along x and along y, by the slopes (4, H, W) of its pixels.
     """
-    found = []
-    for axis, (line, halves) in enumerate(
-        (("rows", "the upper and the lower half"), ("columns", "the left and the right half"))
-    ):
-        lines = np.asarray(slopes, np.float64).sum(axis=2 - axis)
-        number = lines.shape[1]
-        at, odd = np.linspace(-1, 1, number), np.arange(number) % 2 - 0.5
-        columns = np.stack([*(at**power for power in range(4)), odd, np.sign(at) / 2], axis=1)
-        for information, right in (lines[:2], lines[2:]):
-            normal = columns.T @ (information[:, None] * columns)
-            if np.linalg.matrix_rank(normal) < len(normal):
-                continue
-            covariance = np.linalg.inv(normal)
-            away = covariance @ columns.T @ right
-            shifts = np.divide(right, information, out=np.zeros(number), where=information > 0)
-            # Along a pan, a row sees the same edges all the time, at the same fraction of a pixel: rows scatter beyond noise.
-            scatter = (information * (shifts - columns @ away) ** 2).sum() / max(np.count_nonzero(information) - len(away), 1)
-            std = np.sqrt(np.diag(covariance) * max(1.0, float(scatter)))
-            for part, index in ((f"odd and even {line}", -2), (halves, -1)):
-                found.append(PartsApart(part, abs(float(away[index])), abs(float(away[index] / std[index]))))
-    return found
+    found = list[PartsApart]()
+    for lines, of_lines, across in (("rows", slopes, "columns"), ("columns", slopes.swapaxes(1, 2), "rows")):
+        length = of_lines.shape[2]
+        for first, last, place in (
+            (0, length, ""),
+            (0, length // 2, f", in {across} 0 to {length // 2 - 1}"),
+            (length // 2, length, f", in {across} {length // 2} to {length - 1}"),
+        ):
+            sums = np.asarray(of_lines[:, :, first:last], np.float64).sum(axis=2)
+            for information, right in (sums[:2], sums[2:]):
+                found += _lines_apart(information, right, lines, place)
+    return max(found, key=lambda each: each.sigmas, default=None)
+
+
+def _lines_apart(information: FloatArray, right: FloatArray, lines: str, place: str) -> list[PartsApart]:
+    """Return how far odd lines lie beside even ones, and those from one on beside those before it, where that is farthest.
+
+    What a cubic polynomial over the lines explains, such as a rolling shutter, is no difference of parts.
+    """
+    number = len(information)
+    every, at = np.arange(number), np.linspace(-1, 1, number)
+    smooth = np.stack([*(at**power for power in range(4)), every % 2 - 0.5], axis=1)
+    normal = smooth.T @ (information[:, None] * smooth)
+    if np.linalg.matrix_rank(normal) < len(normal):
+        return []
+    steps = (every[:, None] > every[:-1]) - 0.5
+    beyond = steps - smooth @ np.linalg.solve(normal, smooth.T @ (information[:, None] * steps))
+    known = information @ beyond**2
+    told = np.divide((beyond.T @ right) ** 2, known, out=np.zeros(number - 1), where=known > _TOLD * information.sum())
+    first = int(told.argmax()) + 1
+    columns = np.column_stack([smooth, steps[:, first - 1]])
+    covariance = np.linalg.pinv(columns.T @ (information[:, None] * columns))
+    away = covariance @ columns.T @ right
+    shifts = np.divide(right, information, out=np.zeros(number), where=information > 0)
+    # Along a pan, a row sees the same edges all the time, at the same fraction of a pixel: rows scatter beyond noise.
+    scatter = (information * (shifts - columns @ away) ** 2).sum() / max(np.count_nonzero(information) - len(away), 1)
+    std = np.sqrt(np.diag(covariance) * max(1.0, float(scatter)))
+    parts = f"odd and even {lines}", f"{lines} 0 to {first - 1} and {lines} {first} to {number - 1}"
+    return [
+        PartsApart(f"{part}{place}", abs(float(away[index])), abs(float(away[index] / std[index])))
+        for part, index in zip(parts, (-2, -1), strict=True)
+    ]
 
 
 def deformation_px(shifts: FloatArray, information: FloatArray) -> float | None:

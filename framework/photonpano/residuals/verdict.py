@@ -80,6 +80,19 @@ def _untested_motion(run: TestedRun) -> Found:
 
 
 @FACTS.doubtful_above(
+    0.2,
+    "parts of the sensor see the scene at different places, so that the panorama is torn",
+    "read the frames in the order of the sensor's rows and halves, or keep one part (corrections: crop)",
+)
+def _parts(run: TestedRun) -> Found | None:
+    """As where rows take turns, or a part of the sensor is read out some frames later than the rest."""
+    apart = parts_apart(run.explained.residuals.pixel_slopes)
+    if apart is None or apart.sigmas <= _SURE_SIGMAS or run.findings.rival_motion is not None:  # that of a thing in the frame
+        return None
+    return Found(apart.px, f"px between {apart.parts}")
+
+
+@FACTS.doubtful_above(
     10,
     "the photons contradict the focal length or the lens that the spec gives",
     "write camera: {focal_px: find}, and distortion: {k1: find} if the lens distorts, or calibrate the camera anew",
@@ -114,25 +127,13 @@ def _narrow(run: TestedRun) -> Found | None:
 )
 def _lens(run: TestedRun) -> Found | None:
     found = run.explained.lens
-    if found is None:
+    if found is None or _parts.judged(run):  # a part that lies apart bends frames, too
         return None
     camera, what_to_do = run.explained.motion.camera, run.freer_model
     if camera is not None:
         distortion = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
         what_to_do = f"{distortion}; or {_WITHOUT_LENS}"
     return Found(abs(found.k1), f"about {found.k1:.1%} at the corners", what_to_do=what_to_do)
-
-
-@FACTS.doubtful_above(
-    0.2,
-    "parts of the sensor see the scene at different places, so that the panorama is torn",
-    "read the frames in the order of the sensor's rows and halves, or keep one part (corrections: crop)",
-)
-def _parts(run: TestedRun) -> Found | None:
-    """As where rows take turns, or a half of the sensor is read out some frames later than the other."""
-    apart = [each for each in parts_apart(run.explained.residuals.pixel_slopes) if each.sigmas > _SURE_SIGMAS]
-    farthest = max(apart, key=lambda each: each.px, default=None)
-    return farthest and Found(farthest.px, f"px between {farthest.parts}")
 
 
 @FACTS.doubtful_above(
@@ -147,7 +148,7 @@ def _uncertain(run: TestedRun) -> Found | None:
     if not len(known) or not np.isfinite(known).all():
         alone = Found(0.0, "a single exposure was located", doubtful=True, what="no motion is known")
         return None if of_either_part(run) else alone._replace(what_to_do="use smaller groups, or more light")
-    if _narrow.judged(run):  # its distance is in the expected error
+    if _narrow.judged(run) or _parts.judged(run):  # their distance is in the expected error
         return None
     for found in (_two_motions(run), _uncut_jump(run), _ambiguous(run), _one_direction(run)):
         if found is not None and found.figure > _UNCERTAIN_PX:
@@ -187,6 +188,11 @@ def _ambiguous(run: TestedRun) -> Found | None:
 def second_place_px(run: TestedRun) -> float:
     """Return how far away the second place of a scene that repeats is, in px; 0 where pairs fit at one place."""
     return 0.0 if (found := _ambiguous(run)) is None else found.figure
+
+
+def parts_px(run: TestedRun) -> float:
+    """Return how far apart parts of the sensor lie, in px; 0 where none does."""
+    return 0.0 if (reason := _parts.judged(run)) is None else reason.figure
 
 
 def _one_direction(run: TestedRun) -> Found | None:

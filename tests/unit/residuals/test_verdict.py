@@ -149,8 +149,10 @@ def test_what_residuals_show_is_a_note_and_the_cause_of_a_doubt(
     [
         (lambda y, _: 0.5 * (y % 2), "0.5 px between odd and even rows"),
         (lambda _, x: 0.5 * (x % 2), "0.5 px between odd and even columns"),
-        (lambda y, _: 0.5 * (y >= 64), "0.5 px between the upper and the lower half"),
-        (lambda _, x: 0.5 * (x < 96), "0.5 px between the left and the right half"),
+        (lambda y, _: 0.5 * (y >= 64), "0.5 px between rows 0 to 63 and rows 64 to 127"),
+        (lambda _, x: 0.5 * (x < 40), "0.5 px between columns 0 to 39 and columns 40 to 191"),
+        (lambda y, x: 0.5 * (y < 64) * (x >= 96), "0.5 px between columns 0 to 95 and columns 96 to 191, in rows 0 to 63"),
+        (lambda y, x: 0.5 * (y % 2) * (x >= 96), "0.5 px between odd and even rows, in columns 96 to 191"),
         (lambda y, _: y / 20 - (y / 40) ** 2, ""),  # a rolling shutter
         (lambda y, _: 0.1 * (y % 2), ""),
     ],
