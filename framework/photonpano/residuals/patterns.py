@@ -134,12 +134,14 @@ def _lines_apart(information: FloatArray, right: FloatArray, lines: str, place: 
     normal = smooth.T @ (information[:, None] * smooth)
     if np.linalg.matrix_rank(normal) < len(normal):
         return []
-    steps = (every[:, None] > every[:-1]) - 0.5
-    beyond = steps - smooth @ np.linalg.solve(normal, smooth.T @ (information[:, None] * steps))
-    known = information @ beyond**2
-    told = np.divide((beyond.T @ right) ** 2, known, out=np.zeros(number - 1), where=known > _TOLD * information.sum())
+    # Products with steps of 1 at each line, in the order of their first lines.
+    sums = np.cumsum(np.column_stack([information[:, None] * smooth, right])[::-1], axis=0)[::-1]
+    by_smooth, by_right = np.split(sums[1:] - sums[0] / 2, [-1], axis=1)
+    beyond = by_smooth @ np.linalg.inv(normal)
+    left, known = by_right[:, 0] - beyond @ smooth.T @ right, information.sum() / 4 - (beyond * by_smooth).sum(axis=1)
+    told = np.divide(left**2, known, out=np.zeros(number - 1), where=known > _TOLD * information.sum())
     first = int(told.argmax()) + 1
-    columns = np.column_stack([smooth, steps[:, first - 1]])
+    columns = np.column_stack([smooth, (every >= first) - 0.5])
     covariance = np.linalg.pinv(columns.T @ (information[:, None] * columns))
     away = covariance @ columns.T @ right
     shifts = np.divide(right, information, out=np.zeros(number), where=information > 0)
