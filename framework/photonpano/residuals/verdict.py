@@ -153,12 +153,17 @@ def _uncertain(run: TestedRun) -> Found | None:
     for found in (_two_motions(run), _uncut_jump(run), _ambiguous(run), _one_direction(run)):
         if found is not None and found.figure > _UNCERTAIN_PX:
             return found
+    beside_px = float(known.mean())
+    if levels:  # a long path bends, which neither blurs nor tears a panorama
+        located = levels[-1].located
+        assessed = min(float(np.mean(located.std_px**2) / np.mean(known**2)), 1.0)
+        beside_px *= float(np.sqrt(1 - located.drift_share * assessed))
     where = f"px on average, most at frame {np.argmax(np.where(motion.located, motion.std_px, 0))}"
     change_px = levels[-1].change_px if levels else None
     if change_px is not None and change_px > _UNCERTAIN_PX:
         where += f"; the last level changed the motion by {change_px:.2g} px"
-        return Found(float(known.mean()), where, what_to_do="let it converge: use smaller groups, or levels: until-converged")
-    return Found(float(known.mean()), where)
+        return Found(beside_px, where, what_to_do="let it converge: use smaller groups, or levels: until-converged")
+    return Found(beside_px, where)
 
 
 def _two_motions(run: TestedRun) -> Found | None:

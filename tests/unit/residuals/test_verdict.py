@@ -257,6 +257,7 @@ def level_with(
     n_ambiguous: int = 0,
     motion: Located = UNINFORMED,
     change_px: float | None = None,
+    drift_share: float = 0.0,
     **of_solution: object,
 ) -> Any:
     """A level of 30 pairs."""
@@ -272,12 +273,27 @@ def level_with(
     }
     solution = SimpleNamespace(**known | of_solution)
     edges = (Edge(1, 0, motion),) * 30
-    located = SimpleNamespace(ambiguity=ambiguity, rivals=rivals or {}, edges=edges, solution=solution, frame_shape=SHAPE)
+    located = SimpleNamespace(
+        ambiguity=ambiguity,
+        rivals=rivals or {},
+        edges=edges,
+        solution=solution,
+        frame_shape=SHAPE,
+        std_px=np.full(31, 4.0),
+        drift_share=drift_share,
+    )
     level = SimpleNamespace(
         level=SimpleNamespace(number=1), located=located, change_px=change_px, uncertainty=SimpleNamespace(mean_px=1.0)
     )
     level.narrow = LevelResult.narrow.fget(level)
     return level
+
+
+@pytest.mark.parametrize(("drift_share", "doubtful"), [(0.0, True), (0.96, False)])
+def test_bend_of_a_long_path_is_trusted(explained: Explained, drift_share: float, doubtful: bool) -> None:
+    motion = replace(explained.motion, std_px=np.where(explained.motion.located, 4.0, np.inf))
+    verdict = judge(replace(explained, motion=motion), [level_with(drift_share=drift_share)])
+    assert [reason.figure for reason in verdict.reasons] == [pytest.approx(4)] * doubtful
 
 
 @pytest.mark.parametrize(("times", "deviance", "doubtful"), [(9.0, 0.0, False), (2.0, 40.0, False), (9.0, 40.0, True)], ids=str)
