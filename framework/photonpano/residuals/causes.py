@@ -22,6 +22,7 @@ _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 
 FREE = "write motion: {model: homography}"  # what a spec says of a motion that may be any
 FIND_LENS = "camera: {distortion: {k1: find}}"  # what a spec says to measure the lens
+_FOLLOW = "use the refiner short-spans"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +38,11 @@ class TestedRun:
         """What to do if a planar model that was written may hold less than the motion; "" for those that hold any."""
         kind = self.levels[-1].located.solution.model.kind if self.levels else "homography"
         return "" if kind in ("homography", "rotation") else f"{FREE}, as {kind} may hold less than the motion"
+
+    @property
+    def followed(self) -> str:
+        """What to do about motion that is faster than groups where refiners have looked for it; "" where none did."""
+        return "use more light, or damp what shakes: the photons do not carry this motion" if self.explained.refinements else ""
 
 
 _Finder: TypeAlias = Callable[[TestedRun], Found | None]
@@ -74,25 +80,25 @@ def _never_seen(run: TestedRun) -> Found:
 @CAUSES.doubtful_above(
     2.0,
     "the image moves within groups by more than the motion that was found",
-    "use the refiner short-spans, or smaller groups (resample.with.group_size)",
+    _FOLLOW,
 )
 def _fast_motion(run: TestedRun) -> Found | None:
     if not np.isfinite(run.explained.ratio):
         return Found(np.nan, f"{len(run.explained.residuals.spans)} spans are too few: {FEWEST_SPANS} are needed")
-    return Found(run.explained.ratio, "scatter of the shifts of short spans over their noise")
+    return Found(run.explained.ratio, "scatter of the shifts of short spans over their noise", what_to_do=run.followed)
 
 
 @CAUSES.doubtful_above(
     0.1,
     "frames shake faster than the motion that was found can follow",
-    "use the refiner short-spans; if it was used, the photons do not carry this motion: use more light, or damp what shakes",
+    _FOLLOW,
 )
 def _shaking(run: TestedRun) -> Found | None:
     shaking, longest = run.explained.residuals.shaking, max(map(len, run.explained.residuals.spans))
     if longest < FEWEST_FRAMES and not np.isfinite(run.explained.ratio):  # spans of a frame or two show all shaking themselves
         return Found(np.nan, f"spans of {FEWEST_FRAMES} frames are needed")
     where = f"px within spans, most with a period of {shaking.period_frames:.3g} frames"
-    return Found(shaking.size_px, where) if shaking.size_px else None
+    return Found(shaking.size_px, where, what_to_do=run.followed) if shaking.size_px else None
 
 
 def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
@@ -107,8 +113,8 @@ def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
 @CAUSES.doubtful_above(
     0.03,
     "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
-    "mask what moves (corrections: mask), or divide by a flat field if the corners are dark (corrections: flat-field); the "
-    "motion may be that of the thing instead of the scene",
+    "divide by a flat field if the corners are dark (corrections: flat-field); the motion may be that of the thing instead of "
+    "the scene",
 )
 def _moving(run: TestedRun) -> Found | None:
     if run.explained.residuals.cell_count.max(initial=0) < _MIN_BLOCKS:
@@ -142,7 +148,7 @@ def _light(run: TestedRun) -> Found:
 @CAUSES.doubtful_above(
     0.03,
     "parts of the sensor count more or fewer photons than others, as with a vignette, dirt or a window in front of it",
-    "mask these pixels (corrections: mask), or divide by a flat field (corrections: flat-field)",
+    "look at the map of the sensor in the report",
 )
 def _sensor(run: TestedRun) -> Found | None:
     sums = run.explained.residuals.blocks
@@ -179,7 +185,7 @@ def _hot_pixels(run: TestedRun) -> Found:
 @CAUSES.doubtful_above(
     0.05,
     "frames are deformed as no motion of the whole frame explains",
-    "look at the arrows in the report; correct the lens or the rolling shutter before",
+    "look at the arrows in the report",
 )
 def _deformation(run: TestedRun) -> Found | None:
     size = deformation_px(*run.explained.residuals.block_shifts())
@@ -189,7 +195,7 @@ def _deformation(run: TestedRun) -> Found | None:
 @CAUSES.doubtful_above(
     0.1,
     "pairs of exposures contradict each other, as where a scene repeats",
-    "look at the path in the report; use a slower motion, or smaller groups",
+    "look at the path in the report",
 )
 def _contradictions(run: TestedRun) -> Found | None:
     if not run.levels:

@@ -114,7 +114,7 @@ def test_expected_error_corrects_overconfident_edges_only_with_loops(skips: tupl
 
 @pytest.mark.parametrize(("side_px", "share"), [(40, 1.0), (400, 0.66)])
 def test_bend_of_a_path_is_shared_by_exposures_that_see_the_same(side_px: int, share: float) -> None:
-    """99 steps of 10 px. Of x^2 from -1 to 1, 20 steps apart, half of the mean squared difference is 0.34 of the mean square."""
+    """Of x^2 from -1 to 1, 20 of 99 steps apart, half of the mean squared difference is 0.34 of the mean square."""
     rng, along = np.random.default_rng(0), np.linspace(-1, 1, 100)
     bent, alone = np.repeat(along[:, None, None] ** 2, 8, axis=1) * rng.normal(size=64), rng.normal(size=(100, 8, 64))
 
