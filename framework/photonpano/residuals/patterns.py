@@ -111,13 +111,11 @@ def parts_apart(slopes: FluxImage) -> PartsApart | None:
     """
     found = list[PartsApart]()
     for lines, of_lines, across in (("rows", slopes, "columns"), ("columns", slopes.swapaxes(1, 2), "rows")):
-        length = of_lines.shape[2]
-        for first, last, place in (
-            (0, length, ""),
-            (0, length // 2, f", in {across} 0 to {length // 2 - 1}"),
-            (length // 2, length, f", in {across} {length // 2} to {length - 1}"),
-        ):
-            sums = np.asarray(of_lines[:, :, first:last], np.float64).sum(axis=2)
+        first, second = np.array_split(of_lines, 2, axis=2)
+        half, length = first.shape[2], of_lines.shape[2]
+        places = "", f", in {across} 0 to {half - 1}", f", in {across} {half} to {length - 1}"
+        for part, place in zip((of_lines, first, second), places, strict=True):
+            sums = np.asarray(part, np.float64).sum(axis=2)
             for information, right in (sums[:2], sums[2:]):
                 found += _lines_apart(information, right, lines, place)
     return max(found, key=lambda each: each.sigmas, default=None)

@@ -189,14 +189,10 @@ def _ambiguous(run: TestedRun) -> Found | None:
     return None
 
 
-def second_place_px(run: TestedRun) -> float:
-    """Return how far away the second place of a scene that repeats is, in px; 0 where pairs fit at one place."""
-    return 0.0 if (found := _ambiguous(run)) is None else found.figure
-
-
-def parts_px(run: TestedRun) -> float:
-    """Return how far apart parts of the sensor lie, in px; 0 where none does."""
-    return 0.0 if (reason := _parts.judged(run)) is None else reason.figure
+def others_px(run: TestedRun) -> float:
+    """Return how far away motions are that jump, are along a second place, or that of a part of the sensor that lies apart."""
+    found = _uncut_jump(run), _ambiguous(run), _parts.judged(run)
+    return float(np.linalg.norm([each.figure for each in found if each is not None]))
 
 
 def _one_direction(run: TestedRun) -> Found | None:
