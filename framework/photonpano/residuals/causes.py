@@ -22,7 +22,6 @@ _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 
 FREE = "write motion: {model: homography}"  # what a spec says of a motion that may be any
 FIND_LENS = "camera: {distortion: {k1: find}}"  # what a spec says to measure the lens
-_FOLLOW = "use the refiner short-spans"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,11 +37,6 @@ class TestedRun:
         """What to do if a planar model that was written may hold less than the motion; "" for those that hold any."""
         kind = self.levels[-1].located.solution.model.kind if self.levels else "homography"
         return "" if kind in ("homography", "rotation") else f"{FREE}, as {kind} may hold less than the motion"
-
-    @property
-    def followed(self) -> str:
-        """What to do about motion that is faster than groups where refiners have looked for it; "" where none did."""
-        return "use more light, or damp what shakes: the photons do not carry this motion" if self.explained.refinements else ""
 
 
 _Finder: TypeAlias = Callable[[TestedRun], Found | None]
@@ -80,25 +74,25 @@ def _never_seen(run: TestedRun) -> Found:
 @CAUSES.doubtful_above(
     2.0,
     "the image moves within groups by more than the motion that was found",
-    _FOLLOW,
+    "use the refiner short-spans; where it was used, more light",
 )
 def _fast_motion(run: TestedRun) -> Found | None:
     if not np.isfinite(run.explained.ratio):
         return Found(np.nan, f"{len(run.explained.residuals.spans)} spans are too few: {FEWEST_SPANS} are needed")
-    return Found(run.explained.ratio, "scatter of the shifts of short spans over their noise", what_to_do=run.followed)
+    return Found(run.explained.ratio, "scatter of the shifts of short spans over their noise")
 
 
 @CAUSES.doubtful_above(
     0.1,
     "frames shake faster than the motion that was found can follow",
-    _FOLLOW,
+    "use the refiner short-spans; where it was used, more light",
 )
 def _shaking(run: TestedRun) -> Found | None:
     shaking, longest = run.explained.residuals.shaking, max(map(len, run.explained.residuals.spans))
     if longest < FEWEST_FRAMES and not np.isfinite(run.explained.ratio):  # spans of a frame or two show all shaking themselves
         return Found(np.nan, f"spans of {FEWEST_FRAMES} frames are needed")
     where = f"px within spans, most with a period of {shaking.period_frames:.3g} frames"
-    return Found(shaking.size_px, where, what_to_do=run.followed) if shaking.size_px else None
+    return Found(shaking.size_px, where) if shaking.size_px else None
 
 
 def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
