@@ -245,7 +245,9 @@ def gain_of_frames(
         model = _waves(instants, frequency, lengths) @ coefficients
         known = model > _DARKEST
         ratio = np.log(np.maximum(gain[known], 1e-3) / model[known])
-        curve = _smooth(instants[known], ratio, std[known] / np.minimum(1, model[known]))
+        # In the dark of a lamp that is switched, harmonics err by more than noise.
+        misfit = float(np.sqrt(np.mean((gain - slow * model) ** 2)))
+        curve = _smooth(instants[known], ratio, np.hypot(std[known], misfit) / np.minimum(1, model[known]))
         slow = np.exp(curve(np.clip(instants, instants[known][0], instants[known][-1])))
     found = _waves(frames, frequency, np.ones(n_frames)) @ coefficients
     found *= np.exp(curve(np.clip(frames, instants[known][0], instants[known][-1])))
