@@ -89,7 +89,8 @@ def _parts(run: TestedRun) -> Found | None:
     apart = parts_apart(run.explained.residuals.pixel_slopes)
     if apart is None or apart.sigmas <= _SURE_SIGMAS or run.findings.rival_motion is not None:  # that of a thing in the frame
         return None
-    return Found(apart.px, f"px between {apart.parts}")
+    late = f", as if read {apart.frames:.2g} frames apart" if apart.frames else ""
+    return Found(apart.px, f"px between {apart.parts}{late}")
 
 
 @FACTS.doubtful_above(
