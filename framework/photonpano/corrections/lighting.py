@@ -106,7 +106,7 @@ def _tinted(light: Light, of_colours: Sequence[Gains]) -> Light:
     The colours of the panorama are those in the brightest light, in which most lamps are on.
     """
     n_frames, tints, std_tints = len(light.gain), [], []
-    brightest = light.gain >= np.quantile(light.gain, _BRIGHTEST) - (0 if light.std is None else light.std)
+    brightest = light.gain >= np.quantile(light.gain, _BRIGHTEST) - light.std
     for gains in of_colours:
         of_all = np.array([light.mean(span) for span in gains.seen.spans])
         tint, std, _ = _of_frames(gains, gains.gain / np.maximum(of_all, _DARKEST), n_frames)

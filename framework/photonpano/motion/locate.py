@@ -82,7 +82,7 @@ class LocatedLevel:
         near = np.linalg.norm(places[some, None] - places, axis=2) <= max(self.frame_shape) / 2
         last = len(places) - 1 - near[:, ::-1].argmax(axis=1)
         beside = std_of((errors[last] - errors[some])[last > some])
-        return float(max(1 - np.mean(beside**2) / 2 / np.mean(self.std_px**2), 0))
+        return max(float(1 - np.mean(beside**2) / 2 / np.mean(self.std_px**2)), 0.0)
 
     @property
     def information(self) -> FloatArray | None:

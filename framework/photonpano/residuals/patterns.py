@@ -121,7 +121,9 @@ def parts_apart(slopes: FluxImage) -> PartsApart | None:
             speed = float(np.sqrt(2 * sums[4].sum() / max(float(sums[[0, 2]].sum()), 1e-12)))
             for information, right in (sums[:2], sums[2:4]):
                 found += _lines_apart(information, right, lines, place)
-            found += [late._replace(px=late.px * speed, frames=late.px) for late in _lines_apart(*sums[4:], lines, place)]
+            found += [
+                late._replace(px=late.px * speed, frames=late.px) for late in _lines_apart(sums[4], sums[5], lines, place)
+            ]
     return max(found, key=lambda each: each.sigmas, default=None)
 
 
