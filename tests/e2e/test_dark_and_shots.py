@@ -60,6 +60,7 @@ def test_dark_frames_are_not_located_and_cost_the_others_nothing(
     with np.load(tmp_path / "run" / "trajectory.npz") as motion:
         located, path_px, reference = motion["located"], motion["homographies"][:, :2, 2], motion["reference"]
     np.testing.assert_array_equal(located, ~dark)
+    assert (dark[150], reference) == (True, 149)  # the middle is dark, and nobody knows where it lies
     with np.load(shutter_closes.with_suffix(".truth.npz")) as truth:
         true_px = truth["homographies"][:, :2, 2]
     error = (path_px - (true_px - true_px[reference]))[~dark]

@@ -9,8 +9,9 @@ import numpy as np
 
 from photonpano.capture import Capture, LinearCorrection, capture_of
 from photonpano.corrections.geometry import Correction
+from photonpano.corrections.lighting import speed_px
 from photonpano.errors import InputError
-from photonpano.geometry import corner_displacements, inverse, transform_points
+from photonpano.geometry import transform_points
 from photonpano.photometry.images import sums_of_blocks
 from photonpano.reading import read_arrays
 from photonpano.robust import huber_weights, robust_std
@@ -203,11 +204,8 @@ def _places(capture: Capture, homography: Homography, points: FloatArray) -> Flo
 def _spans(capture: Capture, trajectory: Trajectory) -> list[FrameSpan]:
     """Return spans all over the capture, so short that the image hardly moves in them."""
     info = capture.info
-    instants = np.linspace(0, info.n_frames - 1, _SPANS + 1)
-    steps = inverse(trajectory.at(instants[:-1])) @ trajectory.at(instants[1:])
-    moved = float(np.median(corner_displacements(steps, np.eye(3), info.frame_shape).max(axis=-1)))
-    per_frame = moved * _SPANS / max(info.n_frames - 1, 1)
-    n_frames = int(np.clip(_SPAN_PX / max(per_frame, 1e-9), 1, min(_SPAN_FRAMES, max(1, (info.n_frames - 1) // _SPANS))))
+    longest = min(_SPAN_FRAMES, max(1, (info.n_frames - 1) // _SPANS))
+    n_frames = int(np.clip(_SPAN_PX / max(speed_px(capture, trajectory), 1e-9), 1, longest))
     return capture.shown(info.spread(_SPANS, n_frames))
 
 

@@ -106,7 +106,7 @@ def _tinted(light: Light, of_colours: Sequence[Gains]) -> Light:
     The colours of the panorama are those in the brightest light, in which most lamps are on.
     """
     n_frames, tints, std_tints = len(light.gain), [], []
-    brightest = light.gain >= np.quantile(light.gain, _BRIGHTEST) - LEAST_CHANGE
+    brightest = light.gain >= np.quantile(light.gain, _BRIGHTEST) - light.std
     for gains in of_colours:
         of_all = np.array([light.mean(span) for span in gains.seen.spans])
         tint, std, _ = _of_frames(gains, gains.gain / np.maximum(of_all, _DARKEST), n_frames)
@@ -245,7 +245,9 @@ def gain_of_frames(
         model = _waves(instants, frequency, lengths) @ coefficients
         known = model > _DARKEST
         ratio = np.log(np.maximum(gain[known], 1e-3) / model[known])
-        curve = _smooth(instants[known], ratio, std[known] / np.minimum(1, model[known]))
+        # In the dark of a lamp that is switched, harmonics err by more than noise.
+        misfit = float(np.sqrt(np.mean((gain - slow * model) ** 2)))
+        curve = _smooth(instants[known], ratio, np.hypot(std[known], misfit) / np.minimum(1, model[known]))
         slow = np.exp(curve(np.clip(instants, instants[known][0], instants[known][-1])))
     found = _waves(frames, frequency, np.ones(n_frames)) @ coefficients
     found *= np.exp(curve(np.clip(frames, instants[known][0], instants[known][-1])))

@@ -90,12 +90,21 @@ class _Seen:
         """(S, h, w) what was seen."""
         return np.isfinite(self.std)
 
-    def steady(self, usual: FluxImage) -> FluxImage:
-        """Return the roots in the same light, and without a shift of each sum, given those that squares usually have.
+    def evenly_lit(self) -> _Seen:
+        """Return the sums in the same light, as far as each and the next, which see much of the same, tell."""
+        steps = np.ones(len(self.root))
+        for index, both in enumerate(self.known[1:] & self.known[:-1], start=1):
+            before, after = (float(each[both].sum()) for each in self.root[index - 1 : index + 1])
+            steps[index] = after / before if min(before, after) > 0 else 1.0
+        light = np.cumprod(steps)[:, None, None].astype(np.float32)
+        return replace(self, root=self.root / light, std=self.std / light)
+
+    def steady(self, usual: FluxImage) -> _Seen:
+        """Return the sums in the same light, and without a shift of each, given the roots that squares usually have.
 
         The motion is not exact, and a tremor may be left in it.
         """
-        slopes, steady = gradient_of(usual), self.root.copy()
+        slopes, steady, std = gradient_of(usual), self.root.copy(), self.std.copy()
         for index, (root, known) in enumerate(zip(self.root, self.known, strict=True)):
             terms, weight = np.stack([each[known] for each in (usual, *slopes)], axis=1), np.ones(int(known.sum()))
             for _ in range(_ROUNDS):
@@ -103,8 +112,10 @@ class _Seen:
                 change = np.linalg.lstsq(scaled, weight * root[known])[0]
                 left = root[known] - terms @ change
                 weight = np.sqrt(cauchy_weights(left, _NEAR * max(robust_std(left), _TINY)))
-            steady[index, known] = (usual[known] + left / max(float(change[0]), _TINY)) if known.any() else 0
-        return steady
+            light = max(float(change[0]), _TINY)
+            steady[index, known] = (usual[known] + left / light) if known.any() else 0
+            std[index] /= light
+        return replace(self, root=steady, std=std)
 
 
 def find_background(
@@ -126,10 +137,9 @@ def find_background(
     seen = _seen(source, trajectory, camera, span, context)
     if seen is None or len(seen.spans) < _FEWEST_SUMS or not (known := seen.known).any():
         return None
-    usual, _ = _usual(seen, seen.root)
-    steady = seen.steady(usual)
-    usual, sure = _usual(seen, steady)
-    squares = _squares(seen, steady, usual, tolerance.misplaced_px)
+    seen = seen.steady(_usual(seen.evenly_lit())[0])
+    usual, sure = _usual(seen)
+    squares = _squares(seen, usual, tolerance.misplaced_px)
     deviation = _deviation(squares, known)
     hidden = np.array([_patches(*each, tolerance) for each in zip(deviation, known, strict=True)])
     # Where nearly all differs, the motion is wrong.
@@ -219,9 +229,9 @@ def _brightness(
     return root, np.where(seen, step * np.sqrt(np.expm1(np.minimum(lit, 20)) / lit), np.float32(np.inf)).astype(np.float32)
 
 
-def _usual(seen: _Seen, root: FluxImage) -> tuple[FluxImage, BoolArray]:
+def _usual(seen: _Seen) -> tuple[FluxImage, BoolArray]:
     """Return the root of the flux that squares have most often, and for which ones that is often enough: (h, w) each."""
-    known, shape = seen.known, root[0].shape
+    known, root, shape = seen.known, seen.root, seen.root[0].shape
     low, high = np.quantile(root[known], [_TAIL, 1 - _TAIL])
     width = max(float(high - low), 1e-9) / _BINS
     bins = np.clip((root - low) / width, 0, _BINS - 1).astype(np.intp)
@@ -238,11 +248,11 @@ def _usual(seen: _Seen, root: FluxImage) -> tuple[FluxImage, BoolArray]:
     return np.asarray(usual, np.float32), near.sum(axis=0) >= _USUAL * known.sum(axis=0)
 
 
-def _squares(seen: _Seen, root: FluxImage, usual: FluxImage, misplaced_px: float) -> FluxImage:
+def _squares(seen: _Seen, usual: FluxImage, misplaced_px: float) -> FluxImage:
     """Return the squared difference of squares from the usual, in variances; NaN where they are not seen: (S, h, w)."""
     slopes = np.square(gradient_of(usual)).sum(axis=0)
     tolerated = (_UNEVEN * usual) ** 2 + (misplaced_px / CELL_PX) ** 2 * slopes
-    return np.where(seen.known, (root - usual) ** 2 / (np.where(seen.known, seen.std, 1) ** 2 + tolerated), np.nan)
+    return np.where(seen.known, (seen.root - usual) ** 2 / (np.where(seen.known, seen.std, 1) ** 2 + tolerated), np.nan)
 
 
 def _deviation(squares: FluxImage, known: BoolArray) -> FluxImage:

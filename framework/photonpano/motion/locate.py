@@ -14,7 +14,7 @@ from photonpano.contracts.requirements import why_still
 from photonpano.errors import PluginError
 from photonpano.execution.context import Context
 from photonpano.geometry import corner_displacements, corners, inverse, transform_points, translation
-from photonpano.motion.adjustment import Assessment
+from photonpano.motion.adjustment import Assessment, std_of
 from photonpano.motion.diagnosis import require_tied, solving
 from photonpano.motion.graph import GraphOptions, GraphSolution, Rival, components, solve
 from photonpano.motion.gyroscope import Gyroscope
@@ -28,6 +28,7 @@ from photonpano.values import Ambiguity, Edge, FloatArray, FrameSpan, Group, Loc
 
 # A fallback contradicts the first locator beyond this fraction of the shorter side of a frame.
 _CONTRADICTION = 0.05
+_COMPARED = 200  # exposures whose errors are compared with those of others that see the same
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -66,6 +67,22 @@ class LocatedLevel:
     def std_px(self) -> FloatArray:
         """The expected error of the corners of each located exposure, (N,); NaN for a single one."""
         return self.assessed.std_px
+
+    @property
+    def drift_share(self) -> float:
+        """The share of its variance that exposures have in common with those that see half of what they see.
+
+        It is that of homographies; 0 for a camera that turns, whose frames may have no place on a plane.
+        """
+        errors, middle = self.assessed.errors_px, corners(self.frame_shape).mean(axis=0)
+        if self.solution.rotations is not None or len(errors) < 2:
+            return 0.0
+        places = transform_points(self.homographies, middle[None])[:, 0]
+        some = np.unique(np.linspace(0, len(places) - 1, _COMPARED).astype(int))
+        near = np.linalg.norm(places[some, None] - places, axis=2) <= max(self.frame_shape) / 2
+        last = len(places) - 1 - near[:, ::-1].argmax(axis=1)
+        beside = std_of((errors[last] - errors[some])[last > some])
+        return max(float(1 - np.mean(beside**2) / 2 / np.mean(self.std_px**2)), 0.0)
 
     @property
     def information(self) -> FloatArray | None:

@@ -16,7 +16,7 @@ from photonpano.pipeline.state import State
 from photonpano.residuals.causes import TestedRun, changing_places
 from photonpano.residuals.findings import Doubt, Findings
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.verdict import MUCH, of_either_part, second_place_px
+from photonpano.residuals.verdict import MUCH, of_either_part, others_px
 from photonpano.values import FloatArray
 
 _MISFIT = 1.5  # reduced chi-square from which the motion does not explain a block of the sensor
@@ -29,16 +29,16 @@ def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, 
     """Let the expected error of a motion contain the distance to others, where the frames do not tell which one is right.
 
     These are a motion that jumps where the image seems to, one that a lens does not bend, one along a second place of a scene
-    that repeats, those by models that are as likely as the one taken, and that of parts of the frame which the motion
-    does not explain. Where such a part is large and its motion is not found, the error is infinite: not known.
+    that repeats, that of either part of a sensor whose parts lie apart, those by models that are as likely as the one taken,
+    and that of parts of the frame which the motion does not explain. Where such a part is large and its motion is not found,
+    the error is infinite: not known.
     """
     findings = state.found()
     run = TestedRun(explained, state.results, findings)
     n_frames, located = len(explained.motion.std_px), np.flatnonzero(explained.motion.located)
-    jumps_px = 0.0 if findings.uncut_jump is None else findings.uncut_jump.px
     last = state.results[-1]
     freer_px = last.located.rivals["homography"].apart_px if last.narrow else of_models_px(last.located.rivals)
-    explained = _apart(explained, np.full(n_frames, np.linalg.norm([jumps_px, second_place_px(run), freer_px])))
+    explained = _apart(explained, np.full(n_frames, np.hypot(others_px(run), freer_px)))
     if (lens := explained.lens) is not None:
         frames = np.linspace(located[0], located[-1], len(lens.bend_px))
         explained = _apart(explained, np.interp(np.arange(n_frames), frames, abs(lens.k1) * lens.bend_px))

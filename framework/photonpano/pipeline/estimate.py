@@ -103,7 +103,7 @@ def _along(
     source = replace(leaving_out(source, timeline.shown), copies=timeline.copies)
     if shortened > 1:
         context = within(context, shortened)
-    reference = _reference_frame(plan, timeline.shot)
+    reference = _reference_frame(plan, timeline)
     start, decided = _START[started](plan, source, reference, context)
     levels = build_levels(plan, source, attempts[-1], shortened, start)
     gyroscope, fitted = _gyroscope(plan, source, timeline, context)
@@ -170,12 +170,13 @@ def require_centre(plan: Plan, source: Source) -> None:
         )
 
 
-def _reference_frame(plan: Plan, shot: FrameSpan) -> int:
-    """Return the reference frame; where it does not lie in the shot that is located, the middle of that."""
-    reference, middle = plan.render.reference, (shot.start + shot.stop) // 2
+def _reference_frame(plan: Plan, timeline: Timeline) -> int:
+    """Return the frame with light that is next to the reference frame, or to the middle of the shot if that holds no such."""
+    reference, shot, shown = plan.render.reference, timeline.shot, np.flatnonzero(timeline.shown)
+    middle = (shot.start + shot.stop) // 2
     named = {"first": shot.start, "middle": middle, "last": shot.stop - 1}
     frame = named[reference] if isinstance(reference, str) else reference
-    return frame if shot.start <= frame < shot.stop else middle
+    return int(shown[np.abs(shown - (frame if shot.start <= frame < shot.stop else middle)).argmin()])
 
 
 def _no_start(*_: object) -> tuple[None, None]:

@@ -42,6 +42,7 @@ _MOST_PEAKS = 200  # most peaks that are compared
 _REACH = 1 / 3  # largest shift that is looked at, as a share of the frame
 _FILTER_BLUR_PX = 1.0  # standard deviation of the Gaussian that blurs a colour filter array
 _STANDING = 0.3  # share of the frame from which what stands still is named
+_MASKED = 0.5  # share of the pixels that are masked, from which a mask may be the wrong way round
 _BLOCK_FRAMES, _FEW_FRAMES = 256, 16  # frames that are compared at a time, if they are packed and if not
 _ROWS = 32  # rows of the frame on which frames are compared first
 # Frames that are repeated differ from the frame before by this many newly lit pixels, and as many that went dark: dark frames
@@ -90,6 +91,8 @@ def naming_obstacles(source: Source) -> Iterator[None]:
 
 def obstacles(source: Source) -> Iterator[str]:
     """Yield sentences about what makes a capture hard to locate."""
+    if (masked := 1 - float(source.valid.mean())) > _MASKED:
+        yield f"{masked:.0%} of the pixels are masked: if the mask marks the pixels that count, invert it."
     if (share := capture_of(source).still.share) >= _STANDING:
         yield (
             f"{share:.0%} of the frame stands still while the rest moves, as a window or dirt in front of the sensor does: "

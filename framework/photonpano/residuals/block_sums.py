@@ -126,11 +126,13 @@ def add_pixel_sums(  # noqa: PLR0917
     residual: NDArray[np.float32],
     total: NDArray[np.float32],
     slopes: NDArray[np.float32],
+    velocity: NDArray[np.float32],
 ) -> None:
     """Add residuals and expected counts to the sums (H, W) of each pixel; not known are NaN counts, and those of variance 0.
 
-    `counts` are summed over `n_frames`, mean and variance are those of one. `slopes` (4, H, W) are gx gx / v, gx r / v,
-    gy gy / v and gy r / v of pixels inside the frame, see `GXX`.
+    `counts` are summed over `n_frames`, mean and variance are those of one. `slopes` (6, H, W) are gx gx / v, gx r / v,
+    gy gy / v and gy r / v of pixels inside the frame, see `GXX`, and gt gt / v and gt r / v, with gt the change within a frame
+    period of an image that moves by the `velocity` (2,) in px.
     """
     n, zero = np.float32(n_frames), np.float32(0)
     for y in range(mean.shape[0]):
@@ -143,13 +145,16 @@ def add_pixel_sums(  # noqa: PLR0917
             totals[t] += expected if known else zero
     for y in range(1, mean.shape[0] - 1):
         k, m, q, up, down = counts[y], mean[y], variance[y], mean[y - 1], mean[y + 1]
-        xx, xr, yy, yr = slopes[0, y], slopes[1, y], slopes[2, y], slopes[3, y]
+        xx, xr, yy, yr, tt, tr = slopes[0, y], slopes[1, y], slopes[2, y], slopes[3, y], slopes[4, y], slopes[5, y]
         for t in range(1, len(k) - 1):
             gx, gy, _, r, _, w = _terms(m[t], m[t + 1] - m[t - 1], down[t] - up[t], k[t], q[t], zero, n, True)
             xx[t] += w * gx * gx
             xr[t] += w * gx * r
             yy[t] += w * gy * gy
             yr[t] += w * gy * r
+            gt = velocity[0] * gx + velocity[1] * gy
+            tt[t] += w * gt * gt
+            tr[t] += w * gt * r
 
 
 class Totals(NamedTuple):
@@ -163,7 +168,7 @@ class Totals(NamedTuple):
     cell_noise: NDArray[np.float64]  # variance of the residuals, relative to the squared prediction
     pixel_residual: NDArray[np.float32]  # (H, W) residuals of each pixel: see `add_pixel_sums`
     pixel_mean: NDArray[np.float32]  # (H, W) expected counts
-    pixel_slopes: NDArray[np.float32]  # (4, H, W)
+    pixel_slopes: NDArray[np.float32]  # (6, H, W)
 
     @classmethod
     def zeros(cls, shape: tuple[int, int], canvas_shape: tuple[int, int]) -> Totals:
@@ -171,7 +176,7 @@ class Totals(NamedTuple):
         grid, cells = n_blocks(shape), n_blocks(canvas_shape)
         of_blocks = np.zeros((*grid, N_SUMS)), np.zeros(grid), np.zeros(grid)
         of_cells = np.zeros(cells), np.zeros(cells), np.zeros(cells)
-        return cls(*of_blocks, *of_cells, *(np.zeros((*n, *shape), np.float32) for n in ((), (), (4,))))
+        return cls(*of_blocks, *of_cells, *(np.zeros((*n, *shape), np.float32) for n in ((), (), (6,))))
 
     def plus(self, other: Totals) -> Totals:
         """Return the sums over both."""

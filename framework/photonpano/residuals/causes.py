@@ -74,7 +74,7 @@ def _never_seen(run: TestedRun) -> Found:
 @CAUSES.doubtful_above(
     2.0,
     "the image moves within groups by more than the motion that was found",
-    "use the refiner short-spans, or smaller groups (resample.with.group_size)",
+    "use the refiner short-spans; where it was used, more light",
 )
 def _fast_motion(run: TestedRun) -> Found | None:
     if not np.isfinite(run.explained.ratio):
@@ -85,7 +85,7 @@ def _fast_motion(run: TestedRun) -> Found | None:
 @CAUSES.doubtful_above(
     0.1,
     "frames shake faster than the motion that was found can follow",
-    "use the refiner short-spans; if it was used, the photons do not carry this motion: use more light, or damp what shakes",
+    "use the refiner short-spans; where it was used, more light",
 )
 def _shaking(run: TestedRun) -> Found | None:
     shaking, longest = run.explained.residuals.shaking, max(map(len, run.explained.residuals.spans))
@@ -107,8 +107,8 @@ def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
 @CAUSES.doubtful_above(
     0.03,
     "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
-    "mask what moves (corrections: mask), or divide by a flat field if the corners are dark (corrections: flat-field); the "
-    "motion may be that of the thing instead of the scene",
+    "divide by a flat field if the corners are dark (corrections: flat-field); the motion may be that of the thing instead of "
+    "the scene",
 )
 def _moving(run: TestedRun) -> Found | None:
     if run.explained.residuals.cell_count.max(initial=0) < _MIN_BLOCKS:
@@ -142,7 +142,7 @@ def _light(run: TestedRun) -> Found:
 @CAUSES.doubtful_above(
     0.03,
     "parts of the sensor count more or fewer photons than others, as with a vignette, dirt or a window in front of it",
-    "mask these pixels (corrections: mask), or divide by a flat field (corrections: flat-field)",
+    "look at the map of the sensor in the report",
 )
 def _sensor(run: TestedRun) -> Found | None:
     sums = run.explained.residuals.blocks
@@ -179,7 +179,7 @@ def _hot_pixels(run: TestedRun) -> Found:
 @CAUSES.doubtful_above(
     0.05,
     "frames are deformed as no motion of the whole frame explains",
-    "look at the arrows in the report; correct the lens or the rolling shutter before",
+    "look at the arrows in the report",
 )
 def _deformation(run: TestedRun) -> Found | None:
     size = deformation_px(*run.explained.residuals.block_shifts())
@@ -189,7 +189,7 @@ def _deformation(run: TestedRun) -> Found | None:
 @CAUSES.doubtful_above(
     0.1,
     "pairs of exposures contradict each other, as where a scene repeats",
-    "look at the path in the report; use a slower motion, or smaller groups",
+    "look at the path in the report",
 )
 def _contradictions(run: TestedRun) -> Found | None:
     if not run.levels:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from photonpano.capture import Capture
 from photonpano.execution.context import Context
-from photonpano.geometry import corners, steps_px
+from photonpano.geometry import corners, inverse, steps_px, transform_points
 from photonpano.residuals.block_sums import (
     BLOCK_PX,
     GX_R,
@@ -80,7 +80,7 @@ class Residuals:
     block_chi2: FloatArray  # (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen
     pixel_gain: FluxImage  # (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted
     pixel_mean: FluxImage  # (H, W) predicted photons of each pixel, in one of four spans
-    pixel_slopes: FluxImage  # (4, H, W) how pixels lie beside the panorama, in these spans: see `add_pixel_sums`
+    pixel_slopes: FluxImage  # (6, H, W) how pixels lie beside the panorama, in these spans: see `add_pixel_sums`
     # (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was seen
     cell_chi2: FloatArray
     cell_count: FloatArray  # (H', W') number of blocks that fell on each square
@@ -372,6 +372,7 @@ def _measured(
     # A pixel adds to the image of its colour, which fewer frames may have seen.
     frames_seen = max(float(np.mean([each.frames_seen for _, each in predictions.parts])), 1.0)
     images, sums = np.empty((2, *shape), np.float32), np.empty((*grid, N_SUMS), np.float32)
+    velocities = _velocities(first, spans)
     for index, (span, homography) in enumerate(zip(spans, homographies, strict=True)):
         sums[:] = 0
         for place, colour in enumerate(colours):
@@ -383,12 +384,20 @@ def _measured(
             add_block_sums(counts, noise, float(len(span)), images[0], images[1], sums)
             if index % _PIXEL_STRIDE == 0:
                 of_pixels = total.pixel_residual, total.pixel_mean, total.pixel_slopes
-                add_pixel_sums(counts, float(len(span)), images[0], images[1], *of_pixels)
+                add_pixel_sums(counts, float(len(span)), images[0], images[1], *of_pixels, velocities[index])
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
         own = min(0.5, len(span) / frames_seen)
         cells = first.cells(homography, middle, ideal)
         reduced_chi2[index] = fold(sums, lever, *cells, 1 - own, normal[index], gradient[index], total)
     return (normal, gradient, reduced_chi2), total
+
+
+def _velocities(prediction: Prediction, spans: Sequence[FrameSpan]) -> NDArray[np.float32]:
+    """Return how fast the image moves in spans, in px of a frame per frame period: (S, 2)."""
+    middle, ends = corners(prediction.frame_shape).mean(axis=0), np.array([(each.start, each.stop - 1) for each in spans])
+    first, last = (prediction.trajectory.at(each) for each in ends.T)
+    moved = transform_points(inverse(last) @ first, middle[None])[:, 0] - middle
+    return np.asarray(moved / np.maximum(np.ptp(ends, axis=1), 1)[:, None], np.float32)
 
 
 def _middles(index: np.ndarray, length: int) -> FloatArray:

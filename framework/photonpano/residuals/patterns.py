@@ -16,6 +16,8 @@ from photonpano.values import FloatArray, FluxImage
 _INSTANTS = 64  # instants of the motion at which the effect of a lens is computed
 _SIGNIFICANT = 4.0  # standard deviations by which the scatter must exceed that of noise
 _SMALLEST_PX = 0.02  # shaking by less than this stays within spans
+_TURNS = 2, 3, 4, 8  # rows of which one may lie apart
+_TOLD = 1e-3  # least share of what rows tell of their shift that is of a difference of parts
 _FREQUENCIES = 256  # at which the spectrum is computed, up to half a cycle per frame
 
 
@@ -100,35 +102,65 @@ class PartsApart(NamedTuple):
     parts: str
     px: float
     sigmas: float
+    frames: float = 0.0  # by which one is read later than the other, where that explains more than a shift
 
 
-def parts_apart(slopes: FluxImage) -> list[PartsApart]:
-    """Return how far odd rows lie beside even ones, and one half of the sensor beside the other, the same of columns.
+def parts_apart(slopes: FluxImage) -> PartsApart | None:
+    """Return the parts of the sensor that lie beside each other most clearly; None where nothing shows it.
 
-    Each row has a shift of its own, along x and along y, by the slopes (4, H, W) of its pixels. What a cubic polynomial over
-    the rows explains, such as a rolling shutter, is no difference of parts.
+    They are rows that take turns, or rows and those before them, or columns; in the whole frame, or in a half of it, as where
+    one quadrant is late. Each row lies elsewhere along x, y and time, by the slopes (6, H, W) of its pixels.
     """
-    found = []
-    for axis, (line, halves) in enumerate(
-        (("rows", "the upper and the lower half"), ("columns", "the left and the right half"))
-    ):
-        lines = np.asarray(slopes, np.float64).sum(axis=2 - axis)
-        number = lines.shape[1]
-        at, odd = np.linspace(-1, 1, number), np.arange(number) % 2 - 0.5
-        columns = np.stack([*(at**power for power in range(4)), odd, np.sign(at) / 2], axis=1)
-        for information, right in (lines[:2], lines[2:]):
-            normal = columns.T @ (information[:, None] * columns)
-            if np.linalg.matrix_rank(normal) < len(normal):
-                continue
-            covariance = np.linalg.inv(normal)
-            away = covariance @ columns.T @ right
-            shifts = np.divide(right, information, out=np.zeros(number), where=information > 0)
-            # Along a pan, a row sees the same edges all the time, at the same fraction of a pixel: rows scatter beyond noise.
-            scatter = (information * (shifts - columns @ away) ** 2).sum() / max(np.count_nonzero(information) - len(away), 1)
-            std = np.sqrt(np.diag(covariance) * max(1.0, float(scatter)))
-            for part, index in ((f"odd and even {line}", -2), (halves, -1)):
-                found.append(PartsApart(part, abs(float(away[index])), abs(float(away[index] / std[index]))))
-    return found
+    found = list[PartsApart]()
+    for lines, of_lines, across in (("rows", slopes, "columns"), ("columns", slopes.swapaxes(1, 2), "rows")):
+        first, second = np.array_split(of_lines, 2, axis=2)
+        half, length = first.shape[2], of_lines.shape[2]
+        places = "", f", in {across} 0 to {half - 1}", f", in {across} {half} to {length - 1}"
+        for part, place in zip((of_lines, first, second), places, strict=True):
+            sums = np.asarray(part, np.float64).sum(axis=2)
+            speed = float(np.sqrt(2 * sums[4].sum() / max(float(sums[[0, 2]].sum()), 1e-12)))
+            for information, right in (sums[:2], sums[2:4]):
+                found += _lines_apart(information, right, lines, place)
+            found += [
+                late._replace(px=late.px * speed, frames=late.px) for late in _lines_apart(sums[4], sums[5], lines, place)
+            ]
+    return max(found, key=lambda each: each.sigmas, default=None)
+
+
+def _lines_apart(information: FloatArray, right: FloatArray, lines: str, place: str) -> list[PartsApart]:
+    """Return how far lines that take turns lie beside the others, or lines from one on beside those before it.
+
+    What a cubic polynomial over the lines explains, such as a rolling shutter, is no difference of parts.
+    """
+    number = len(information)
+    every, at = np.arange(number), np.linspace(-1, 1, number)
+    smooth = np.stack([at**power for power in range(4)], axis=1)
+    normal = smooth.T @ (information[:, None] * smooth)
+    if np.linalg.matrix_rank(normal) < len(normal):
+        return []
+    turns = [(each, first) for each in _TURNS for first in range(each if each > 2 else 1)]
+    # 0 and 1 for lines that take turns; products with 0 and 1 for those from each on are sums over these.
+    taken = np.array([every % each == first for each, first in turns], dtype=np.float64)
+    weighted = np.column_stack([information[:, None] * smooth, right, information])
+    products = np.concatenate([taken @ weighted, np.cumsum(weighted[::-1], axis=0)[-2::-1]])
+    by_smooth, (by_right, squares) = products[:, :-2], products[:, -2:].T
+    beyond = by_smooth @ np.linalg.inv(normal)
+    left, known = by_right - beyond @ smooth.T @ right, squares - (beyond * by_smooth).sum(axis=1)
+    told = np.divide(left**2, known, out=np.zeros(len(known)), where=known > _TOLD * information.sum())
+    best = int(told.argmax())
+    start = best - len(turns) + 1
+    columns = np.column_stack([smooth, taken[best] if start <= 0 else every >= start])
+    covariance = np.linalg.pinv(columns.T @ (information[:, None] * columns))
+    away = covariance @ columns.T @ right
+    shifts = np.divide(right, information, out=np.zeros(number), where=information > 0)
+    # Along a pan, a row sees the same edges all the time, at the same fraction of a pixel: rows scatter beyond noise.
+    scatter = (information * (shifts - columns @ away) ** 2).sum() / max(np.count_nonzero(information) - len(away), 1)
+    parts = f"{lines} 0 to {start - 1} and {lines} {start} to {number - 1}"
+    if start <= 0:
+        each, first = turns[best]
+        parts = f"odd and even {lines}" if each == 2 else f"one of {each} {lines}, from {first} on, and the others"
+    sigmas = abs(float(away[-1])) / np.sqrt(covariance[-1, -1] * max(1.0, float(scatter)))
+    return [PartsApart(f"{parts}{place}", abs(float(away[-1])), float(sigmas))]
 
 
 def deformation_px(shifts: FloatArray, information: FloatArray) -> float | None:

@@ -80,6 +80,20 @@ def _untested_motion(run: TestedRun) -> Found:
 
 
 @FACTS.doubtful_above(
+    0.2,
+    "parts of the sensor see the scene at different places, so that the panorama is torn",
+    "read the frames in the order of the sensor's rows and halves",
+)
+def _parts(run: TestedRun) -> Found | None:
+    """As where rows take turns, or a part of the sensor is read out some frames later than the rest."""
+    apart = parts_apart(run.explained.residuals.pixel_slopes)
+    if apart is None or apart.sigmas <= _SURE_SIGMAS or run.findings.rival_motion is not None:  # that of a thing in the frame
+        return None
+    late = f", as if read {apart.frames:.2g} frames apart" if apart.frames else ""
+    return Found(apart.px, f"px between {apart.parts}{late}")
+
+
+@FACTS.doubtful_above(
     10,
     "the photons contradict the focal length or the lens that the spec gives",
     "write camera: {focal_px: find}, and distortion: {k1: find} if the lens distorts, or calibrate the camera anew",
@@ -114,7 +128,7 @@ def _narrow(run: TestedRun) -> Found | None:
 )
 def _lens(run: TestedRun) -> Found | None:
     found = run.explained.lens
-    if found is None:
+    if found is None or _parts.judged(run):  # a part that lies apart bends frames, too
         return None
     camera, what_to_do = run.explained.motion.camera, run.freer_model
     if camera is not None:
@@ -124,21 +138,9 @@ def _lens(run: TestedRun) -> Found | None:
 
 
 @FACTS.doubtful_above(
-    0.2,
-    "parts of the sensor see the scene at different places, so that the panorama is torn",
-    "read the frames in the order of the sensor's rows and halves, or keep one part (corrections: crop)",
-)
-def _parts(run: TestedRun) -> Found | None:
-    """As where rows take turns, or a half of the sensor is read out some frames later than the other."""
-    apart = [each for each in parts_apart(run.explained.residuals.pixel_slopes) if each.sigmas > _SURE_SIGMAS]
-    farthest = max(apart, key=lambda each: each.px, default=None)
-    return farthest and Found(farthest.px, f"px between {farthest.parts}")
-
-
-@FACTS.doubtful_above(
     _UNCERTAIN_PX,
     "the expected error of the motion is large",
-    "use more light; where few pairs tie parts together, more of them (graph.skips, graph.tie)",
+    "use more light",
 )
 def _uncertain(run: TestedRun) -> Found | None:
     """The motion is not known to a pixel: where two are possible, a direction is not seen, or there is too little light."""
@@ -146,30 +148,34 @@ def _uncertain(run: TestedRun) -> Found | None:
     known = motion.std_px[motion.located]
     if not len(known) or not np.isfinite(known).all():
         alone = Found(0.0, "a single exposure was located", doubtful=True, what="no motion is known")
-        return None if of_either_part(run) else alone._replace(what_to_do="use smaller groups, or more light")
-    if _narrow.judged(run):  # its distance is in the expected error
+        return None if of_either_part(run) else alone
+    if _narrow.judged(run) or _parts.judged(run):  # their distance is in the expected error
         return None
     for found in (_two_motions(run), _uncut_jump(run), _ambiguous(run), _one_direction(run)):
         if found is not None and found.figure > _UNCERTAIN_PX:
             return found
+    beside_px = float(known.mean())
+    if levels:  # a long path bends, which neither blurs nor tears a panorama
+        located = levels[-1].located
+        assessed = min(float(np.mean(located.std_px**2) / np.mean(known**2)), 1.0)
+        beside_px *= float(np.sqrt(1 - located.drift_share * assessed))
     where = f"px on average, most at frame {np.argmax(np.where(motion.located, motion.std_px, 0))}"
     change_px = levels[-1].change_px if levels else None
     if change_px is not None and change_px > _UNCERTAIN_PX:
         where += f"; the last level changed the motion by {change_px:.2g} px"
-        return Found(float(known.mean()), where, what_to_do="let it converge: use smaller groups, or levels: until-converged")
-    return Found(float(known.mean()), where)
+    return Found(beside_px, where)
 
 
 def _two_motions(run: TestedRun) -> Found | None:
     what = "parts of the frame follow another motion than the one that was found"
-    what_to_do = "mask what does not belong to the scene (corrections: mask); the motion may be that of either part"
+    what_to_do = "the motion may be that of either part"
     rival = run.findings.rival_motion
     return None if rival is None else Found(rival.px, rival.where, what=what, what_to_do=what_to_do)
 
 
 def _uncut_jump(run: TestedRun) -> Found | None:
     what = "the image seems to jump, but the photons contradict a cut of the motion there"
-    what_to_do = "look at the path in the report around this frame; use a slower motion, or smaller groups"
+    what_to_do = "look at the path in the report around this frame"
     jump = run.findings.uncut_jump
     return None if jump is None else Found(jump.px, jump.where, what=what, what_to_do=what_to_do)
 
@@ -184,9 +190,10 @@ def _ambiguous(run: TestedRun) -> Found | None:
     return None
 
 
-def second_place_px(run: TestedRun) -> float:
-    """Return how far away the second place of a scene that repeats is, in px; 0 where pairs fit at one place."""
-    return 0.0 if (found := _ambiguous(run)) is None else found.figure
+def others_px(run: TestedRun) -> float:
+    """Return how far away motions are that jump, are along a second place, or that of a part of the sensor that lies apart."""
+    found = _uncut_jump(run), _ambiguous(run), _parts.judged(run)
+    return float(np.linalg.norm([each.figure for each in found if each is not None]))
 
 
 def _one_direction(run: TestedRun) -> Found | None:
@@ -213,7 +220,7 @@ def _one_direction(run: TestedRun) -> Found | None:
 @FACTS.doubtful_above(
     0.5,
     "the image stands still, and has the fine grain of a sensor whose pixels differ",
-    "divide by a flat field (corrections: flat-field); what was found to stand still may be the sensor, and not the scene",
+    "what was found to stand still may be the sensor, and not the scene",
 )
 def _grain(run: TestedRun) -> Found | None:
     residuals, motion = run.explained.residuals, run.explained.motion
@@ -252,7 +259,7 @@ def _alternating(run: TestedRun) -> Found | None:
 @FACTS.doubtful_above(
     0.5,
     "more than half of the frame stands still while the rest moves",
-    "mask what stands in the frame (corrections: mask); the motion may be that of either part",
+    "the motion may be that of either part",
 )
 def _standing(run: TestedRun) -> Found:
     return Found(run.findings.standing_share, "share of the parts that show motion or rest")
@@ -304,7 +311,7 @@ def _halves(run: TestedRun) -> Found | None:
 @AGREEMENT.doubtful_above(
     0.1,
     "neighbouring frames have in common what the motion and the panorama do not show",
-    "use smaller groups (resample.with.group_size), in which a motion that returns shows; or mask what stands in the frame",
+    "the motion may return within groups, or something stands in the frame",
 )
 def _neighbours(run: TestedRun) -> Found | None:
     lasting = run.explained.lasting

@@ -124,6 +124,15 @@ def tiles(period: int) -> np.ndarray:
     return np.where((rows // (period // 2) + columns // (period // 2)) % 2, 0.05, 0.15)
 
 
+def test_error_says_that_a_mask_leaves_few_pixels() -> None:
+    masked = np.random.default_rng(0).random(SHAPE) < 0.98
+    capture = replace(capture_of(MemorySource(np.zeros((64, *SHAPE), bool))), valid=~masked)
+    with pytest.raises(LocationError) as raised, naming_obstacles(capture):
+        raise LocationError("none of the pairs could be located")
+    said = "98% of the pixels are masked: if the mask marks the pixels that count, invert it."
+    assert str(raised.value).splitlines()[1:] == [said]
+
+
 def test_error_names_what_stands_still_and_what_repeats() -> None:
     frames = np.random.default_rng(0).random((64, *SHAPE)) < 4 * tiles(20)
     capture = replace(capture_of(MemorySource(frames)), still=Still(0.38))

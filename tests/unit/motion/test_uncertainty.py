@@ -1,13 +1,16 @@
 """The expected errors of a solved motion graph, and what its measurements say of a node."""
 
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from photonpano import Group
-from photonpano.geometry import from_parameters
+from photonpano.geometry import from_parameters, translation
+from photonpano.motion.adjustment import std_of
 from photonpano.motion.graph import GraphSolution, solve
+from photonpano.motion.locate import LocatedLevel
 from photonpano.motion.models import MotionModel
 
 from .measured_graphs import (
@@ -107,3 +110,23 @@ def test_expected_error_corrects_overconfident_edges_only_with_loops(skips: tupl
     assert overconfident == pytest.approx(honest if skips == (1, 2) else honest / 5, rel=0.2)
     # With less to tell, walks are narrower.
     assert 3 * honest < modest < 5.5 * honest
+
+
+@pytest.mark.parametrize(("side_px", "share"), [(40, 1.0), (400, 0.66)])
+def test_bend_of_a_path_is_shared_by_exposures_that_see_the_same(side_px: int, share: float) -> None:
+    """Of x^2 from -1 to 1, 20 of 99 steps apart, half of the mean squared difference is 0.34 of the mean square."""
+    rng, along = np.random.default_rng(0), np.linspace(-1, 1, 100)
+    bent, alone = np.repeat(along[:, None, None] ** 2, 8, axis=1) * rng.normal(size=64), rng.normal(size=(100, 8, 64))
+
+    def drift_share(errors: np.ndarray) -> float:
+        level = SimpleNamespace(
+            assessed=SimpleNamespace(errors_px=errors),
+            solution=SimpleNamespace(rotations=None),
+            homographies=np.array([translation(10.0 * number, 0) for number in range(100)]),
+            frame_shape=(side_px, side_px),
+            std_px=std_of(errors),
+        )
+        return LocatedLevel.drift_share.fget(level)
+
+    assert drift_share(bent) == pytest.approx(share, abs=0.02)
+    assert drift_share(alone) < 0.02

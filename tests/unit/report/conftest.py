@@ -100,7 +100,7 @@ def make_residuals(n_frames: int = N_FRAMES, tremor_px: float = 0.0, period: flo
         block_chi2=rng.normal(1, 0.05, grid),
         pixel_gain=np.ones(FRAME_SHAPE, np.float32),
         pixel_mean=np.full(FRAME_SHAPE, 1e4, np.float32),
-        pixel_slopes=np.zeros((4, *FRAME_SHAPE), np.float32),
+        pixel_slopes=np.zeros((6, *FRAME_SHAPE), np.float32),
         cell_chi2=rng.normal(1, 0.1, cells),
         cell_count=np.full(cells, 300.0),
         cell_noise=np.full(cells, 0.01),

@@ -38,7 +38,7 @@ def noise() -> Residuals:
         block_chi2=rng.normal(1, 0.05, grid),
         pixel_gain=rng.normal(1, 0.03, SHAPE).astype(np.float32),
         pixel_mean=np.full(SHAPE, 1000, np.float32),
-        pixel_slopes=np.zeros((4, *SHAPE), np.float32),
+        pixel_slopes=np.zeros((6, *SHAPE), np.float32),
         cell_chi2=rng.normal(1, 0.1, cells),
         cell_count=np.full(cells, 200.0),
         cell_noise=np.full(cells, 0.01),

@@ -149,8 +149,11 @@ def test_what_residuals_show_is_a_note_and_the_cause_of_a_doubt(
     [
         (lambda y, _: 0.5 * (y % 2), "0.5 px between odd and even rows"),
         (lambda _, x: 0.5 * (x % 2), "0.5 px between odd and even columns"),
-        (lambda y, _: 0.5 * (y >= 64), "0.5 px between the upper and the lower half"),
-        (lambda _, x: 0.5 * (x < 96), "0.5 px between the left and the right half"),
+        (lambda y, _: 0.5 * (y >= 64), "0.5 px between rows 0 to 63 and rows 64 to 127"),
+        (lambda _, x: 0.5 * (x < 40), "0.5 px between columns 0 to 39 and columns 40 to 191"),
+        (lambda y, _: 0.5 * (y % 4 == 3), "0.5 px between one of 4 rows, from 3 on, and the others"),
+        (lambda y, x: 0.5 * (y < 64) * (x >= 96), "0.5 px between columns 0 to 95 and columns 96 to 191, in rows 0 to 63"),
+        (lambda y, x: 0.5 * (y % 2) * (x >= 96), "0.5 px between odd and even rows, in columns 96 to 191"),
         (lambda y, _: y / 20 - (y / 40) ** 2, ""),  # a rolling shutter
         (lambda y, _: 0.1 * (y % 2), ""),
     ],
@@ -159,9 +162,20 @@ def test_parts_of_the_sensor_that_lie_apart_are_doubtful(
     explained: Explained, apart_px: Callable[[np.ndarray, np.ndarray], np.ndarray], where: str
 ) -> None:
     shifts = apart_px(*np.indices((128, 192))) + np.random.default_rng(0).standard_normal((128, 192)) / 10
-    slopes = 100 * np.stack([np.ones_like(shifts), shifts, np.ones_like(shifts), np.zeros_like(shifts)]).astype(np.float32)
+    ones, zeros = np.ones_like(shifts), np.zeros_like(shifts)
+    slopes = 100 * np.stack([ones, shifts, ones, zeros, zeros, zeros]).astype(np.float32)
     verdict = judge(replace(explained, residuals=replace(explained.residuals, pixel_slopes=slopes)), ())
     assert [f"{reason.figure:.1f} {reason.where}" for reason in verdict.reasons] == [where] * bool(where)
+
+
+def test_part_that_is_late_is_named_where_the_motion_returns(explained: Explained) -> None:
+    """20 frames, at 0.1 px a frame along x in half of the spans, and back in the others: no shift is left."""
+    late = 20.0 * (np.indices((128, 192))[0] >= 64) + np.random.default_rng(0).standard_normal((128, 192))
+    ones, zeros = np.ones_like(late), np.zeros_like(late)
+    slopes = np.stack([100 * ones, zeros, 100 * ones, zeros, ones, late]).astype(np.float32)
+    [reason] = judge(replace(explained, residuals=replace(explained.residuals, pixel_slopes=slopes)), ()).reasons
+    assert reason.where == "px between rows 0 to 63 and rows 64 to 127, as if read 20 frames apart"
+    assert reason.figure == pytest.approx(2, abs=0.1)
 
 
 @pytest.mark.parametrize(("filtered", "doubtful"), [(0.2, True), (0.05, False)])
@@ -255,6 +269,7 @@ def level_with(
     n_ambiguous: int = 0,
     motion: Located = UNINFORMED,
     change_px: float | None = None,
+    drift_share: float = 0.0,
     **of_solution: object,
 ) -> Any:
     """A level of 30 pairs."""
@@ -270,12 +285,27 @@ def level_with(
     }
     solution = SimpleNamespace(**known | of_solution)
     edges = (Edge(1, 0, motion),) * 30
-    located = SimpleNamespace(ambiguity=ambiguity, rivals=rivals or {}, edges=edges, solution=solution, frame_shape=SHAPE)
+    located = SimpleNamespace(
+        ambiguity=ambiguity,
+        rivals=rivals or {},
+        edges=edges,
+        solution=solution,
+        frame_shape=SHAPE,
+        std_px=np.full(31, 4.0),
+        drift_share=drift_share,
+    )
     level = SimpleNamespace(
         level=SimpleNamespace(number=1), located=located, change_px=change_px, uncertainty=SimpleNamespace(mean_px=1.0)
     )
     level.narrow = LevelResult.narrow.fget(level)
     return level
+
+
+@pytest.mark.parametrize(("drift_share", "doubtful"), [(0.0, True), (0.96, False)])
+def test_bend_of_a_long_path_is_trusted(explained: Explained, drift_share: float, doubtful: bool) -> None:
+    motion = replace(explained.motion, std_px=np.where(explained.motion.located, 4.0, np.inf))
+    verdict = judge(replace(explained, motion=motion), [level_with(drift_share=drift_share)])
+    assert [reason.figure for reason in verdict.reasons] == [pytest.approx(4)] * doubtful
 
 
 @pytest.mark.parametrize(("times", "deviance", "doubtful"), [(9.0, 0.0, False), (2.0, 40.0, False), (9.0, 40.0, True)], ids=str)

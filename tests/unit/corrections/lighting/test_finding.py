@@ -11,7 +11,15 @@ from photonpano import FrameSpan
 from photonpano.capture import capture_of, in_light
 from photonpano.corrections import ColourFilter, Vignette, corrected_source, divided_by
 from photonpano.corrections.gains import SeenCells, local_flicker, solve_gains
-from photonpano.corrections.lighting import PixelGain, decision_of, find_light, in_light_of, measure_pixel_gain, write_light
+from photonpano.corrections.lighting import (
+    PixelGain,
+    decision_of,
+    find_light,
+    gain_of_frames,
+    in_light_of,
+    measure_pixel_gain,
+    write_light,
+)
 from photonpano.execution.context import Context
 from photonpano.geometry import Canvas, translation
 from photonpano.merging.accumulate import gain_image
@@ -40,6 +48,18 @@ def panned(
         gain = light[first : first + 8].reshape(8, *light.shape[1:] or (1, 1))
         frames[first : first + 8] = rng.random((8, *SHAPE)) < -np.expm1(-view * gain)
     return MemorySource(frames)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_lamp_that_is_switched_shows_no_slow_change(seed: int) -> None:
+    """Harmonics miss what little light is left in the dark by more than that, and by more than photon noise."""
+    light = np.where(np.arange(900) % 60 < 20, 0.05, 1.47)
+    gain, std = light.reshape(-1, 4).mean(axis=1), np.where(light[::4] < 1, 0.037, 0.009)
+    noisy = gain * (1 + std * np.random.default_rng(seed).standard_normal(225))
+    found, _, frequency = gain_of_frames(np.arange(225) * 4 + 1.5, noisy, std, np.full(225, 4.0), 900)
+    assert frequency == pytest.approx(1 / 60, rel=0.01)
+    assert np.quantile(abs(found - light), 0.9) < 0.5
+    assert found[light > 1].reshape(15, 40).mean(axis=1) == pytest.approx(1.47, abs=0.1)
 
 
 @pytest.mark.parametrize("seed", range(2))
