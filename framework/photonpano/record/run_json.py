@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -372,6 +373,9 @@ def plugin_records(plan: Plan) -> list[PluginRecord]:
     return list(seen.values())
 
 
+installed_version = cache(importlib.metadata.version)  # which parses the whole description of a distribution each time
+
+
 def library_versions(plan: Plan) -> dict[str, str]:
     """Return the versions of Python and of the libraries that the result depends on."""
     versions = {"python": sys.version.split()[0]}
@@ -379,7 +383,7 @@ def library_versions(plan: Plan) -> dict[str, str]:
     for name in dict.fromkeys((*_LIBRARIES, *required)):
         # The distribution may have another name than the module.
         with suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
+            versions[name] = installed_version(name)
     return versions
 
 
