@@ -317,8 +317,7 @@ class _Mode:
         self.scales = _SCALES * np.median(noise.diagonal() / jerk.diagonal())
         # All scales are factorised at once, as blocks of one banded matrix.
         bands, jerks = (_banded(each, _ORDER)[:, None] for each in (noise, jerk))
-        blocks = (bands + self.scales[:, None] * jerks).reshape(len(bands), -1)
-        factor = cholesky_banded(blocks)
+        factor = cholesky_banded((bands + self.scales[:, None] * jerks).reshape(len(bands), -1))
         solved = cho_solve_banded((factor, False), np.tile(observed, len(self.scales)))
         self.squares = solved.reshape(len(self.scales), -1) @ observed
         self.determinants = 2 * np.log(factor[-1]).reshape(len(self.scales), -1).sum(axis=1)

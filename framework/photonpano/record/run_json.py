@@ -362,6 +362,7 @@ def _number(value: float) -> float | None:
 
 
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "scipy", "pydantic", "pluggy", "tifffile")
+_version_of = cache(importlib.metadata.version)  # which reads the whole description of a distribution each time
 
 
 def plugin_records(plan: Plan) -> list[PluginRecord]:
@@ -373,9 +374,6 @@ def plugin_records(plan: Plan) -> list[PluginRecord]:
     return list(seen.values())
 
 
-installed_version = cache(importlib.metadata.version)  # which parses the whole description of a distribution each time
-
-
 def library_versions(plan: Plan) -> dict[str, str]:
     """Return the versions of Python and of the libraries that the result depends on."""
     versions = {"python": sys.version.split()[0]}
@@ -383,7 +381,7 @@ def library_versions(plan: Plan) -> dict[str, str]:
     for name in dict.fromkeys((*_LIBRARIES, *required)):
         # The distribution may have another name than the module.
         with suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = installed_version(name)
+            versions[name] = _version_of(name)
     return versions
 
 
