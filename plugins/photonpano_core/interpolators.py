@@ -319,8 +319,8 @@ class _Mode:
         bands, jerks = (_banded(each, _ORDER)[:, None] for each in (noise, jerk))
         factor = cholesky_banded((bands + self.scales[:, None] * jerks).reshape(len(bands), -1))
         solved = cho_solve_banded((factor, False), np.tile(observed, len(self.scales)))
-        self.squares = solved.reshape(len(self.scales), -1) @ observed
-        self.determinants = 2 * np.log(factor[-1]).reshape(len(self.scales), -1).sum(axis=1)
+        self.squares: FloatArray = solved.reshape(len(self.scales), -1) @ observed
+        self.determinants: FloatArray = 2 * np.log(factor[-1]).reshape(len(self.scales), -1).sum(axis=1)
 
     def deviances(self, noises: FloatArray) -> FloatArray:
         """Return the deviances, minus twice the log likelihoods, for S variances of the noise: (S, L)."""

@@ -311,7 +311,7 @@ def test_captures_of_the_paper_are_unpacked_from_their_archive(examples, tmp_pat
     ("name", "small", "pictures", "std"),
     [
         ("poses", {"pose.with.group_size": 15}, 16, 0.03),
-        ("stratified-poses", {"pose.with.group_size": 20, "pose.with.levels": 2}, 0, 0.01),
+        ("stratified-poses", {"pose.with.group_size": 30, "pose.with.levels": 2}, 0, 0.01),
     ],
 )
 def test_example_of_poses_runs(examples, tmp_path, without_report, name, small, pictures, std):
