@@ -315,12 +315,12 @@ class _Mode:
         """Take the (N - 3,) third differences, and their covariances V and J from noise and jerk of unit variance."""
         self.n_observed = len(observed)
         self.scales = _SCALES * np.median(noise.diagonal() / jerk.diagonal())
-        self.squares, self.determinants = np.empty((2, len(self.scales)))
-        noise_bands, jerk_bands = _banded(noise, _ORDER), _banded(jerk, _ORDER)
-        for index, scale in enumerate(self.scales):
-            factor = cholesky_banded(noise_bands + scale * jerk_bands)
-            self.squares[index] = observed @ cho_solve_banded((factor, False), observed)
-            self.determinants[index] = 2 * np.log(factor[-1]).sum()
+        # All scales are factorised at once, as blocks of one banded matrix.
+        bands, jerks = (_banded(each, _ORDER)[:, None] for each in (noise, jerk))
+        factor = cholesky_banded((bands + self.scales[:, None] * jerks).reshape(len(bands), -1))
+        solved = cho_solve_banded((factor, False), np.tile(observed, len(self.scales)))
+        self.squares: FloatArray = solved.reshape(len(self.scales), -1) @ observed
+        self.determinants: FloatArray = 2 * np.log(factor[-1]).reshape(len(self.scales), -1).sum(axis=1)
 
     def deviances(self, noises: FloatArray) -> FloatArray:
         """Return the deviances, minus twice the log likelihoods, for S variances of the noise: (S, L)."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import doctest
 import importlib.util
+import io
 import itertools
-import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -92,15 +94,19 @@ def ident(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-@pytest.fixture
-def make_capture(small_capture) -> Callable[[str], None]:
-    """Put a small capture and its truth into the current folder: `make_capture("capture.npy")`."""
+@pytest.fixture(scope="session")
+def captures(simulated, small_capture) -> dict[str, Callable[[str], None]]:
+    """What puts a capture and its truth into the current folder, by name: `make_capture("capture.npy")`.
 
-    def make(name: str) -> None:
-        shutil.copy(small_capture, name)
-        shutil.copy(truth_path(small_capture), truth_path(Path(name)))
+    Runs of the first take half as long: 200 frames of 80x112 px on a steady pan.
+    """
+    steady = simulated(n_frames=200, frame_shape=[80, 112], path={"kind": "pan", "length_px": 40, "angle_deg": 10})
 
-    return make
+    def copy(capture: Path, name: str) -> None:
+        shutil.copy(capture, name)
+        shutil.copy(truth_path(capture), truth_path(Path(name)))
+
+    return {"make_capture": partial(copy, steady), "make_trembling_capture": partial(copy, small_capture)}
 
 
 @pytest.fixture
@@ -227,17 +233,17 @@ class Reader:
     def run_module(self, block: Block, module: str, arguments: list[str], shown: str) -> None:
         """Run a module of the repository, which pages run in its root."""
         more = ["--help"] if block.marker == "test: parse" else []
-        paths = os.pathsep.join([str(ROOT), *filter(None, sys.path)])
-        done = subprocess.run(
-            [sys.executable, "-m", module, *arguments, *more],
-            env={**os.environ, "PYTHONPATH": paths},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, f"{block}: {module}\n{done.stderr}"
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
+            patch.syspath_prepend(ROOT)
+            patch.setattr(sys, "argv", [module, *arguments, *more])
+            code: Any = 0
+            try:
+                runpy.run_module(module, run_name="__main__")
+            except SystemExit as ended:
+                code = ended.code
+        assert not code, f"{block}: {module}\n{printed.getvalue()}"
         if not more:
-            self.compare(block, [module, *arguments], done.stdout, shown)
+            self.compare(block, [module, *arguments], printed.getvalue(), shown)
 
     def compare(self, block: Block, words: list[str], printed: str, shown: str) -> None:
         flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
@@ -265,10 +271,10 @@ class Reader:
 @pytest.mark.documentation
 @pytest.mark.parametrize("page", PAGES, ids=ident)
 @pytest.mark.usefixtures("without_report")
-def test_code_and_commands_of_page_work(page, workplace, make_capture, monkeypatch):
+def test_code_and_commands_of_page_work(page, workplace, captures, monkeypatch):
     # Pages do not show the lines that long commands print as they go on, and on a busy machine any command is long.
     monkeypatch.setattr(cli_progress, "INTERVAL_S", 3600.0)
-    reader = Reader(workplace, {"make_capture": make_capture, "figures": partial(compare_figures, page)})
+    reader = Reader(workplace, {**captures, "figures": partial(compare_figures, page)})
     for block in blocks_of(page):
         try:
             reader.follow(block)

@@ -20,7 +20,7 @@ LONG_GROUPS = {"resample": {"with": {"group_size": 100}}, "refine": []}
 # What the simulator is told; the spec; what is doubtful; the advice; and the spec that follows it.
 ADVICE: dict[str, tuple[dict[str, Any], dict[str, Any], str, str, dict[str, Any]]] = {
     "refiner": (
-        {"path": PAN | {"shake": {"rms_px": 2, "frequencies_hz": [700, 1100]}}, "n_frames": 600},
+        {"path": PAN | {"shake": {"rms_px": 2, "frequencies_hz": [700, 1100]}}, "n_frames": 500},
         LONG_GROUPS,
         "the image moves within groups by more than the motion that was found",
         "use the refiner short-spans",
@@ -41,7 +41,7 @@ ADVICE: dict[str, tuple[dict[str, Any], dict[str, Any], str, str, dict[str, Any]
         {"light": "auto"},
     ),
     "lens": (
-        {"path": TURN, "focal_length_px": 200, "distortion": {"k1": -0.3}},
+        {"path": TURN, "focal_length_px": 200, "distortion": {"k1": -0.3}, "frame_shape": [96, 144], "n_frames": 400},
         {"motion": {"model": "homography"}},
         "the lens distorts the frames, which bends the motion",
         "write motion: {model: rotation} and camera: {distortion: {k1: find}}",
@@ -60,7 +60,7 @@ ADVICE: dict[str, tuple[dict[str, Any], dict[str, Any], str, str, dict[str, Any]
 @pytest.mark.parametrize("case", ADVICE)
 def test_advice_that_is_followed_helps(case: str, simulated: Callable[..., Path], tmp_path: Path) -> None:
     settings, spec, what, advice, followed = ADVICE[case]
-    capture = simulated(**{"frame_shape": [96, 144], "n_frames": 400} | settings)
+    capture = simulated(**{"frame_shape": [80, 128], "n_frames": 300} | settings)
     base = {"version": 1, "source": {"use": "packed-npy", "with": {"path": str(capture), "frame_rate_hz": 96800}}, "levels": 1}
     doubtful, better = (
         run(parse_spec(base | each, output=tmp_path / name)) for name, each in (("before", spec), ("after", followed))
@@ -69,7 +69,7 @@ def test_advice_that_is_followed_helps(case: str, simulated: Callable[..., Path]
     assert better.verdict is not None
     assert advice in {reason.what: reason.what_to_do for reason in (*doubtful.verdict.reasons, *doubtful.verdict.notes)}[what]
     assert better.verdict.status == "trusted"
-    scores = [evaluate(each.directory, truth_path(capture)) for each in (doubtful, better)]
+    scores = [evaluate(each.directory, truth_path(capture), oracle=False) for each in (doubtful, better)]
     if case == "flat-field":  # the panorama is worse, rather than the motion
         before_db, after_db = (score.panorama.psnr_db for score in scores)
         assert after_db > before_db + 1

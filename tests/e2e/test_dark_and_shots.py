@@ -77,11 +77,18 @@ def test_dark_frames_are_not_located_and_cost_the_others_nothing(
     assert flux_of(tmp_path / "run") == pytest.approx(flux_of(tmp_path / "open"), rel=0.03)
 
 
+@pytest.fixture(scope="module")
+def steady(simulated: Callable[..., Path]) -> Path:
+    """A capture without a shutter, beside its run."""
+    capture = simulated(path=PAN)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("photonpano.pipeline.run.render_report", lambda *_: "")
+        run_plan(parse_spec(spec_of(capture), output=capture.parent / "run"))
+    return capture
+
+
 @pytest.mark.parametrize(("period", "n_dark"), [(2, 1), (30, 10)])
-def test_frames_between_flashes_of_a_lamp_are_no_data(
-    period: int, n_dark: int, simulated: Callable[..., Path], tmp_path: Path
-) -> None:
-    steady = simulated(path=PAN)
+def test_frames_between_flashes_of_a_lamp_are_no_data(period: int, n_dark: int, steady: Path, tmp_path: Path) -> None:
     frames = np.load(steady)
     unlit = np.arange(len(frames)) % period >= period - n_dark
     frames[unlit] = 0
@@ -95,12 +102,11 @@ def test_frames_between_flashes_of_a_lamp_are_no_data(
     )
     assert result.verdict is not None
     assert [str(each) for each in result.verdict.reasons] == []
-    run_plan(parse_spec(spec_of(steady), output=tmp_path / "steady"))
-    assert flux_of(tmp_path / "run") == pytest.approx(flux_of(tmp_path / "steady"), rel=0.01)
+    assert flux_of(tmp_path / "run") == pytest.approx(flux_of(steady.parent / "run"), rel=0.01)
 
 
-def test_dim_frames_are_light(simulated: Callable[..., Path], tmp_path: Path) -> None:
-    frames = np.load(simulated(path=PAN))
+def test_dim_frames_are_light(steady: Path, tmp_path: Path) -> None:
+    frames = np.load(steady)
     rng = np.random.default_rng(0)
     kept = [np.packbits(rng.random((100, *frames.shape[1:], 8)) < 0.1)[: frames[200:].size].reshape(frames[200:].shape)]
     frames[200:] &= kept[0]

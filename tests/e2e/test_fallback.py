@@ -53,7 +53,7 @@ def catalog() -> Catalog:
 @pytest.fixture(scope="module")
 def run(outcome_of: Callable) -> Callable[..., Any]:
     def run(spec: dict[str, Any], catalog: Catalog, threads: int = 2) -> Any:
-        return outcome_of(parse_spec(spec | {"levels": 1, "run": {"threads": threads}}, catalog=catalog))
+        return outcome_of(parse_spec(spec | {"levels": 1, "refine": [], "run": {"threads": threads}}, catalog=catalog))
 
     return run
 

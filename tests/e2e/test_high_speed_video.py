@@ -1,4 +1,4 @@
-"""Panoramas of a simulated high-speed camera: 90 frames of 128x160 px at 500 Hz, 2.7 px a frame."""
+"""Panoramas of a simulated high-speed camera: 60 frames of 128x160 px at 500 Hz, 2.7 px a frame."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ pytestmark = pytest.mark.usefixtures("without_report")
 SHAKE = {"rms_px": 1.0, "frequencies_hz": [3, 5, 8]}
 CAMERA = {
     "scene": {"kind": "street", "width": 1024, "height": 682},
-    "path": {"kind": "pan", "length_px": 240, "angle_deg": 10, "shake": SHAKE},
-    "n_frames": 90,
+    "path": {"kind": "pan", "length_px": 160, "angle_deg": 10, "shake": SHAKE},
+    "n_frames": 60,
     "frame_shape": [128, 160],
 }
 

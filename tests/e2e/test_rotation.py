@@ -18,8 +18,8 @@ SIMULATED: dict[str, Any] = {
     "path": {"kind": "turn", "degrees": 80, "pitch_wobble_deg": 3, "roll_wobble_deg": 2},
     "frame_shape": [96, 160],
     "focal_length_px": FOCAL_PX,
-    "flux": 0.5,
-    "n_frames": 800,
+    "flux": 0.8,
+    "n_frames": 500,
     "distortion": {"k1": -0.08},
 }
 
@@ -37,7 +37,7 @@ def spec_of(capture: Path, **sections: Any) -> dict[str, Any]:
     return {
         "version": 1,
         "source": source,
-        "resample": {"use": "midpoint", "with": {"group_size": 50}},
+        "resample": {"use": "midpoint", "with": {"group_size": 32}},
         "refine": [],
         **sections,
     }

@@ -320,13 +320,16 @@ def _explained(series: FloatArray, weights: FloatArray, instants: FloatArray, fr
     """Return the mean square that waves of a frequency explain in (C, S) weighted series, each with a mean of its own."""
     turns = 2 * np.pi * frequency * instants
     columns = np.stack([np.ones(len(turns)), np.cos(turns), np.sin(turns)])
-    right = series @ columns.T
-    normal = (weights @ (columns[:, None] * columns).reshape(9, -1).T).reshape(-1, 3, 3)
-    total = np.maximum(normal[:, 0, 0], 1e-12)
-    normal[:, [1, 2], [1, 2]] += _LEAST_INFORMATION * total[:, None]
-    normal[:, [0, 1, 2], [0, 1, 2]] += 1e-12
-    waves = np.linalg.solve(normal, right[..., None])[..., 0]
-    return float(((waves * right).sum(axis=1) - right[:, 0] ** 2 / total).sum() / total.sum())
+    light, of_cosine, of_sine = (series @ columns.T).T
+    total, cosine, sine, squares, product = (weights @ np.concatenate([columns, columns[1] * columns[1:]]).T).T
+    total = np.maximum(total, 1e-12)
+    # Normal equations of cosine and sine, beside the mean: least squares by Cramer's rule.
+    of_cosine, of_sine = of_cosine - light * cosine / total, of_sine - light * sine / total
+    least, rest = _LEAST_INFORMATION * total + 1e-12, total - squares
+    squares, rest = squares - cosine**2 / total + least, rest - sine**2 / total + least
+    product = product - cosine * sine / total
+    gained = rest * of_cosine**2 - 2 * product * of_cosine * of_sine + squares * of_sine**2
+    return float((gained / (squares * rest - product**2)).sum() / total.sum())
 
 
 def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:

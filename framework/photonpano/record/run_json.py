@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -361,6 +362,7 @@ def _number(value: float) -> float | None:
 
 
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "scipy", "pydantic", "pluggy", "tifffile")
+_version_of = cache(importlib.metadata.version)  # which reads the whole description of a distribution each time
 
 
 def plugin_records(plan: Plan) -> list[PluginRecord]:
@@ -379,7 +381,7 @@ def library_versions(plan: Plan) -> dict[str, str]:
     for name in dict.fromkeys((*_LIBRARIES, *required)):
         # The distribution may have another name than the module.
         with suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
+            versions[name] = _version_of(name)
     return versions
 
 

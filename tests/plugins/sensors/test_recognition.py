@@ -21,7 +21,8 @@ NAMES = (
     "packed-npy npy zarr swissspad-half swissspad-full spad512 spad512-sparse mat-parts visionsim ubicept-h5 "
     "spike-dat video fastcam-mraw image-folder events"
 )
-SOURCES = {name: discover().find("source", name).contribution for name in NAMES.split()}
+CATALOG = discover()
+SOURCES = {name: CATALOG.find("source", name).contribution for name in NAMES.split()}
 PHOTRON = Path(__file__).parents[2] / "data" / "photron"
 FRAMES = np.random.default_rng(0).integers(0, 2, (6, 10, 16), dtype=np.uint8)
 

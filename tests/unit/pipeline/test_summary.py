@@ -1,5 +1,6 @@
 """Summaries and pictures of captures."""
 
+from functools import cache
 from typing import Any
 
 import cv2
@@ -32,17 +33,17 @@ class Film:
             self.valid = ~self.hot
         self.x_px = x_px
         self.front = np.zeros((0, 0))
+        self.frame = cache(self.made)  # spans overlap
+
+    def made(self, frame: int) -> np.ndarray:
+        shift = np.float32([[1, 0, -float(self.x_px(frame))], [0, 1, 0]])
+        flux = cv2.warpAffine(self.scene, shift, SHAPE[::-1], borderMode=cv2.BORDER_REFLECT)
+        height, width = self.front.shape
+        flux[20 : 20 + height, 25 : 25 + width] = self.front
+        return (np.random.default_rng(frame).random(SHAPE) < -np.expm1(-flux)) | self.hot
 
     def counts(self, span: FrameSpan) -> np.ndarray:
-        counts = np.zeros(SHAPE, np.uint32)
-        for frame in range(span.start, span.stop):
-            shift = np.float32([[1, 0, -float(self.x_px(frame))], [0, 1, 0]])
-            flux = cv2.warpAffine(self.scene, shift, SHAPE[::-1], borderMode=cv2.BORDER_REFLECT)
-            height, width = self.front.shape
-            flux[20 : 20 + height, 25 : 25 + width] = self.front
-            lit = np.random.default_rng(frame).random(SHAPE) < -np.expm1(-flux)
-            counts += lit | self.hot
-        return counts
+        return np.sum([self.frame(index) for index in range(span.start, span.stop)], axis=0, dtype=np.uint32)
 
 
 @pytest.mark.parametrize("speed_px", [0.05, 0.3, 2.0])

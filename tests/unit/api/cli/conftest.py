@@ -1,4 +1,3 @@
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -59,10 +58,11 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
     (folder / "capture.yaml").write_text(CAPTURE)
     (folder / "run.yaml").write_text(RUN)
-    for name, arguments in (("simulate", ["capture.yaml", "--output", "cube.npy"]), ("run", ["run.yaml"])):
-        done = subprocess.run(
-            [*PROGRAM, name, *arguments], cwd=folder, capture_output=True, text=True, check=True, stdin=subprocess.DEVNULL
-        )
-        (folder / f"{name}.out").write_text(done.stdout)
-        (folder / f"{name}.err").write_text(done.stderr)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for name, arguments in (("simulate", ["capture.yaml", "--output", "cube.npy"]), ("run", ["run.yaml"])):
+            done = CliRunner().invoke(app, [name, *arguments], catch_exceptions=False)
+            assert done.exit_code == 0, done.output
+            (folder / f"{name}.out").write_text(done.stdout)
+            (folder / f"{name}.err").write_text(done.stderr)
     return folder
