@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from photonpano.capture import Capture, LinearCorrection, capture_of
-from photonpano.corrections.geometry import Correction
-from photonpano.corrections.lighting import speed_px
+from photonpano.corrections.geometry import Correction, speed_px
 from photonpano.errors import InputError
 from photonpano.geometry import transform_points
 from photonpano.photometry.images import sums_of_blocks

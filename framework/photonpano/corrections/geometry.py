@@ -1,4 +1,7 @@
-"""The interface of a correction, and those that move pixels: each applies one function to an array of the pixels' numbers."""
+"""The interface of a correction, and those that move pixels: each applies one function to an array of the pixels' numbers.
+
+And how fast the image moves, by which corrections that look at the frames choose how long to sum.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,9 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from photonpano.capture import MISSING, Capture, Index, MaskedSpan, numbered
+from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.errors import InputError
+from photonpano.geometry import steps_px
 from photonpano.plugins.contributions import Config
 from photonpano.values import BoolArray, FluxImage, FrameSpan, Still
 
@@ -271,3 +276,10 @@ def _part(ends: tuple[int | None, int | None], length: int, what: str) -> slice:
         given = ", ".join("null" if end is None else str(end) for end in ends)
         raise InputError(f"there are no {what} [{given}]: frames have {length} {what} at this place of the list")
     return slice(start, stop)
+
+
+def speed_px(source: Source, trajectory: Trajectory) -> float:
+    """Return the usual speed of the image, in px per frame."""
+    instants = np.linspace(0, source.info.n_frames - 1, 65)
+    moved = steps_px(trajectory.at(instants), source.info.frame_shape).max(axis=-1)
+    return float(np.median(moved)) / max(float(instants[1]), 1e-9)

@@ -25,9 +25,10 @@ from photonpano.corrections.gains import (
     seen_cells,
     solve_gains,
 )
+from photonpano.corrections.geometry import speed_px
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
-from photonpano.geometry import corner_displacements, inverse
+from photonpano.geometry import inverse
 from photonpano.reading import reading
 from photonpano.values import Decision, FloatArray, FluxImage, FrameSpan, Light
 
@@ -188,14 +189,6 @@ def _spread(n_frames: int, length: int) -> list[FrameSpan]:
     jitter = np.random.default_rng(0).uniform(-0.3, 0.3, len(even)) * max(n_frames / _PROBES - length, 0)
     starts = np.clip(even + jitter, 0, n_frames - length).astype(int)
     return [FrameSpan(start, start + length) for start in np.unique(starts).tolist()]
-
-
-def speed_px(source: Source, trajectory: Trajectory) -> float:
-    """Return the usual speed of the image, in px per frame."""
-    instants = np.linspace(0, source.info.n_frames - 1, 65)
-    steps = inverse(trajectory.at(instants[:-1])) @ trajectory.at(instants[1:])
-    moved = np.median(corner_displacements(steps, np.eye(3), source.info.frame_shape).max(axis=-1))
-    return float(moved) / max(float(instants[1]), 1e-9)
 
 
 def flicker_frequency(instants: FloatArray, gain: FloatArray) -> float:

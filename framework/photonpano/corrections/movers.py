@@ -17,7 +17,7 @@ from scipy.ndimage import maximum_filter1d, uniform_filter, uniform_filter1d
 from photonpano.capture import capture_of, with_background
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.corrections.gains import least_weight, scene_canvas
-from photonpano.corrections.lighting import speed_px
+from photonpano.corrections.geometry import speed_px
 from photonpano.errors import InputError
 from photonpano.execution.context import Context
 from photonpano.filtering import gradient_of

@@ -87,7 +87,9 @@ def _untested_motion(run: TestedRun) -> Found:
 def _parts(run: TestedRun) -> Found | None:
     """As where rows take turns, or a part of the sensor is read out some frames later than the rest."""
     apart = parts_apart(run.explained.residuals.pixel_slopes)
-    if apart is None or apart.sigmas <= _SURE_SIGMAS or run.findings.rival_motion is not None:  # that of a thing in the frame
+    if apart is None or apart.sigmas <= _SURE_SIGMAS:
+        return None
+    if run.findings.rival_motion is not None or _standing.judged(run):  # a thing in the frame moves, or stands, by itself
         return None
     late = f", as if read {apart.frames:.2g} frames apart" if apart.frames else ""
     return Found(apart.px, f"px between {apart.parts}{late}")
