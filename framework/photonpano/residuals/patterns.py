@@ -17,7 +17,7 @@ _INSTANTS = 64  # instants of the motion at which the effect of a lens is comput
 _SIGNIFICANT = 4.0  # standard deviations by which the scatter must exceed that of noise
 _SMALLEST_PX = 0.02  # shaking by less than this stays within spans
 _TURNS = 2, 3, 4, 8  # rows of which one may lie apart
-_TOLD = 1e-3  # least share of what rows tell of their shift that is of a difference of parts
+_LEAST_PART = 0.1  # of what rows tell of their shift; at the ends of a sensor, a lens bends by more than a cubic polynomial
 _FREQUENCIES = 256  # at which the spectrum is computed, up to half a cycle per frame
 
 
@@ -146,7 +146,8 @@ def _lines_apart(information: FloatArray, right: FloatArray, lines: str, place: 
     by_smooth, (by_right, squares) = products[:, :-2], products[:, -2:].T
     beyond = by_smooth @ np.linalg.inv(normal)
     left, known = by_right - beyond @ smooth.T @ right, squares - (beyond * by_smooth).sum(axis=1)
-    told = np.divide(left**2, known, out=np.zeros(len(known)), where=known > _TOLD * information.sum())
+    share = squares / information.sum()
+    told = np.divide(left**2, known, out=np.zeros(len(known)), where=np.minimum(share, 1 - share) > _LEAST_PART)
     best = int(told.argmax())
     start = best - len(turns) + 1
     columns = np.column_stack([smooth, taken[best] if start <= 0 else every >= start])
