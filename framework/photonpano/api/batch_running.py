@@ -6,7 +6,6 @@ So a run begins with clean memory, and may crash or be killed: its row says how 
 from __future__ import annotations
 
 import csv
-import gc
 import io
 import logging
 import os
@@ -251,5 +250,4 @@ def _table(directory: Path, rows: Sequence[BatchRow], keys: Sequence[str]) -> st
 
 
 if __name__ == "__main__":
-    gc.freeze()  # as on the command line
     main(*map(Path, sys.argv[1:]))

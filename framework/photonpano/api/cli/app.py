@@ -6,7 +6,6 @@ Plugins add commands by entry points of the group `photonpano.commands`: the nam
 from __future__ import annotations
 
 import ast
-import gc
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cached_property
@@ -148,5 +147,4 @@ def main() -> None:
     """Run the program with the arguments of the process."""
     prepare_streams()
     end_on_signals()
-    gc.disable()  # until the command runs: nothing that is imported is garbage, and looking for it takes a tenth of the time
     app(prog_name="photonpano")  # with "python -m photonpano", completion would not work

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import importlib
 import inspect
 import re
@@ -127,9 +126,6 @@ class LoadedCommand(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
-        if not gc.isenabled():  # as `main` has it
-            gc.freeze()
-            gc.enable()
         with verbosity_of(ctx), reported(debug=ctx.find_root().params["debug"]):
             return super().invoke(ctx)
 
