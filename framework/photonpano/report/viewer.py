@@ -222,7 +222,8 @@ def views_of_instant(
     averaged = source.info.spread(_AVERAGED, _AVERAGED_FRAMES)
     alone = still_exposure(source, FrameSpan(frame, frame + 1))
     alone *= panorama.white_flux / (float(np.nanmax(alone, initial=0)) or 1.0)  # a lit pixel of a binary frame is white
-    among = "all frames" if len(averaged) == 1 else f"{sum(map(len, averaged)):,} frames of all over the capture"
+    number, total = sum(map(len, averaged)), source.info.n_frames
+    among = f"all {total:,} frames" if number == total else f"{number:,} of {total:,} frames"
     found = [
         view("One frame", f"frame {frame:,}", alone, itself, sharp=True),
         view("Plain average", f"{among}, without motion", still_exposure(source, *averaged), itself),
