@@ -40,6 +40,7 @@ from photonpano_direct.normal_equations import (
     expected_px,
     information_of,
     inverse_homography,
+    local_noise,
     product,
     residuals_and_moments,
     scaled_to_one,
@@ -290,9 +291,19 @@ _SUMS = 9
 
 
 def _sums_of_patches(template: Layer, buffers: Buffers) -> FloatArray:
-    """Return the (P, 9) sums of `_add_up` over the patches of a template; residual and weight are those of its last step."""
+    """Return the (P, 9) sums of `_add_up` over the patches of a template; residual and weight are those of its last step.
+
+    Noise is taken from what the shift of each patch leaves of the residuals around a pixel.
+    """
     sums = np.zeros((PATCHES, PATCHES, _SUMS))
     _add_up(template, buffers, sums)
+    steps = np.linalg.pinv(sums[..., [0, 1, 1, 2]].reshape(PATCHES, PATCHES, 2, 2), hermitian=True) @ sums[..., 3:5, None]
+    row, column = (np.arange(side) * PATCHES // side for side in template.image.shape)
+    along_x, along_y = np.moveaxis(steps[..., 0].astype(np.float32), -1, 0)[:, row][:, :, column]
+    explained = template.gradients[0] * along_x + template.gradients[1] * along_y
+    noise = local_noise(buffers._replace(residual=buffers.residual - explained), template.blur_px)
+    sums[:] = 0
+    _add_up(template._replace(smoothed=template.smoothed * np.sqrt(noise)), buffers, sums)
     return sums.reshape(-1, _SUMS)
 
 
@@ -333,12 +344,11 @@ def _patches_of(sums: FloatArray, homography: Homography, shape: tuple[int, int]
 def _add_up(template: Layer, buffers: Buffers, sums: FloatArray) -> None:
     """Add up (rows, columns, 9) sums over the pixels of each patch, with the gradient g, residual r and weight w of a pixel.
 
-    They are w times the products xx, xy, yy of g; w r g; w^2 times the products of the smoothed g, relative to the mean weight;
-    and the number of pixels that both images see.
+    They are w times the products xx, xy, yy of g; w r g; w^2 times the products of the smoothed g; and the number of pixels
+    that both images see.
     """
     height, width = template.image.shape
     rows, columns, _ = sums.shape
-    total, count = 0.0, 0
     for y in range(height):
         row = y * rows // height
         residual, weight = buffers.residual[y], buffers.weight[y]
@@ -360,11 +370,3 @@ def _add_up(template: Layer, buffers: Buffers, sums: FloatArray) -> None:
                     part[6] += w2 * sx[x] * sy[x]
                     part[7] += w2 * sy[x] * sy[x]
                     part[8] += 1
-                    total += w
-                    count += 1
-    # A product with a slice would compile the messages of arrays that do not fit, for two seconds.
-    factor = count / max(total, 1e-20)
-    for row in range(rows):
-        for column in range(columns):
-            for k in range(5, 8):
-                sums[row, column, k] *= factor

@@ -432,7 +432,7 @@ def expected_px(information: FloatArray, basis: FloatArray, to_corners: FloatArr
 _AROUND = 2.0  # standard deviation of the Gaussian within which residuals are averaged, in that of the blur
 
 
-def _local_noise(buffers: Buffers, blur_px: float) -> Image:
+def local_noise(buffers: Buffers, blur_px: float) -> Image:
     """Return the mean squared residual around each pixel, over that of all that both images see, weighted: (H, W).
 
     In the dark, pixels hold less than a photon, and no scale makes noise uniform: a star is noisier than the sky around it.
@@ -458,7 +458,7 @@ def information_of(
     buffers come from `residuals_and_moments`, and all are overwritten. `noise_ratio` is the mean squared residual relative to
     that of photon noise.
     """
-    pixels, noise = int(np.count_nonzero(buffers.weight)), _local_noise(buffers, moving.blur_px)
+    pixels, noise = int(np.count_nonzero(buffers.weight)), local_noise(buffers, moving.blur_px)
     _, hessian, common = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
     # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights, noise and
     # positions hardly change within the blur, so M needs only blurred gradients.
