@@ -152,7 +152,17 @@ def solve(
         return tied.alone(model)
     fits = _rivals(tied, start, model)
     tied, fits, chosen = _of_background(tied, start, fits, _chosen(fits, tied))
-    return tied.solution(fits[chosen], chosen, cache(partial(_compared, tied, start, fits, chosen)))
+    return tied.solution(_steadied(tied, fits[chosen]), chosen, cache(partial(_compared, tied, start, fits, chosen)))
+
+
+def _steadied(tied: _Tied, fit: _Fit) -> _Fit:
+    """Return a fit whose roll is a random walk, too, if homographies roll.
+
+    Models are compared without, since the roll of a camera that turns has no prior.
+    """
+    if not isinstance(fit.adjustment, PlanarAdjustment) or not fit.adjustment.can_learn_roll:
+        return fit
+    return _Fit(*tied.learnt(fit.adjustment.learning_roll(), fit.state, fit.norms, fit.kept), fit.kept)
 
 
 def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[MotionModel, _Fit]:
@@ -471,11 +481,11 @@ class _Tied:
         if not learns:
             return _Fit(adjustment, found, norms, kept)
         adjustment.hold_noise(norms, kept)
-        adjustment, found, norms = self._learnt(adjustment, found, norms, kept)
+        adjustment, found, norms = self.learnt(adjustment, found, norms, kept)
         inliers = adjustment.inliers(norms)
         if not inliers.all() and not component_labels(len(self.order), self.compact_pairs[inliers]).any():
             kept = inliers
-            adjustment, found, norms = self._learnt(adjustment, *adjustment.minimise(found, kept), kept)
+            adjustment, found, norms = self.learnt(adjustment, *adjustment.minimise(found, kept), kept)
         return _Fit(adjustment, found, norms, kept)
 
     def stepped(self, model: MotionModel, fit: _Fit) -> _Fit:
@@ -484,7 +494,7 @@ class _Tied:
         state, norms = adjustment.minimise(fit.state, fit.kept, fit.weights, iterations=_TRIED)
         return _Fit(adjustment, state, norms, fit.kept, fit.state)
 
-    def _learnt(
+    def learnt(
         self, adjustment: Adjustment[Any], found: Any, norms: FloatArray, kept: BoolArray
     ) -> tuple[Adjustment[Any], Any, FloatArray]:
         """Solve again with variances of the prior that the solution shows, and without unknowns that these hold at 0."""
