@@ -122,6 +122,22 @@ class GraphSolution:
     parallax: float = 0.0
     # returns what of a given camera the edges contradict most; None where nothing is given, and for homographies
     freed: Callable[[], Freed | None] = lambda: None
+    # returns the solution without roll; None unless all that homographies do beside shifts is roll
+    without_roll: Callable[[], GraphSolution] | None = None
+
+    def rolls_by_chance(self, errors_px: FloatArray, frame_shape: tuple[int, int]) -> bool:
+        """Return whether homographies roll no more, as a whole and from each to the next, than one of the drawn errors does.
+
+        `errors_px` (L, 8, S) are those of the assessment. Then noise is all that is told of the roll.
+        """
+        frame = corners(frame_shape)
+        away = frame - frame.mean(axis=0)
+        across = (np.stack([-away[:, 1], away[:, 0]], axis=-1) / (away**2).sum()).ravel()
+        homographies = self.homographies[self.located]
+        found = np.unwrap(np.arctan2(homographies[:, 1, 0], homographies[:, 0, 0]))
+        rolls = np.column_stack([found, np.einsum("c,ncs->ns", across, errors_px)])
+        sizes = np.array([rolls.var(axis=0), np.diff(rolls, axis=0).var(axis=0)])
+        return bool((sizes[:, 0] <= sizes[:, 1:].max(axis=1)).all())
 
 
 def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
@@ -152,17 +168,7 @@ def solve(
         return tied.alone(model)
     fits = _rivals(tied, start, model)
     tied, fits, chosen = _of_background(tied, start, fits, _chosen(fits, tied))
-    return tied.solution(_steadied(tied, fits[chosen]), chosen, cache(partial(_compared, tied, start, fits, chosen)))
-
-
-def _steadied(tied: _Tied, fit: _Fit) -> _Fit:
-    """Return a fit whose roll is a random walk, too, if homographies roll.
-
-    Models are compared without, since the roll of a camera that turns has no prior.
-    """
-    if not isinstance(fit.adjustment, PlanarAdjustment) or not fit.adjustment.can_learn_roll:
-        return fit
-    return _Fit(*tied.learnt(fit.adjustment.learning_roll(), fit.state, fit.norms, fit.kept), fit.kept)
+    return tied.solution(fits[chosen], chosen, cache(partial(_compared, tied, start, fits, chosen)))
 
 
 def _rivals(tied: _Tied, start: FloatArray | None, model: MotionModel) -> dict[MotionModel, _Fit]:
@@ -481,11 +487,11 @@ class _Tied:
         if not learns:
             return _Fit(adjustment, found, norms, kept)
         adjustment.hold_noise(norms, kept)
-        adjustment, found, norms = self.learnt(adjustment, found, norms, kept)
+        adjustment, found, norms = self._learnt(adjustment, found, norms, kept)
         inliers = adjustment.inliers(norms)
         if not inliers.all() and not component_labels(len(self.order), self.compact_pairs[inliers]).any():
             kept = inliers
-            adjustment, found, norms = self.learnt(adjustment, *adjustment.minimise(found, kept), kept)
+            adjustment, found, norms = self._learnt(adjustment, *adjustment.minimise(found, kept), kept)
         return _Fit(adjustment, found, norms, kept)
 
     def stepped(self, model: MotionModel, fit: _Fit) -> _Fit:
@@ -494,7 +500,7 @@ class _Tied:
         state, norms = adjustment.minimise(fit.state, fit.kept, fit.weights, iterations=_TRIED)
         return _Fit(adjustment, state, norms, fit.kept, fit.state)
 
-    def learnt(
+    def _learnt(
         self, adjustment: Adjustment[Any], found: Any, norms: FloatArray, kept: BoolArray
     ) -> tuple[Adjustment[Any], Any, FloatArray]:
         """Solve again with variances of the prior that the solution shows, and without unknowns that these hold at 0."""
@@ -510,9 +516,8 @@ class _Tied:
         adjustment, found = fit.adjustment, fit.state
         homographies = np.full((len(self.located), 3, 3), np.nan)
         homographies[self.located] = fit.homographies
-        assess = adjustment.assess
-        if isinstance(adjustment, PlanarAdjustment) and model.planar == "homography":
-            assess = adjustment.assess_beside_turns
+        planar = adjustment if isinstance(adjustment, PlanarAdjustment) else None
+        assess = adjustment.assess if planar is None or model.planar != "homography" else planar.assess_beside_turns
         return GraphSolution(
             homographies=homographies,
             located=self.located,
@@ -521,13 +526,21 @@ class _Tied:
             assess=partial(assess, found, fit.norms, fit.kept),
             model=model,
             rotations=found if isinstance(found, Rotations) else None,
-            walks_px=adjustment.walks_px if isinstance(adjustment, PlanarAdjustment) else {},
-            turning_px=adjustment.turning_px(found) if isinstance(adjustment, PlanarAdjustment) else None,
+            walks_px={} if planar is None else planar.walks_px,
+            turning_px=None if planar is None else planar.turning_px(found),
             compare=compare,
             layers=self.layers,
             parallax=self.parallax,
             freed=partial(_freed, self, model, fit),
+            without_roll=partial(self._without_roll, fit, model, compare) if planar is not None and planar.only_rolls else None,
         )
+
+    def _without_roll(self, fit: _Fit, model: MotionModel, compare: Callable[[], Mapping[str, Rival]]) -> GraphSolution:
+        """Return the solution of shifts alone, by the same pairs; the model is that of the fit, in which roll is none."""
+        assert isinstance(fit.adjustment, PlanarAdjustment)
+        adjustment = fit.adjustment.of(self.problem, "translation")
+        state, norms = adjustment.minimise(Plane(nearest("translation", fit.homographies, self.frame_shape)), fit.kept)
+        return self.solution(_Fit(adjustment, state, norms, fit.kept), model, compare)
 
     def alone(self, model: MotionModel) -> GraphSolution:
         """Return the solution of a single node."""

@@ -207,6 +207,9 @@ def locate(exposures: VirtualExposures, setting: LoopSetting, start: StartingMot
             if fair != closures:
                 closures, solution = fair, solve(groups, edges + fair, anchor, frame_shape=shape, start=to_plane, model=model)
         assessed = solution.assess()
+        if solution.without_roll is not None and solution.rolls_by_chance(assessed.errors_px, shape):
+            solution = solution.without_roll()
+            assessed = solution.assess()
     return LocatedLevel(
         groups=groups,
         edges=edges + closures,

@@ -33,8 +33,9 @@ _MOVED: dict[PlanarName, tuple[dict[int, float], ...]] = {
     "homography": (*_SHIFTS, _ROLL, _ZOOM, *_SHEARS, *_PERSPECTIVES),
 }
 PLANAR_NAMES: tuple[PlanarName, ...] = tuple(_MOVED)
-_FREE = 3  # the first of these motions have no prior; or one less, where the roll has one, too
+_FREE = 3  # the first of these motions have no prior
 _WALKS = ("zoom", "shear of the axes", "shear of the diagonals", "perspective along x", "perspective along y")
+_PERSPECTIVE = slice(3, 5)  # of the walks
 _TERMS = 12  # of the exponential and the logarithmic series
 _HALVINGS = 2  # of a logarithm, by square roots, before its series
 _ROOTS = 8  # Newton steps of a square root
@@ -159,11 +160,11 @@ class PlanarAdjustment(Adjustment[Plane]):
         variances: of the prior, in squares of unit coordinates: of each walk per frame, (w,), and then of the coupling.
     """
 
-    def __init__(self, problem: Problem, model: PlanarName, *, bends: bool = False, rolls: bool = True) -> None:
-        """Set up the problem; `bends` has a model without perspective share the coupling, too; `rolls`: any roll is as likely."""
+    def __init__(self, problem: Problem, model: PlanarName, *, bends: bool = False) -> None:
+        """Set up the problem; `bends` has a model without perspective share the coupling, too."""
         self._problem, self._model, self._basis = problem, model, basis_of(model)
-        self._bends, self._rolls, self._n_free = bends, rolls, _FREE if rolls else _FREE - 1
-        self._n_walks = max(self._basis.shape[1] - self._n_free, 0)
+        self._n_walks = max(self._basis.shape[1] - _FREE, 0)
+        self._bends = bends
         super().__init__(problem, n_shared=int(model == "homography" or bends))
         # Nodes are in order of time; those of one instant make no step.
         self._times = np.maximum(np.diff(problem.instants), 1.0)
@@ -173,7 +174,7 @@ class PlanarAdjustment(Adjustment[Plane]):
 
     def of(self, problem: Problem, model: PlanarName | None = None) -> PlanarAdjustment:
         """Return the same for other pairs, or for a narrower model, with the variances of these walks."""
-        found = PlanarAdjustment(problem, model or self._model, rolls=self._rolls)
+        found = PlanarAdjustment(problem, model or self._model)
         found.variances, found._noise_norm = self.variances[: found._n_walks + found._n_shared], self._noise_norm
         return found
 
@@ -184,19 +185,13 @@ class PlanarAdjustment(Adjustment[Plane]):
     @property
     def walks_px(self) -> dict[str, float]:
         """How far each walk moves the ends of a frame over the capture, in px: a standard deviation; none that are 0."""
-        ends_px = (np.sqrt(self.variances * self._durations) * self._half)[_FREE - self._n_free : self._n_walks]
-        return {name: float(px) for name, px in zip(_WALKS, ends_px, strict=False) if px > _NONE * self._half}
+        ends_px = np.sqrt(self.variances * self._durations) * self._half
+        return {name: float(px) for name, px in zip(_WALKS, ends_px[: self._n_walks], strict=False) if px > _NONE * self._half}
 
     @property
-    def can_learn_roll(self) -> bool:
-        """Whether all that frames do beside shifts is roll, and there are enough of them to tell how wide it is."""
-        return self._n_node == _FREE and self._rolls and len(self._times) >= _FEWEST_STEPS
-
-    def learning_roll(self) -> PlanarAdjustment:
-        """Return the same with a roll that is a random walk, too, as wide as the capture shows."""
-        found = PlanarAdjustment(self._problem, self._model, rolls=False)
-        found.variances[1:], found._noise_norm = self.variances, self._noise_norm
-        return found
+    def only_rolls(self) -> bool:
+        """Whether all that nodes do beside shifts is roll."""
+        return self._n_node == _FREE
 
     @property
     def n_hyperparameters(self) -> int:
@@ -296,7 +291,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         own = self.assess(state, norms, kept)
         if self._n_shared:
             return own
-        bent = PlanarAdjustment(self._problem, self._model, bends=True, rolls=self._rolls)
+        bent = PlanarAdjustment(self._problem, self._model, bends=True)
         bent._noise_norm, bent.variances = self._noise_norm, np.append(self.variances, 1.0)
         jacobians, residuals = bent._linearised(state, bent.weights(norms, kept))
         free = bent._free(state)
@@ -335,7 +330,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         """Return the problem without walks that are none, and the nearest state that it holds."""
         there = self.variances > _NONE**2 / self._durations
         most = int(np.flatnonzero(there).max(initial=-1)) + 1
-        model = next(name for name in PLANAR_NAMES if len(_MOVED[name]) >= min(most + self._n_free, 8))
+        model = next(name for name in PLANAR_NAMES[1:] if len(_MOVED[name]) - _FREE >= min(most, len(_WALKS)))
         if len(_MOVED[model]) >= self._n_node:
             return self, state
         return self.of(self._problem, model), Plane(nearest(model, state.homographies, self._frame_shape))
@@ -358,18 +353,18 @@ class PlanarAdjustment(Adjustment[Plane]):
         perspective = self._model == "homography"
         relative = inverse(state.homographies[:-1]) @ state.homographies[1:]
         motions = logarithms(relative, self._frame_shape)
-        back = np.linalg.pinv(self._basis)[self._n_free :]  # from p1..p8 to the walks
+        back = np.linalg.pinv(self._basis)[_FREE:]  # from p1..p8 to the walks
         moves = generators(self._frame_shape)
         earlier = _coordinates(inverse(relative)[:, None] @ moves @ relative[:, None], self._frame_shape)
         by_nodes = np.stack([-back @ np.swapaxes(earlier, 1, 2), np.broadcast_to(back, (n_steps, w, 8))], axis=2) @ self._basis
         steps, roots = motions @ back.T, 1 / np.sqrt(self._times)
         by_coupling = np.zeros((n_steps, w))
         if perspective:
-            by_coupling[:, -2:] = -motions[:, 4:6]
+            by_coupling[:, _PERSPECTIVE] = -motions[:, 4:6]
             steps += state.coupling * by_coupling
             shifts = np.eye(8)[4:6]
             of_shift = np.stack([-shifts @ np.swapaxes(earlier, 1, 2), np.broadcast_to(shifts, (n_steps, 2, 8))], axis=2)
-            by_nodes[:, -2:] -= state.coupling * (of_shift @ self._basis)
+            by_nodes[:, _PERSPECTIVE] -= state.coupling * (of_shift @ self._basis)
         rows = np.repeat(np.arange(n_steps), 2 * k)
         columns = (k * np.arange(n_steps)[:, None] + np.arange(2 * k)).ravel()
         parts = []
