@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from threading import local
 
+import cv2
 import numpy as np
 
 from photonpano import FloatArray, Homography, NotLocated, Patches
@@ -32,6 +33,7 @@ from photonpano_direct.normal_equations import (
     PRIOR,
     Buffers,
     Coordinates,
+    Image,
     Layer,
     applied,
     chance_level,
@@ -93,11 +95,12 @@ class Aligned:
         # A Gaussian blur of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
         noise_ratio = self.squares / self.pixels * 4 * np.pi * self.template.blur_px**2
         shape = (self.template.image.shape[0], self.template.image.shape[1])
-        sums = _sums_of_patches(self.template, self.buffers)
+        sums, noise = _sums_of_patches(self.template, self.buffers)
         information, std_px, common = information_of(
             self.template,
             self.buffers,
             self.homography,
+            noise=noise,
             noise_ratio=noise_ratio,
             coordinates=_coordinates(shape),
         )
@@ -290,21 +293,21 @@ _LARGEST_PX = 2.0  # step, in px of the layer, beyond which the image is not lin
 _SUMS = 9
 
 
-def _sums_of_patches(template: Layer, buffers: Buffers) -> FloatArray:
-    """Return the (P, 9) sums of `_add_up` over the patches of a template; residual and weight are those of its last step.
+def _sums_of_patches(template: Layer, buffers: Buffers) -> tuple[FloatArray, Image]:
+    """Return the (P, 9) sums of `_add_up` over the patches of a template, and the `local_noise` in them.
 
-    Noise is taken from what the shift of each patch leaves of the residuals around a pixel.
+    Residual and weight are those of its last step. Noise is what the shift of each patch leaves of the residuals.
     """
-    sums = np.zeros((PATCHES, PATCHES, _SUMS))
+    sums, (height, width) = np.zeros((PATCHES, PATCHES, _SUMS)), template.image.shape
     _add_up(template, buffers, sums)
-    steps = np.linalg.pinv(sums[..., [0, 1, 1, 2]].reshape(PATCHES, PATCHES, 2, 2), hermitian=True) @ sums[..., 3:5, None]
-    row, column = (np.arange(side) * PATCHES // side for side in template.image.shape)
-    along_x, along_y = np.moveaxis(steps[..., 0].astype(np.float32), -1, 0)[:, row][:, :, column]
-    explained = template.gradients[0] * along_x + template.gradients[1] * along_y
-    noise = local_noise(buffers._replace(residual=buffers.residual - explained), template.blur_px)
+    curvature = sums[..., [0, 1, 1, 2]].reshape(PATCHES, PATCHES, 2, 2)
+    steps = (np.linalg.pinv(curvature, hermitian=True) @ sums[..., 3:5, None])[..., 0]
+    spread = cv2.resize(steps.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
+    explained = template.gradients[0] * spread[..., 0] + template.gradients[1] * spread[..., 1]
+    noise = local_noise(buffers.residual - explained, buffers.weight, template.blur_px)
     sums[:] = 0
     _add_up(template._replace(smoothed=template.smoothed * np.sqrt(noise)), buffers, sums)
-    return sums.reshape(-1, _SUMS)
+    return sums.reshape(-1, _SUMS), noise
 
 
 def _patches_of(sums: FloatArray, homography: Homography, shape: tuple[int, int], common: float, noise_ratio: float) -> Patches:

@@ -432,16 +432,22 @@ def expected_px(information: FloatArray, basis: FloatArray, to_corners: FloatArr
 _AROUND = 2.0  # standard deviation of the Gaussian within which residuals are averaged, in that of the blur
 
 
-def local_noise(buffers: Buffers, blur_px: float) -> Image:
+def local_noise(residual: Image, weight: Image, blur_px: float) -> Image:
     """Return the mean squared residual around each pixel, over that of all that both images see, weighted: (H, W).
 
     In the dark, pixels hold less than a photon, and no scale makes noise uniform: a star is noisier than the sky around it.
     """
-    seen = (buffers.weight > 0).astype(np.float32)
-    squares = seen * np.square(buffers.residual)
-    usual = np.vdot(buffers.weight, squares) / np.count_nonzero(seen)
-    around, share = (cv2.GaussianBlur(each, (0, 0), _AROUND * blur_px) for each in (squares, seen))
-    return np.asarray(around / np.maximum(share * usual, np.float32(1e-20)), np.float32)
+    seen = np.asarray(weight > 0, np.float32)
+    squares = seen * np.square(residual)
+    usual = np.vdot(weight, squares) / max(seen.sum(), 1)
+    # What is as smooth as this is averaged on every other pixel.
+    height, width = weight.shape
+    around, share = (
+        cv2.GaussianBlur(cv2.resize(each, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), (0, 0), _AROUND * blur_px / 2)
+        for each in (squares, seen)
+    )
+    noise = np.asarray(around / np.maximum(share * usual, np.float32(1e-20)), np.float32)
+    return np.asarray(cv2.resize(noise, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def information_of(
@@ -449,16 +455,17 @@ def information_of(
     buffers: Buffers,
     homography: Homography,
     *,
+    noise: Image,
     noise_ratio: float,
     coordinates: Coordinates,
 ) -> tuple[FloatArray, float, float]:
     """Return the inverse covariance of p1..p8, (8, 8), and the expected error of a corner in px, infinite without texture.
 
     The third result is the share of the template's curvature that both images have in common. Residual and weight of the
-    buffers come from `residuals_and_moments`, and all are overwritten. `noise_ratio` is the mean squared residual relative to
-    that of photon noise.
+    buffers come from `residuals_and_moments`, and all are overwritten. `noise` is that of `local_noise`, and `noise_ratio` the
+    mean squared residual relative to that of photon noise.
     """
-    pixels, noise = int(np.count_nonzero(buffers.weight)), local_noise(buffers, moving.blur_px)
+    pixels = int(np.count_nonzero(buffers.weight))
     _, hessian, common = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
     # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights, noise and
     # positions hardly change within the blur, so M needs only blurred gradients.
