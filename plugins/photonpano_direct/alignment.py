@@ -33,7 +33,6 @@ from photonpano_direct.normal_equations import (
     PRIOR,
     Buffers,
     Coordinates,
-    Image,
     Layer,
     applied,
     chance_level,
@@ -95,12 +94,11 @@ class Aligned:
         # A Gaussian blur of standard deviation s leaves 1 / (4 pi s^2) of the variance of white noise.
         noise_ratio = self.squares / self.pixels * 4 * np.pi * self.template.blur_px**2
         shape = (self.template.image.shape[0], self.template.image.shape[1])
-        sums, noise = _sums_of_patches(self.template, self.buffers)
+        sums = _sums_of_patches(self.template, self.buffers)
         information, std_px, common = information_of(
             self.template,
             self.buffers,
             self.homography,
-            noise=noise,
             noise_ratio=noise_ratio,
             coordinates=_coordinates(shape),
         )
@@ -293,10 +291,10 @@ _LARGEST_PX = 2.0  # step, in px of the layer, beyond which the image is not lin
 _SUMS = 9
 
 
-def _sums_of_patches(template: Layer, buffers: Buffers) -> tuple[FloatArray, Image]:
-    """Return the (P, 9) sums of `_add_up` over the patches of a template, and the `local_noise` in them.
+def _sums_of_patches(template: Layer, buffers: Buffers) -> FloatArray:
+    """Return the (P, 9) sums of `_add_up` over the patches of a template; residual and weight are those of its last step.
 
-    Residual and weight are those of its last step. Noise is what the shift of each patch leaves of the residuals.
+    Noise is what the shift of each patch leaves of the residuals around a pixel.
     """
     sums, (height, width) = np.zeros((PATCHES, PATCHES, _SUMS)), template.image.shape
     _add_up(template, buffers, sums)
@@ -307,7 +305,7 @@ def _sums_of_patches(template: Layer, buffers: Buffers) -> tuple[FloatArray, Ima
     noise = local_noise(buffers.residual - explained, buffers.weight, template.blur_px)
     sums[:] = 0
     _add_up(template._replace(smoothed=template.smoothed * np.sqrt(noise)), buffers, sums)
-    return sums.reshape(-1, _SUMS), noise
+    return sums.reshape(-1, _SUMS)
 
 
 def _patches_of(sums: FloatArray, homography: Homography, shape: tuple[int, int], common: float, noise_ratio: float) -> Patches:

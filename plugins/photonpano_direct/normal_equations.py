@@ -455,17 +455,16 @@ def information_of(
     buffers: Buffers,
     homography: Homography,
     *,
-    noise: Image,
     noise_ratio: float,
     coordinates: Coordinates,
 ) -> tuple[FloatArray, float, float]:
     """Return the inverse covariance of p1..p8, (8, 8), and the expected error of a corner in px, infinite without texture.
 
     The third result is the share of the template's curvature that both images have in common. Residual and weight of the
-    buffers come from `residuals_and_moments`, and all are overwritten. `noise` is that of `local_noise`, and `noise_ratio` the
-    mean squared residual relative to that of photon noise.
+    buffers come from `residuals_and_moments`, and all are overwritten. `noise_ratio` is the mean squared residual relative to
+    that of photon noise.
     """
-    pixels = int(np.count_nonzero(buffers.weight))
+    pixels, noise = int(np.count_nonzero(buffers.weight)), local_noise(buffers.residual, buffers.weight, moving.blur_px)
     _, hessian, common = curvatures(moving, buffers, chance_level(pixels, moving.blur_px), MIN_COMMON_CURVATURE)
     # The blur correlates the noise of neighbours, so the step scatters by H^-1 M H^-1 and not by H^-1. Weights, noise and
     # positions hardly change within the blur, so M needs only blurred gradients.
