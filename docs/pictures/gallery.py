@@ -10,8 +10,7 @@ import picture_parts as draw
 from harness import EXAMPLES, Study
 from numpy.typing import NDArray
 
-from photonpano import FrameSpan, load_panorama, load_spec, load_trajectory, open_source, parse_spec, run, warp
-from photonpano.capture import Capture
+from photonpano import load_panorama, load_spec, load_trajectory, open_source, run, warp
 from photonpano.geometry import transform_points, translation
 
 # From pixels of the middle frame of usaf.yaml to the chart, upright, 4 px for each.
@@ -28,7 +27,6 @@ _PERIOD = 57.7  # of the bars of the first element; that of the next is shorter 
 _REACH = 8  # px of the upright chart by which bars may lie beside their places
 _FRAMES = (5, 10, 20, 40, 70, 100)
 _PULSAR, _AROUND, _STEP = (272, 295), 60, 0.5  # x and y of the pulsar, and what is shown around it, in px of 4x4 pixels
-_BLOCK = 500  # frames read at once
 _KNOWN_DEG, _KNOWN_CENTRE = -3.40, (231.0, 233.0)  # turn of the fan by frame, and its axis: where merged frames vary most
 
 
@@ -63,24 +61,13 @@ def usaf(study: Study) -> Iterator[tuple[str, draw.Picture]]:
 
 
 def nebula(study: Study) -> Iterator[tuple[str, draw.Picture]]:
-    """Yield the photons of a nebula as they fell on the sensor, along the motion, and along that of the star tracker.
-
-    The file is as `tests/benchmarks/gallery.py` downloads it, in the folder of the study.
-    """
-    source = {"use": "events", "with": {"path": str(study.folder / "msh1552_acis_evt2_filtered.fits"), "bin": 4}}
-    folder = study.folder / "nebula"
-    plan = parse_spec({"version": 1, "source": source}, output=folder)
+    """Yield the photons of a nebula as they fell on the sensor, along the motion, and along that of the star tracker."""
+    capture, folder = EXAMPLES / "pipelines" / "nebula", study.folder / "nebula"
     if not (folder / "run.json").exists():
-        run(plan)
+        run(load_spec(capture.with_suffix(".yaml"), output=folder))
     found = load_trajectory(folder).homographies
-    with open_source(plan) as opened:
-        assert isinstance(opened, Capture)
-        truth, info = opened.truth(), opened.info
-        spans = [FrameSpan(start, min(start + _BLOCK, info.n_frames)) for start in range(0, info.n_frames, _BLOCK)]
-        photons = [np.argwhere(opened.frames(span)) + np.array([span.start, 0, 0]) for span in spans]
-    assert truth is not None
-    known = np.asarray(truth["homographies"], np.float64)
-    frame, y, x = np.concatenate(photons).T
+    with np.load(capture / "truth.npz") as truth, np.load(capture / "photons.npz") as photons:
+        known, (frame, x, y) = truth["homographies"], (photons[name].astype(int) for name in ("frame", "x", "y"))
     motions = {
         "as they fell on the sensor": np.broadcast_to(np.eye(3), found.shape),
         "along the motion that was found": found,

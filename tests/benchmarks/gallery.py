@@ -12,7 +12,6 @@ import hashlib
 import platform
 import shutil
 import urllib.request
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,16 +24,11 @@ from photonpano import InputError, LocationError, Plan, load_spec, load_trajecto
 
 SPIKE_ZOO = "https://raw.githubusercontent.com/chenkang455/Spike-Zoo/32e327ccf2f36f10d224368a79b69a65723beb8b/data/"
 PYMRAW = "https://raw.githubusercontent.com/ladisk/pyMRAW/04d947a62181a8edd915e9d79106ed2a2d8fada3/data/"
-WHEEL = "ixpeobssim-33.2.1-py3-none-any.whl"  # of which the list of photons alone is used
 FILES = {
     "uhsr.npz": (SPIKE_ZOO, "6e47eb26f59e40c71a4a0f677b5a48f647d4ff015313380faa0c2471aa651bff"),
     "data.dat": (SPIKE_ZOO, "c03e101bca99803e1a688c80652ca87922bb71ab2e31d7032bc839cb6bd50ee5"),
     "ball_12bit.cihx": (PYMRAW, "959421c4a604a877c8ff4ee81124e83186c2cc2ac8a7a9cce884e357c09e0542"),
     "ball_12bit.mraw": (PYMRAW, "1b49c662ecb9f70359cec6c31864a4e1c7a2929cbcd8150704b2521cdbc86a39"),
-    WHEEL: (
-        "https://files.pythonhosted.org/packages/py3/i/ixpeobssim/",
-        "88d1c797fbe6e27c1769c17bc8d4a8e57b7a255cfb138f5ac484acb74f4e2c34",
-    ),
 }
 """Public files, each with where it is and its SHA-256."""
 
@@ -63,14 +57,6 @@ def spikes_of(archive: Path) -> Path:
     return path
 
 
-def photons_of(wheel: Path) -> Path:
-    """Unpack the photons of Chandra's observation 754 from the package that carries them."""
-    path = wheel.parent / "msh1552_acis_evt2_filtered.fits"
-    with zipfile.ZipFile(wheel) as archive:
-        path.write_bytes(archive.read(f"ixpeobssim/config/fits/{path.name}"))
-    return path
-
-
 def captures(data: Path) -> Iterator[tuple[str, str, Path | Mapping[str, Any]]]:
     """Yield each capture: its name, what was given beside the file, and its spec."""
 
@@ -88,7 +74,7 @@ def captures(data: Path) -> Iterator[tuple[str, str, Path | Mapping[str, Any]]]:
         "the size of frames",
         spec("spike-dat", data / "data.dat", settings={"frame_shape": [250, 400]}),
     )
-    yield "nebula, Chandra", "pixels of 4x4", spec("events", photons_of(data / WHEEL), settings={"bin": 4})
+    yield "nebula, Chandra", "the size of frames", EXAMPLES / "pipelines" / "nebula.yaml"
     yield "falling ball, FASTCAM", "nothing", spec("fastcam-mraw", data / "ball_12bit.cihx")
 
 

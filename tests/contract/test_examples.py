@@ -103,7 +103,7 @@ RUNS: dict[str, dict[str, Any]] = {
     | {"source.with.path.length_px": 60, "source.with.path.row_spacing_px": 15},
 }
 """Specs to run, with overrides that make them small."""
-OTHERS = {"mandrill", "usaf", "poses", "stratified-poses", "many-captures", "as-it-arrives", "windows"}
+OTHERS = {"mandrill", "usaf", "nebula", "poses", "stratified-poses", "many-captures", "as-it-arrives", "windows"}
 """Specs that have tests of their own."""
 SAME_GROUPS = {"constant-groups", "sliding-window"}
 """Specs with the same number of groups at every level."""
@@ -280,6 +280,19 @@ def test_example_of_a_real_capture_runs(examples, tmp_path, without_report):
     # Also in the frames before the middle of the first exposure, and after that of the last.
     np.testing.assert_allclose(np.diff(turned), 3.71, atol=0.3)
     assert "usaf.yaml: ok" in photonpano("check", examples / "usaf.yaml")
+
+
+def test_example_of_a_telescope_follows_its_star_tracker(examples, tmp_path, without_report):
+    """The first third of the frames, at level 1: 2 px away at most, where the telescope sways by 4 px on either side."""
+    n_frames = 2000
+    with np.load(EXAMPLES / "nebula" / "photons.npz") as photons, np.load(EXAMPLES / "nebula" / "truth.npz") as truth:
+        kept, known = photons["frame"] < n_frames, truth["homographies"][:n_frames, :2, 2]
+        np.savez(tmp_path / "photons.npz", **{name: photons[name][kept] for name in photons})
+    small = {"source.with.path": tmp_path / "photons.npz", "levels": 1, "refine": "[]"}
+    photonpano("run", examples / "nebula.yaml", "--output", tmp_path / "run", **small)
+    found = load_trajectory(tmp_path / "run").homographies[:, :2, 2]
+    missed = (found - found.mean(axis=0)) - (known - known.mean(axis=0))
+    assert np.sqrt((missed**2).sum(axis=1).mean()) < 0.9 < 0.25 * np.sqrt(((known - known.mean(axis=0)) ** 2).sum(axis=1).mean())
 
 
 def test_captures_of_the_paper_are_unpacked_from_their_archive(examples, tmp_path):
