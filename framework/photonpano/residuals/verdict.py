@@ -30,7 +30,7 @@ _WITHOUT_LENS = "undistort the frames before, or use their middle only (correcti
 MUCH = 0.25  # share of the panorama that changes, beyond which what is left out may be the scene
 MAX_CONTRAST = 0.05  # up to this share of the light, what the panorama does not explain does not matter
 _UNCERTAIN_PX = 1.0
-_PARTS_SIGMAS = 10.0  # from which on parts lie apart: thousands are compared, and what the rows beside a dead one show is alike
+_PARTS_CHANCE = 0.001  # of parts that noise sets apart
 _SURE_SIGMAS = 6.0  # from which on what neighbouring frames have in common is no noise
 _ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
 _AMBIGUOUS = 0.05  # share of the pairs of a level that fit at several places; one or two may be by their noise
@@ -88,7 +88,7 @@ def _untested_motion(run: TestedRun) -> Found:
 def _parts(run: TestedRun) -> Found | None:
     """As where rows take turns, or a part of the sensor is read out some frames later than the rest."""
     apart = parts_apart(run.explained.residuals.pixel_slopes)
-    if apart is None or apart.sigmas <= _PARTS_SIGMAS:
+    if apart is None or apart.chance > _PARTS_CHANCE:
         return None
     if run.findings.rival_motion is not None or _standing.judged(run):  # a thing in the frame moves, or stands, by itself
         return None
@@ -194,8 +194,12 @@ def _ambiguous(run: TestedRun) -> Found | None:
 
 
 def others_px(run: TestedRun) -> float:
-    """Return how far away motions are that jump, are along a second place, or that of a part of the sensor that lies apart."""
-    found = _uncut_jump(run), _ambiguous(run), _parts.judged(run)
+    """Return how far away motions are that jump, are along a second place, or that of a part of the sensor that lies apart.
+
+    Rows that take turns see the same motion: what lies between them tears the panorama alone.
+    """
+    apart = parts_apart(run.explained.residuals.pixel_slopes)
+    found = _uncut_jump(run), _ambiguous(run), None if apart is None or apart.turns else _parts.judged(run)
     return float(np.linalg.norm([each.figure for each in found if each is not None]))
 
 
