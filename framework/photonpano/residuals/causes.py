@@ -32,12 +32,6 @@ class TestedRun:
     levels: Sequence[LevelResult]
     findings: Findings
 
-    @property
-    def freer_model(self) -> str:
-        """What to do if a planar model that was written may hold less than the motion; "" for those that hold any."""
-        kind = self.levels[-1].located.solution.model.kind if self.levels else "homography"
-        return "" if kind in ("homography", "rotation") else f"{FREE}, as {kind} may hold less than the motion"
-
 
 _Finder: TypeAlias = Callable[[TestedRun], Found | None]
 
@@ -107,8 +101,7 @@ def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
 @CAUSES.doubtful_above(
     0.03,
     "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
-    "divide by a flat field if the corners are dark (corrections: flat-field); the motion may be that of the thing instead of "
-    "the scene",
+    "the motion may be that of the thing instead of the scene",
 )
 def _moving(run: TestedRun) -> Found | None:
     if run.explained.residuals.cell_count.max(initial=0) < _MIN_BLOCKS:
@@ -127,7 +120,7 @@ def _box(cells: BoolArray, unit: str) -> str:
 @CAUSES.doubtful_above(
     0.03,
     "the light changes over time",
-    "write light: auto if the spec says that it is steady; otherwise keep it steady, or shorten the capture",
+    "write light: auto if the spec says that it is steady; otherwise keep it steady",
 )
 def _light(run: TestedRun) -> Found:
     residuals = run.explained.residuals
@@ -183,7 +176,7 @@ def _hot_pixels(run: TestedRun) -> Found:
 )
 def _deformation(run: TestedRun) -> Found | None:
     size = deformation_px(*run.explained.residuals.block_shifts())
-    return None if size is None else Found(size, "px, over the frame", what_to_do=run.freer_model)
+    return None if size is None else Found(size, "px, over the frame")
 
 
 @CAUSES.doubtful_above(

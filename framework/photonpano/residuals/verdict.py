@@ -26,7 +26,6 @@ from photonpano.values.verdict import Found, Test, judged
 
 NARROW = "the camera moves by more than the model of its motion holds"
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
-_WITHOUT_LENS = "undistort the frames before, or use their middle only (corrections: crop)"
 MUCH = 0.25  # share of the panorama that changes, beyond which what is left out may be the scene
 MAX_CONTRAST = 0.05  # up to this share of the light, what the panorama does not explain does not matter
 _UNCERTAIN_PX = 1.0
@@ -61,7 +60,7 @@ def _shots(run: TestedRun) -> Found | None:
 @FACTS.doubtful_above(
     0,
     "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
-    "leave these frames out, or keep the light on",
+    "keep the light on while the camera moves",
 )
 def _jump_in_the_dark(run: TestedRun) -> Found:
     found = [str(cut.dark) for cut in run.findings.cuts if cut.dark is not None]
@@ -83,7 +82,7 @@ def _untested_motion(run: TestedRun) -> Found:
 @FACTS.doubtful_above(
     0.2,
     "parts of the sensor see the scene at different places, so that the panorama is torn",
-    "read the frames in the order of the sensor's rows and halves",
+    "the sensor may be read in another order than its frames are given in, or in parts one after the other",
 )
 def _parts(run: TestedRun) -> Found | None:
     """As where rows take turns, or a part of the sensor is read out some frames later than the rest."""
@@ -127,16 +126,17 @@ def _narrow(run: TestedRun) -> Found | None:
 @FACTS.doubtful_above(
     0.002,  # half of this is seen without a lens
     "the lens distorts the frames, which bends the motion",
-    f"write motion: {{model: rotation}} and {FIND_LENS} for a camera that only turns; or {_WITHOUT_LENS}",
+    "undistort the frames before",
 )
 def _lens(run: TestedRun) -> Found | None:
     found = run.explained.lens
     if found is None or _parts.judged(run):  # a part that lies apart bends frames, too
         return None
-    camera, what_to_do = run.explained.motion.camera, run.freer_model
+    camera, what_to_do = run.explained.motion.camera, ""
     if camera is not None:
-        distortion = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
-        what_to_do = f"{distortion}; or {_WITHOUT_LENS}"
+        what_to_do = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
+    elif not run.levels or "rotation" not in run.levels[-1].located.rivals:  # of which none through a lens was likelier
+        what_to_do = f"write motion: {{model: rotation}} and {FIND_LENS} for a camera that only turns"
     return Found(abs(found.k1), f"about {found.k1:.1%} at the corners", what_to_do=what_to_do)
 
 
@@ -312,7 +312,7 @@ def _halves(run: TestedRun) -> Found | None:
         "standard errors that the coherence lacks to 1, median over the instants; "
         f"least is {cuts.coherence[least]:.3g}, before frame {cuts.firsts[least]:.0f}"
     )
-    return Found(run.explained.halves.disagreement, where, what_to_do=run.freer_model)
+    return Found(run.explained.halves.disagreement, where)
 
 
 @AGREEMENT.doubtful_above(

@@ -355,32 +355,35 @@ def test_model_that_holds_less_than_the_motion_is_doubtful(
 
 
 FIND = "camera: {distortion: {k1: find}}"
-WITHOUT_LENS = "or undistort the frames before, or use their middle only (corrections: crop)"
+TO_ROTATIONS = f"write motion: {{model: rotation}} and {FIND} for a camera that only turns"
 
 
 @pytest.mark.parametrize(
-    ("camera", "lens", "turn"),
+    ("camera", "rivals", "lens", "turn"),
     [
-        (
-            None,
-            f"write motion: {{model: rotation}} and {FIND} for a camera that only turns; {WITHOUT_LENS}",
-            f"write motion: {{model: homography}}, or {FIND}",
-        ),
-        (Camera.of(200, SHAPE), f"write {FIND}; {WITHOUT_LENS}", f"write motion: {{model: homography}}, or {FIND}"),
+        (None, ("homography",), TO_ROTATIONS, f"write motion: {{model: homography}}, or {FIND}"),
+        (None, ("homography", "rotation"), "undistort the frames before", f"write motion: {{model: homography}}, or {FIND}"),
+        (Camera.of(200, SHAPE), ("rotation",), f"write {FIND}", f"write motion: {{model: homography}}, or {FIND}"),
         (
             Camera.of(200, SHAPE, [-0.1, 0, 0, 0]),
-            f"calibrate the lens, and write camera.distortion; {WITHOUT_LENS}",
+            ("rotation",),
+            "calibrate the lens, and write camera.distortion",
             "write motion: {model: homography}",
         ),
     ],
-    ids=["homographies", "rotations", "rotations through a lens that was found"],
+    ids=["homographies", "homographies, likelier than rotations", "rotations", "rotations through a lens that was found"],
 )
-def test_advice_is_not_what_the_run_does_already(explained: Explained, camera: Camera | None, lens: str, turn: str) -> None:
-    rivals = {"homography": Rival(1.0, 232, 0.0, 9.0), "rotation": Rival(25.0, 88, 3.0)}
+def test_advice_is_not_what_the_run_does_already(
+    explained: Explained, camera: Camera | None, rivals: tuple[str, ...], lens: str, turn: str
+) -> None:
     bent = LensDistortion(-0.1, 0.005, np.zeros((1, 2)))
     run = replace(explained, motion=replace(explained.motion, camera=camera), lens=bent)
-    found = {reason.what: reason.what_to_do for reason in judge(run, [level_with(object(), rivals)]).reasons}
-    assert found == {"the lens distorts the frames, which bends the motion": lens, NARROW: turn}
+    narrow = {"homography": Rival(1.0, 232, 0.0, 9.0), "rotation": Rival(25.0, 88, 3.0)}
+    found = {reason.what: reason.what_to_do for reason in judge(run, [level_with(object(), narrow)]).reasons}
+    assert found[NARROW] == turn
+    compared = {name: Rival(1.0, 232, 0.0) for name in rivals}
+    [reason] = judge(run, [level_with(None, compared, model=MotionModel(kind="homography"))]).reasons
+    assert (reason.what, reason.what_to_do) == ("the lens distorts the frames, which bends the motion", lens)
 
 
 @pytest.mark.parametrize(("turn", "how"), [(np.flipud, "upside down"), (np.fliplr, "left to right"), (None, "")])
