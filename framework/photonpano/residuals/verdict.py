@@ -80,6 +80,24 @@ def _untested_motion(run: TestedRun) -> Found:
 
 
 @FACTS.doubtful_above(
+    0.5,
+    "the camera travels past near things, and much of the frames shows that",
+    "keep away from what is near, or write pose: to find the path of the camera in place of a panorama",
+)
+def _travels(run: TestedRun) -> Found | None:
+    if (hidden := _hidden(run)) is None or not (parallax := parallax_of(run)):
+        return None
+    what = f"the camera travels by about {parallax:.1g} of the distance of what is near, and much of the frames shows that"
+    return hidden._replace(what=what)
+
+
+def parallax_of(run: TestedRun) -> float:
+    """Return how far the camera travelled, over the distance of what is near; 0 where that does not rest."""
+    # Later levels leave out what is near.
+    return max((each.located.solution.parallax for each in run.levels), default=0.0)
+
+
+@FACTS.doubtful_above(
     0.2,
     "parts of the sensor see the scene at different places, so that the panorama is torn",
     "the sensor may be read in another order than its frames are given in, or in parts one after the other",
@@ -157,6 +175,8 @@ def _uncertain(run: TestedRun) -> Found | None:
     for found in (_two_motions(run), _uncut_jump(run), _ambiguous(run), _one_direction(run)):
         if found is not None and found.figure > _UNCERTAIN_PX:
             return found
+    if _travels.judged(run):  # the way of what is near is in the expected error
+        return None
     beside_px = float(known.mean())
     if levels:  # a long path bends, which neither blurs nor tears a panorama
         located = levels[-1].located
@@ -274,18 +294,17 @@ def _standing(run: TestedRun) -> Found:
 
 @FACTS.doubtful_above(
     0.5,
-    "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
-    "keep away from what is near, or find the path of the camera in place of a panorama; the motion may be that of either part",
+    "much of what the frames show does not follow one turn of the camera",
+    "the motion may be that of either part",
 )
 def _layers(run: TestedRun) -> Found | None:
-    # Later levels leave out what is near.
-    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
-    where = "share of the frames that is left out, on average"
-    if parallax:
-        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
+    return None if parallax_of(run) else _hidden(run)
+
+
+def _hidden(run: TestedRun) -> Found | None:
     if run.findings.hidden_share is None:
         return None
-    found = Found(run.findings.hidden_share, where)
+    found = Found(run.findings.hidden_share, "share of the frames that is left out, on average")
     # Where little is left out, but much changes that is not, what is left out may be the scene.
     changing_share, _ = changing_places(run.explained.residuals)
     if min(found.figure, changing_share) <= MUCH:
@@ -295,7 +314,7 @@ def _layers(run: TestedRun) -> Found | None:
 
 def of_either_part(run: TestedRun) -> bool:
     """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
-    return any(test.judged(run) for test in (_grain, _standing, _layers))
+    return any(test.judged(run) for test in (_grain, _standing, _travels, _layers))
 
 
 @AGREEMENT.doubtful_above(

@@ -444,6 +444,18 @@ def test_background_that_is_mostly_hidden_is_doubtful(explained: Explained) -> N
     assert [[reason.figure for reason in reasons] for reasons in found] == [[], [0.52]]
 
 
+def test_camera_that_travels_past_near_things_is_named_first(explained: Explained) -> None:
+    """Not the lens that this bends, nor more light for the expected error, which holds the way of what is near."""
+    motion = replace(explained.motion, std_px=explained.motion.std_px + 3)
+    bent = replace(explained, motion=motion, lens=LensDistortion(-0.1, 0.005, np.zeros((1, 2))))
+    levels = [level_with(object(), parallax=0.04), level_with(object())]
+    whats = [reason.what for reason in judge(bent, levels, Findings(hidden_share=0.52)).reasons]
+    assert whats == [
+        "the camera travels by about 0.04 of the distance of what is near, and much of the frames shows that",
+        "the lens distorts the frames, which bends the motion",
+    ]
+
+
 @pytest.mark.parametrize(("grain", "moves_px", "doubtful"), [(1, 0, True), (0, 0, False), (1, 3, False)])
 def test_image_that_stands_still_is_doubtful_if_it_has_the_grain_of_a_sensor(
     explained: Explained, grain: float, moves_px: float, doubtful: bool
