@@ -72,20 +72,18 @@ def order_warning(source: Source) -> str | None:
 
 @contextmanager
 def naming_obstacles(source: Source) -> Iterator[None]:
-    """Append the sentences of `obstacles` to the `LocationError` of a block."""
+    """Append sentences about what makes a capture hard to locate to the `LocationError` of a block."""
     try:
         yield
     except LocationError as error:
-        error.args = ("\n".join([str(error), *obstacles(source)]),)
+        masked, share = 1 - float(source.valid.mean()), capture_of(source).still.share
+        if masked > _MASKED:
+            inverted = "of the pixels are masked: if the mask marks the pixels that count, invert it."
+            error.args = (f"{error}\n{masked:.0%} {inverted}",)
+        if share >= _STANDING:
+            stands = "of the frame stands still while the rest moves, as a window or dirt in front of the sensor does."
+            error.args = (f"{error}\n{share:.0%} {stands}",)
         raise
-
-
-def obstacles(source: Source) -> Iterator[str]:
-    """Yield sentences about what makes a capture hard to locate."""
-    if (masked := 1 - float(source.valid.mean())) > _MASKED:
-        yield f"{masked:.0%} of the pixels are masked: if the mask marks the pixels that count, invert it."
-    if (share := capture_of(source).still.share) >= _STANDING:
-        yield f"{share:.0%} of the frame stands still while the rest moves, as a window or dirt in front of the sensor does."
 
 
 def timeline_of(source: Source, context: Context) -> Timeline:

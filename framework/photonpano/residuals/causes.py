@@ -20,9 +20,6 @@ from photonpano.values.verdict import Found, Test
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 
-FREE = "write motion: {model: homography}"  # what a spec says of a motion that may be any
-FIND_LENS = "camera: {distortion: {k1: find}}"  # what a spec says to measure the lens
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TestedRun:

@@ -15,7 +15,7 @@ from scipy import ndimage
 from photonpano.geometry import corners, transform_points
 from photonpano.motion.loop import TOO_NARROW, LevelResult
 from photonpano.residuals.block_sums import M, V
-from photonpano.residuals.causes import CAUSES, FIND_LENS, FREE, TestedRun, Tests, changing_places
+from photonpano.residuals.causes import CAUSES, TestedRun, Tests, changing_places
 from photonpano.residuals.findings import NOTHING, Findings
 from photonpano.residuals.measure import FEWEST_FRAMES
 from photonpano.residuals.patterns import parts_apart
@@ -26,6 +26,7 @@ from photonpano.values.verdict import Found, Test, judged
 
 NARROW = "the camera moves by more than the model of its motion holds"
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
+_FIND_LENS = "camera: {distortion: {k1: find}}"  # what a spec says to measure the lens
 MUCH = 0.25  # share of the panorama that changes, beyond which what is left out may be the scene
 MAX_CONTRAST = 0.05  # up to this share of the light, what the panorama does not explain does not matter
 _UNCERTAIN_PX = 1.0
@@ -81,14 +82,23 @@ def _untested_motion(run: TestedRun) -> Found:
 
 @FACTS.doubtful_above(
     0.5,
-    "the camera travels past near things, and much of the frames shows that",
-    "keep away from what is near, or write pose: to find the path of the camera in place of a panorama",
+    "much of what the frames show does not follow one turn of the camera",
+    "the motion may be that of either part",
 )
-def _travels(run: TestedRun) -> Found | None:
-    if (hidden := _hidden(run)) is None or not (parallax := parallax_of(run)):
+def _layers(run: TestedRun) -> Found | None:
+    rival = run.findings.rival_motion
+    if run.findings.hidden_share is None or (rival is not None and rival.px > _UNCERTAIN_PX):
         return None
-    what = f"the camera travels by about {parallax:.1g} of the distance of what is near, and much of the frames shows that"
-    return hidden._replace(what=what)
+    found = Found(run.findings.hidden_share, "share of the frames that is left out, on average")
+    if parallax := parallax_of(run):
+        what = f"the camera travels by about {parallax:.1g} of the distance of what is near, and much of the frames shows that"
+        what_to_do = "keep away from what is near, or write pose: to find the path of the camera in place of a panorama"
+        found = found._replace(what=what, what_to_do=what_to_do)
+    # Where little is left out, but much changes that is not, what is left out may be the scene.
+    changing_share, _ = changing_places(run.explained.residuals)
+    if min(found.figure, changing_share) <= MUCH:
+        return found
+    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
 
 
 def parallax_of(run: TestedRun) -> float:
@@ -127,18 +137,16 @@ def _given_camera(run: TestedRun) -> Found | None:
     return Found(abs(freed.found - freed.given) / freed.std, where)
 
 
-@FACTS.doubtful_above(TOO_NARROW, NARROW, FREE)
+@FACTS.doubtful_above(TOO_NARROW, NARROW, "write motion: {model: homography}")
 def _narrow(run: TestedRun) -> Found | None:
     """Homographies are likelier, and farther away than the motion is expected to err."""
     if not run.levels or not (times := run.levels[-1].narrow):
         return None
-    located, motion = run.levels[-1].located, run.explained.motion
+    located = run.levels[-1].located
     model = located.solution.model
     apart_px = located.rivals["homography"].apart_px
     where = f"times the expected error lie between {model.name} and any homographies, which are likelier: {apart_px:.2g} px"
-    finds = model.kind == "rotation" and not (motion.camera is not None and motion.camera.distorts)
-    what_to_do = f"{FREE}, or {FIND_LENS}" if finds else ""
-    return Found(times, where, what_to_do=what_to_do)
+    return Found(times, where)
 
 
 @FACTS.doubtful_above(
@@ -152,9 +160,9 @@ def _lens(run: TestedRun) -> Found | None:
         return None
     camera, what_to_do = run.explained.motion.camera, ""
     if camera is not None:
-        what_to_do = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
+        what_to_do = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {_FIND_LENS}"
     elif not run.levels or "rotation" not in run.levels[-1].located.rivals:  # of which none through a lens was likelier
-        what_to_do = f"write motion: {{model: rotation}} and {FIND_LENS} for a camera that only turns"
+        what_to_do = f"write motion: {{model: rotation}} and {_FIND_LENS} for a camera that only turns"
     return Found(abs(found.k1), f"about {found.k1:.1%} at the corners", what_to_do=what_to_do)
 
 
@@ -175,7 +183,7 @@ def _uncertain(run: TestedRun) -> Found | None:
     for found in (_two_motions(run), _uncut_jump(run), _ambiguous(run), _one_direction(run)):
         if found is not None and found.figure > _UNCERTAIN_PX:
             return found
-    if _travels.judged(run):  # the way of what is near is in the expected error
+    if _layers.judged(run):  # the way of what is near is in the expected error
         return None
     beside_px = float(known.mean())
     if levels:  # a long path bends, which neither blurs nor tears a panorama
@@ -292,29 +300,9 @@ def _standing(run: TestedRun) -> Found:
     return Found(run.findings.standing_share, "share of the parts that show motion or rest")
 
 
-@FACTS.doubtful_above(
-    0.5,
-    "much of what the frames show does not follow one turn of the camera",
-    "the motion may be that of either part",
-)
-def _layers(run: TestedRun) -> Found | None:
-    return None if parallax_of(run) else _hidden(run)
-
-
-def _hidden(run: TestedRun) -> Found | None:
-    if run.findings.hidden_share is None:
-        return None
-    found = Found(run.findings.hidden_share, "share of the frames that is left out, on average")
-    # Where little is left out, but much changes that is not, what is left out may be the scene.
-    changing_share, _ = changing_places(run.explained.residuals)
-    if min(found.figure, changing_share) <= MUCH:
-        return found
-    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
-
-
 def of_either_part(run: TestedRun) -> bool:
     """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
-    return any(test.judged(run) for test in (_grain, _standing, _travels, _layers))
+    return any(test.judged(run) for test in (_grain, _standing, _layers))
 
 
 @AGREEMENT.doubtful_above(
