@@ -253,7 +253,8 @@ class CanvasNoise:
     def of_tile(self, flux: FluxImage, weight: FluxImage, top: int, left: int) -> Iterator[tuple[slice, FluxStd]]:
         """Return the standard deviations of a part of the canvas, some rows after the other so that it takes little memory.
 
-        A place that is off by e changes the flux by e times its gradient, which is measured and has noise itself.
+        A place that is off by e changes the flux by e times its gradient, which is measured and has noise itself. The flux of a
+        saturated pixel is a lower bound, and its error is not known.
         """
         step = max(1, _BLOCK // max(1, flux[0].size)) if len(flux) else 1
         for row in range(0, len(flux), step):
@@ -261,13 +262,14 @@ class CanvasNoise:
             part = flux[rows]
             averages = self._averages(part, top + row, left)
             photons = self._of_photons(part, weight[rows], top + row, left, averages)
-            if averages is None:
-                yield rows, FluxStd(photons, photons)
-                continue
-            squares = squared_gradient(flux[first : rows.stop + 1])[row - first :][: len(part)]
-            motion, light = (_as_colours(each, part) for each in (averages.motion_variance, averages.light_variance))
-            rise = np.maximum(squares - photons**2, np.float32(_LEAST))  # an unknown motion moves even places that look flat
-            yield rows, FluxStd(photons, np.asarray(np.sqrt(photons**2 + motion * rise + light * part**2), np.float32))
+            variance = photons**2
+            if averages is not None:
+                squares = squared_gradient(flux[first : rows.stop + 1])[row - first :][: len(part)]
+                motion, light = (_as_colours(each, part) for each in (averages.motion_variance, averages.light_variance))
+                # An unknown motion moves even places that look flat.
+                variance = variance + motion * np.maximum(squares - variance, np.float32(_LEAST)) + light * part**2
+            variance[self.saturated(part, weight[rows])] = np.inf
+            yield rows, FluxStd(photons, np.asarray(np.sqrt(variance), np.float32))
 
     def _averages(self, flux: FluxImage, top: int, left: int) -> Averages | None:
         return None if self.averaging is None else self.averaging.over((flux.shape[0], flux.shape[1]), top, left)

@@ -21,7 +21,9 @@ from photonpano.geometry import (
     inverse,
     lenses_apart_px,
     likely_rotations,
+    patch_centres,
     scaled_ahead,
+    transform_points,
 )
 from photonpano.motion.adjustment import Adjustment, Assessment, Problem
 from photonpano.motion.models import (
@@ -118,7 +120,7 @@ class GraphSolution:
     # (N, P) how far patches of each node lie from where the motion lets expect them, as mean squares in variances, 1 for noise;
     # 0 where nothing is known, and None where patches do not contradict the motion
     layers: FloatArray | None = None
-    # angle by which what does not follow the motion passes the background: the way of the camera over its distance, if it rests
+    # way of the camera over the distance of what is near, by which that passes the background; 0 unless what is near rests
     parallax: float = 0.0
     # returns what of a given camera the edges contradict most; None where nothing is given, and for homographies
     freed: Callable[[], Freed | None] = lambda: None
@@ -239,8 +241,10 @@ def _of_background(
     found = layers(tied.pairs, tied.motions, first.beside(fit.state), len(tied.located))
     background = replace(background, layers=found)
     if isinstance(fit.state, Rotations):
-        way_px = travelled(tied.pairs, tied.motions, first.beside(fit.state), found)
-        background = replace(background, parallax=way_px / fit.state.camera.focal_px)
+        camera, seen = fit.state.camera, np.array([each.homography for each in tied.motions])
+        places = (transform_points(seen, patch_centres(tied.frame_shape)) - camera.centre_px) / camera.focal_px
+        way_px = travelled(tied.pairs, tied.motions, first.beside(fit.state), found, places)
+        background = replace(background, parallax=way_px / camera.focal_px)
     others = [each for each in fits if each is not model]
     fits = {each: _fitted(background, start, each) for each in others} | ({model: fit} if model in fits else {})
     return background, fits, _likeliest(fits, tied.frame_shape)

@@ -30,6 +30,8 @@ _UNCERTAIN = 1e-4  # factor of the information of a pair that has fewer
 _FAR, _FAR_PX = 4.0, 0.5  # standard deviations, and px, beyond which a patch contradicts a motion
 _ALIKE_PX = 0.1  # error of patches beside photon noise
 APART = 9.0  # mean square of the residuals of a patch that does not follow the motion, in variances
+_RESTS = 0.5  # share of patches that move as what rests, more than those that move the other way
+_LINE_STEPS = 10  # with weights of Geman and McClure
 _DAMPING, _TINY = 1e-6, 1e-12
 _AT_ONCE = 256  # pairs whose patches are weighed together: some 10 MB
 
@@ -197,16 +199,42 @@ def layers(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: Fl
     return np.asarray(squares / np.maximum(numbers, 1))
 
 
-def travelled(pairs: NDArray[np.integer], motions: Sequence[Located], residuals: FloatArray, layers: FloatArray) -> float:
-    """Return how far what does not follow the camera moves beside the background from the first node to the last, px."""
-    steps = []
-    for (moving, fixed), motion, left in zip(pairs, motions, residuals, strict=True):
+def travelled(
+    pairs: NDArray[np.integer], motions: Sequence[Located], residuals: FloatArray, layers: FloatArray, places: FloatArray
+) -> float:
+    """Return how far what is near moves beside the background from the first node to the last, px, as the camera travels.
+
+    It is 0 where what does not follow the turns of the camera does not rest, either: beside the background, what rests moves by
+    its inverse depth along lines through one point of a frame, all of it towards that point, or away. `places` (E, P, 2) are
+    where patches lie, in focal lengths from the centre of the fixed frame.
+    """
+    steps, aside = [], list[FloatArray]()
+    for (moving, fixed), motion, left, there in zip(pairs, motions, residuals, places, strict=True):
         apart = layers[moving] > APART
         if motion.patches is not None and (apart := apart & (motion.patches.information[:, 0, 0] > 0)).sum() >= _FEWEST:
-            noise = np.trace(_covariances(motion.patches.information[apart]), axis1=1, axis2=2)
-            sizes = np.sqrt(np.maximum((left[apart] ** 2).sum(axis=-1) - noise, 0))
+            covariances = _covariances(motion.patches.information[apart])
+            sizes = np.sqrt(np.maximum((left[apart] ** 2).sum(axis=-1) - np.trace(covariances, axis1=1, axis2=2), 0))
             steps.append(float(np.median(sizes)) / abs(moving - fixed))
-    return float(np.median(steps)) * (len(layers) - 1) if steps else 0.0
+            aside.append(_along_lines(there[apart], left[apart], covariances + _ALIKE_PX**2 * np.eye(2)))
+    rests = bool(aside) and float(np.concatenate(aside).mean()) > _RESTS
+    return float(np.median(steps)) * (len(layers) - 1) if rests else 0.0
+
+
+def _along_lines(places: FloatArray, shifts: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return which shifts (P, 2) at places (P, 2) lie along lines through one point: 1 for those of most, -1 for the opposite.
+
+    It is 0 for those that do not.
+    """
+    x, y = shifts.T
+    across, weights = np.stack([-y, x, y * places[:, 0] - x * places[:, 1]], axis=1), np.ones(len(shifts))
+    for _ in range(_LINE_STEPS):
+        point = np.linalg.eigh((across * weights[:, None]).T @ across)[1][:, 0]
+        lines = point[:2] - point[2] * places
+        beside = np.stack([-lines[:, 1], lines[:, 0]], axis=1)
+        squares = (across @ point) ** 2 / np.maximum(np.einsum("pi,pij,pj->p", beside, covariances, beside), _TINY)
+        weights = 1 / (1 + squares / _FAR) ** 2 / np.maximum((lines**2).sum(axis=1), _TINY)
+    sides = np.sign((shifts * lines).sum(axis=1))
+    return np.asarray(np.where(squares < _FAR**2, sides * np.sign(np.median(sides)), 0))
 
 
 def _by_patches(motions: Sequence[Located], weights: FloatArray, tolerance_px: float, shape: tuple[int, int]) -> list[Located]:

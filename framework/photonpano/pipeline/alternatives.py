@@ -16,7 +16,7 @@ from photonpano.pipeline.state import State
 from photonpano.residuals.causes import TestedRun, changing_places
 from photonpano.residuals.findings import Doubt, Findings
 from photonpano.residuals.refinement import Explained
-from photonpano.residuals.verdict import MUCH, of_either_part, others_px
+from photonpano.residuals.verdict import MUCH, of_either_part, others_px, parallax_of
 from photonpano.values import FloatArray
 
 _MISFIT = 1.5  # reduced chi-square from which the motion does not explain a block of the sensor
@@ -31,7 +31,7 @@ def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, 
     These are a motion that jumps where the image seems to, one that a lens does not bend, one along a second place of a scene
     that repeats, that of either part of a sensor whose parts lie apart, those by models that are as likely as the one taken,
     and that of parts of the frame which the motion does not explain. Where such a part is large and its motion is not found,
-    the error is infinite: not known.
+    the error is infinite: not known. What is near and rests passes the background by the way of the camera over its distance.
     """
     findings = state.found()
     run = TestedRun(explained, state.results, findings)
@@ -44,7 +44,9 @@ def beside_alternatives(state: State, explained: Explained) -> tuple[Explained, 
         explained = _apart(explained, np.interp(np.arange(n_frames), frames, abs(lens.k1) * lens.bend_px))
     beside, rival = _beside_rival(state, explained)
     if rival is None and of_either_part(run):
-        beside = _apart(beside, np.full(n_frames, np.inf))
+        rotations, since = last.located.solution.rotations, np.arange(n_frames) - explained.motion.reference
+        way_px = parallax_of(run) * rotations.camera.focal_px if rotations is not None else 0.0
+        beside = _apart(beside, abs(since) * way_px / n_frames if way_px else np.full(n_frames, np.inf))
     return beside, replace(findings, rival_motion=rival)
 
 

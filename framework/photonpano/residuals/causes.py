@@ -20,9 +20,6 @@ from photonpano.values.verdict import Found, Test
 _STANDARD_DEVIATIONS = 6.0  # that a place or a pixel must deviate by
 _MIN_BLOCKS = 16  # that must have fallen on a square of the panorama
 
-FREE = "write motion: {model: homography}"  # what a spec says of a motion that may be any
-FIND_LENS = "camera: {distortion: {k1: find}}"  # what a spec says to measure the lens
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TestedRun:
@@ -31,12 +28,6 @@ class TestedRun:
     explained: Explained
     levels: Sequence[LevelResult]
     findings: Findings
-
-    @property
-    def freer_model(self) -> str:
-        """What to do if a planar model that was written may hold less than the motion; "" for those that hold any."""
-        kind = self.levels[-1].located.solution.model.kind if self.levels else "homography"
-        return "" if kind in ("homography", "rotation") else f"{FREE}, as {kind} may hold less than the motion"
 
 
 _Finder: TypeAlias = Callable[[TestedRun], Found | None]
@@ -107,8 +98,7 @@ def changing_places(residuals: Residuals) -> tuple[float, BoolArray]:
 @CAUSES.doubtful_above(
     0.03,
     "parts of the panorama change over time, as things do that move by themselves or stand at another depth",
-    "divide by a flat field if the corners are dark (corrections: flat-field); the motion may be that of the thing instead of "
-    "the scene",
+    "the motion may be that of the thing instead of the scene",
 )
 def _moving(run: TestedRun) -> Found | None:
     if run.explained.residuals.cell_count.max(initial=0) < _MIN_BLOCKS:
@@ -127,7 +117,7 @@ def _box(cells: BoolArray, unit: str) -> str:
 @CAUSES.doubtful_above(
     0.03,
     "the light changes over time",
-    "write light: auto if the spec says that it is steady; otherwise keep it steady, or shorten the capture",
+    "write light: auto if the spec says that it is steady; otherwise keep it steady",
 )
 def _light(run: TestedRun) -> Found:
     residuals = run.explained.residuals
@@ -183,7 +173,7 @@ def _hot_pixels(run: TestedRun) -> Found:
 )
 def _deformation(run: TestedRun) -> Found | None:
     size = deformation_px(*run.explained.residuals.block_shifts())
-    return None if size is None else Found(size, "px, over the frame", what_to_do=run.freer_model)
+    return None if size is None else Found(size, "px, over the frame")
 
 
 @CAUSES.doubtful_above(

@@ -45,7 +45,6 @@ _BATCH = 64  # spans that a thread measures at a time
 # Most frames that are measured one by one, and most as a share of the capture, to see what moves faster than a span; and the
 # fewest in a row.
 _SINGLE_FRAMES, _SINGLE_SHARE, _WINDOW_FRAMES = 512, 1 / 8, 32
-_PIXEL_STRIDE = 4  # one span in 4 is added to the sums of single pixels, which no other sum needs
 FEWEST_FRAMES = 3  # frames of the shortest span within which single frames show shaking
 # Where photon noise makes spans long: shorter ones, whose neighbours are compared, most pairs of each, and pixels of a square.
 _BRIEF_FRAMES, _BRIEF_PAIRS, _SQUARE_PX = (4, 16), 192, 2
@@ -79,8 +78,8 @@ class Residuals:
     blocks: FloatArray  # (h, w, 12) sums over time, for each block of the sensor: see `block_sums`
     block_chi2: FloatArray  # (h, w) mean over time of squared residual / variance of each block, NaN where nothing was seen
     pixel_gain: FluxImage  # (H, W) observed / predicted photons of each pixel of the sensor, NaN where nothing was predicted
-    pixel_mean: FluxImage  # (H, W) predicted photons of each pixel, in one of four spans
-    pixel_slopes: FluxImage  # (6, H, W) how pixels lie beside the panorama, in these spans: see `add_pixel_sums`
+    pixel_mean: FluxImage  # (H, W) predicted photons of each pixel
+    pixel_slopes: FluxImage  # (6, H, W) how pixels lie beside the panorama: see `add_pixel_sums`
     # (H', W') mean of squared residual / variance over the panorama, in squares of 16 px; NaN where nothing was seen
     cell_chi2: FloatArray
     cell_count: FloatArray  # (H', W') number of blocks that fell on each square
@@ -382,9 +381,8 @@ def _measured(
             colour.prediction.view(homography, images, span)
             noise = colour.noise_beside(images[0], images[1], span)
             add_block_sums(counts, noise, float(len(span)), images[0], images[1], sums)
-            if index % _PIXEL_STRIDE == 0:
-                of_pixels = total.pixel_residual, total.pixel_mean, total.pixel_slopes
-                add_pixel_sums(counts, float(len(span)), images[0], images[1], *of_pixels, velocities[index])
+            of_pixels = total.pixel_residual, total.pixel_mean, total.pixel_slopes
+            add_pixel_sums(counts, float(len(span)), images[0], images[1], *of_pixels, velocities[index])
         # The photons of the span are part of the panorama, so that the residual is less than their noise.
         own = min(0.5, len(span) / frames_seen)
         cells = first.cells(homography, middle, ideal)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.stats import norm
 
 from photonpano.filtering import SYSTEMATIC_PX
 from photonpano.geometry import corners, transform_points
@@ -17,7 +18,9 @@ _INSTANTS = 64  # instants of the motion at which the effect of a lens is comput
 _SIGNIFICANT = 4.0  # standard deviations by which the scatter must exceed that of noise
 _SMALLEST_PX = 0.02  # shaking by less than this stays within spans
 _TURNS = 2, 3, 4, 8  # rows of which one may lie apart
-_LEAST_PART = 0.1  # of what rows tell of their shift; at the ends of a sensor, a lens bends by more than a cubic polynomial
+_LENS_POWERS = 6  # of a polynomial over the lines of a sensor: a lens bends them by their fifth power
+_LEAST_KNOWN = 1e-9  # of the information of all lines, below which a polynomial says all of a part
+_FEWEST_SUMS = 2 * (_LENS_POWERS + 1)  # lines, or sums of neighbouring ones, whose scatter is measured
 _FREQUENCIES = 256  # at which the spectrum is computed, up to half a cycle per frame
 
 
@@ -103,6 +106,8 @@ class PartsApart(NamedTuple):
     px: float
     sigmas: float
     frames: float = 0.0  # by which one is read later than the other, where that explains more than a shift
+    turns: bool = False  # whether they are lines that take turns, which no motion follows one by one
+    chance: float = 1.0  # that noise alone sets any of the parts that were compared as clearly apart
 
 
 def parts_apart(slopes: FluxImage) -> PartsApart | None:
@@ -111,32 +116,34 @@ def parts_apart(slopes: FluxImage) -> PartsApart | None:
     They are rows that take turns, or rows and those before them, or columns; in the whole frame, or in a half of it, as where
     one quadrant is late. Each row lies elsewhere along x, y and time, by the slopes (6, H, W) of its pixels.
     """
-    found = list[PartsApart]()
+    found, compared = list[PartsApart](), 0
     for lines, of_lines, across in (("rows", slopes, "columns"), ("columns", slopes.swapaxes(1, 2), "rows")):
         first, second = np.array_split(of_lines, 2, axis=2)
         half, length = first.shape[2], of_lines.shape[2]
         places = "", f", in {across} 0 to {half - 1}", f", in {across} {half} to {length - 1}"
         for part, place in zip((of_lines, first, second), places, strict=True):
             sums = np.asarray(part, np.float64).sum(axis=2)
+            compared += len(sums) // 2 * (sum(_TURNS) + len(part[0]))
             speed = float(np.sqrt(2 * sums[4].sum() / max(float(sums[[0, 2]].sum()), 1e-12)))
             for information, right in (sums[:2], sums[2:4]):
                 found += _lines_apart(information, right, lines, place)
             found += [
                 late._replace(px=late.px * speed, frames=late.px) for late in _lines_apart(sums[4], sums[5], lines, place)
             ]
-    return max(found, key=lambda each: each.sigmas, default=None)
+    best = max(found, key=lambda each: each.sigmas, default=None)
+    return None if best is None else best._replace(chance=min(1.0, 2 * compared * float(norm.sf(best.sigmas))))
 
 
 def _lines_apart(information: FloatArray, right: FloatArray, lines: str, place: str) -> list[PartsApart]:
     """Return how far lines that take turns lie beside the others, or lines from one on beside those before it.
 
-    What a cubic polynomial over the lines explains, such as a rolling shutter, is no difference of parts.
+    What a polynomial over the lines explains, such as a lens or a rolling shutter, is no difference of parts.
     """
     number = len(information)
     every, at = np.arange(number), np.linspace(-1, 1, number)
-    smooth = np.stack([at**power for power in range(4)], axis=1)
+    smooth = np.polynomial.legendre.legvander(at, _LENS_POWERS - 1)
     normal = smooth.T @ (information[:, None] * smooth)
-    if np.linalg.matrix_rank(normal) < len(normal):
+    if np.count_nonzero(information) < _FEWEST_SUMS or np.linalg.matrix_rank(normal) < len(normal):
         return []
     turns = [(each, first) for each in _TURNS for first in range(each if each > 2 else 1)]
     # 0 and 1 for lines that take turns; products with 0 and 1 for those from each on are sums over these.
@@ -146,22 +153,35 @@ def _lines_apart(information: FloatArray, right: FloatArray, lines: str, place: 
     by_smooth, (by_right, squares) = products[:, :-2], products[:, -2:].T
     beyond = by_smooth @ np.linalg.inv(normal)
     left, known = by_right - beyond @ smooth.T @ right, squares - (beyond * by_smooth).sum(axis=1)
-    share = squares / information.sum()
-    told = np.divide(left**2, known, out=np.zeros(len(known)), where=np.minimum(share, 1 - share) > _LEAST_PART)
+    told = np.divide(left**2, known, out=np.zeros(len(known)), where=known > _LEAST_KNOWN * information.sum())
     best = int(told.argmax())
     start = best - len(turns) + 1
     columns = np.column_stack([smooth, taken[best] if start <= 0 else every >= start])
     covariance = np.linalg.pinv(columns.T @ (information[:, None] * columns))
     away = covariance @ columns.T @ right
-    shifts = np.divide(right, information, out=np.zeros(number), where=information > 0)
-    # Along a pan, a row sees the same edges all the time, at the same fraction of a pixel: rows scatter beyond noise.
-    scatter = (information * (shifts - columns @ away) ** 2).sum() / max(np.count_nonzero(information) - len(away), 1)
+    scatter = _scatter(information, right - information * (columns @ away))
     parts = f"{lines} 0 to {start - 1} and {lines} {start} to {number - 1}"
     if start <= 0:
         each, first = turns[best]
         parts = f"odd and even {lines}" if each == 2 else f"one of {each} {lines}, from {first} on, and the others"
-    sigmas = abs(float(away[-1])) / np.sqrt(covariance[-1, -1] * max(1.0, float(scatter)))
-    return [PartsApart(f"{parts}{place}", abs(float(away[-1])), float(sigmas))]
+    sigmas = abs(float(away[-1])) / np.sqrt(covariance[-1, -1] * scatter)
+    return [PartsApart(f"{parts}{place}", abs(float(away[-1])), float(sigmas), turns=start <= 0)]
+
+
+def _scatter(information: FloatArray, left: FloatArray) -> float:
+    """Return the scatter of what a fit leaves of lines over that of photon noise, 1 or more.
+
+    Along a pan, a row sees the same edges all the time, at the same fraction of a pixel, and its neighbours see them, too: what
+    they show is alike. So sums over 1, 2, 4, 8 lines are compared, and the largest scatter counts.
+    """
+    largest, size = 1.0, 1
+    while len(left) // size >= _FEWEST_SUMS:
+        starts = np.arange(0, len(left), size)
+        variances = np.add.reduceat(information, starts)
+        known = variances > 0
+        squares = np.add.reduceat(left, starts)[known] ** 2 / variances[known]
+        largest, size = max(largest, float(squares.sum()) / max(len(squares) - _LENS_POWERS - 1, 1)), 2 * size
+    return largest
 
 
 def deformation_px(shifts: FloatArray, information: FloatArray) -> float | None:

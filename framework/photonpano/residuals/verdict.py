@@ -15,7 +15,7 @@ from scipy import ndimage
 from photonpano.geometry import corners, transform_points
 from photonpano.motion.loop import TOO_NARROW, LevelResult
 from photonpano.residuals.block_sums import M, V
-from photonpano.residuals.causes import CAUSES, FIND_LENS, FREE, TestedRun, Tests, changing_places
+from photonpano.residuals.causes import CAUSES, TestedRun, Tests, changing_places
 from photonpano.residuals.findings import NOTHING, Findings
 from photonpano.residuals.measure import FEWEST_FRAMES
 from photonpano.residuals.patterns import parts_apart
@@ -26,11 +26,11 @@ from photonpano.values.verdict import Found, Test, judged
 
 NARROW = "the camera moves by more than the model of its motion holds"
 REPEATS = "the scene repeats, and pairs of exposures fit at several places"
-_WITHOUT_LENS = "undistort the frames before, or use their middle only (corrections: crop)"
+_FIND_LENS = "camera: {distortion: {k1: find}}"  # what a spec says to measure the lens
 MUCH = 0.25  # share of the panorama that changes, beyond which what is left out may be the scene
 MAX_CONTRAST = 0.05  # up to this share of the light, what the panorama does not explain does not matter
 _UNCERTAIN_PX = 1.0
-_PARTS_SIGMAS = 10.0  # from which on parts lie apart: thousands are compared, and what the rows beside a dead one show is alike
+_PARTS_CHANCE = 0.001  # of parts that noise sets apart
 _SURE_SIGMAS = 6.0  # from which on what neighbouring frames have in common is no noise
 _ASLANT = 5.0  # ratio of the errors along two directions beyond which one of them is unknown
 _AMBIGUOUS = 0.05  # share of the pairs of a level that fit at several places; one or two may be by their noise
@@ -61,7 +61,7 @@ def _shots(run: TestedRun) -> Found | None:
 @FACTS.doubtful_above(
     0,
     "the image jumps while frames show nothing, so that it is unknown where they lie, and whether frames are missing",
-    "leave these frames out, or keep the light on",
+    "keep the light on while the camera moves",
 )
 def _jump_in_the_dark(run: TestedRun) -> Found:
     found = [str(cut.dark) for cut in run.findings.cuts if cut.dark is not None]
@@ -81,14 +81,41 @@ def _untested_motion(run: TestedRun) -> Found:
 
 
 @FACTS.doubtful_above(
+    0.5,
+    "much of what the frames show does not follow one turn of the camera",
+    "the motion may be that of either part",
+)
+def _layers(run: TestedRun) -> Found | None:
+    rival = run.findings.rival_motion
+    if run.findings.hidden_share is None or (rival is not None and rival.px > _UNCERTAIN_PX):
+        return None
+    found = Found(run.findings.hidden_share, "share of the frames that is left out, on average")
+    if parallax := parallax_of(run):
+        what = f"the camera travels by about {parallax:.1g} of the distance of what is near, and much of the frames shows that"
+        what_to_do = "keep away from what is near, or write pose: to find the path of the camera in place of a panorama"
+        found = found._replace(what=what, what_to_do=what_to_do)
+    # Where little is left out, but much changes that is not, what is left out may be the scene.
+    changing_share, _ = changing_places(run.explained.residuals)
+    if min(found.figure, changing_share) <= MUCH:
+        return found
+    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
+
+
+def parallax_of(run: TestedRun) -> float:
+    """Return how far the camera travelled, over the distance of what is near; 0 where that does not rest."""
+    # Later levels leave out what is near.
+    return max((each.located.solution.parallax for each in run.levels), default=0.0)
+
+
+@FACTS.doubtful_above(
     0.2,
     "parts of the sensor see the scene at different places, so that the panorama is torn",
-    "read the frames in the order of the sensor's rows and halves",
+    "the sensor may be read in another order than its frames are given in, or in parts one after the other",
 )
 def _parts(run: TestedRun) -> Found | None:
     """As where rows take turns, or a part of the sensor is read out some frames later than the rest."""
     apart = parts_apart(run.explained.residuals.pixel_slopes)
-    if apart is None or apart.sigmas <= _PARTS_SIGMAS:
+    if apart is None or apart.chance > _PARTS_CHANCE:
         return None
     if run.findings.rival_motion is not None or _standing.judged(run):  # a thing in the frame moves, or stands, by itself
         return None
@@ -110,33 +137,32 @@ def _given_camera(run: TestedRun) -> Found | None:
     return Found(abs(freed.found - freed.given) / freed.std, where)
 
 
-@FACTS.doubtful_above(TOO_NARROW, NARROW, FREE)
+@FACTS.doubtful_above(TOO_NARROW, NARROW, "write motion: {model: homography}")
 def _narrow(run: TestedRun) -> Found | None:
     """Homographies are likelier, and farther away than the motion is expected to err."""
     if not run.levels or not (times := run.levels[-1].narrow):
         return None
-    located, motion = run.levels[-1].located, run.explained.motion
+    located = run.levels[-1].located
     model = located.solution.model
     apart_px = located.rivals["homography"].apart_px
     where = f"times the expected error lie between {model.name} and any homographies, which are likelier: {apart_px:.2g} px"
-    finds = model.kind == "rotation" and not (motion.camera is not None and motion.camera.distorts)
-    what_to_do = f"{FREE}, or {FIND_LENS}" if finds else ""
-    return Found(times, where, what_to_do=what_to_do)
+    return Found(times, where)
 
 
 @FACTS.doubtful_above(
     0.002,  # half of this is seen without a lens
     "the lens distorts the frames, which bends the motion",
-    f"write motion: {{model: rotation}} and {FIND_LENS} for a camera that only turns; or {_WITHOUT_LENS}",
+    "undistort the frames before",
 )
 def _lens(run: TestedRun) -> Found | None:
     found = run.explained.lens
     if found is None or _parts.judged(run):  # a part that lies apart bends frames, too
         return None
-    camera, what_to_do = run.explained.motion.camera, run.freer_model
+    camera, what_to_do = run.explained.motion.camera, ""
     if camera is not None:
-        distortion = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {FIND_LENS}"
-        what_to_do = f"{distortion}; or {_WITHOUT_LENS}"
+        what_to_do = "calibrate the lens, and write camera.distortion" if camera.distorts else f"write {_FIND_LENS}"
+    elif not run.levels or "rotation" not in run.levels[-1].located.rivals:  # of which none through a lens was likelier
+        what_to_do = f"write motion: {{model: rotation}} and {_FIND_LENS} for a camera that only turns"
     return Found(abs(found.k1), f"about {found.k1:.1%} at the corners", what_to_do=what_to_do)
 
 
@@ -157,6 +183,8 @@ def _uncertain(run: TestedRun) -> Found | None:
     for found in (_two_motions(run), _uncut_jump(run), _ambiguous(run), _one_direction(run)):
         if found is not None and found.figure > _UNCERTAIN_PX:
             return found
+    if _layers.judged(run):  # the way of what is near is in the expected error
+        return None
     beside_px = float(known.mean())
     if levels:  # a long path bends, which neither blurs nor tears a panorama
         located = levels[-1].located
@@ -194,8 +222,12 @@ def _ambiguous(run: TestedRun) -> Found | None:
 
 
 def others_px(run: TestedRun) -> float:
-    """Return how far away motions are that jump, are along a second place, or that of a part of the sensor that lies apart."""
-    found = _uncut_jump(run), _ambiguous(run), _parts.judged(run)
+    """Return how far away motions are that jump, are along a second place, or that of a part of the sensor that lies apart.
+
+    Rows that take turns see the same motion: what lies between them tears the panorama alone.
+    """
+    apart = parts_apart(run.explained.residuals.pixel_slopes)
+    found = _uncut_jump(run), _ambiguous(run), None if apart is None or apart.turns else _parts.judged(run)
     return float(np.linalg.norm([each.figure for each in found if each is not None]))
 
 
@@ -268,27 +300,6 @@ def _standing(run: TestedRun) -> Found:
     return Found(run.findings.standing_share, "share of the parts that show motion or rest")
 
 
-@FACTS.doubtful_above(
-    0.5,
-    "much of what the frames show does not follow one turn of the camera, as where it travels past near things",
-    "keep away from what is near, or find the path of the camera in place of a panorama; the motion may be that of either part",
-)
-def _layers(run: TestedRun) -> Found | None:
-    # Later levels leave out what is near.
-    parallax = max((each.located.solution.parallax for each in run.levels), default=0.0)
-    where = "share of the frames that is left out, on average"
-    if parallax:
-        where += f"; if what is near stands still, the camera travelled by about {parallax:.1g} of its distance"
-    if run.findings.hidden_share is None:
-        return None
-    found = Found(run.findings.hidden_share, where)
-    # Where little is left out, but much changes that is not, what is left out may be the scene.
-    changing_share, _ = changing_places(run.explained.residuals)
-    if min(found.figure, changing_share) <= MUCH:
-        return found
-    return found._replace(doubtful=True, where=f"{found.where}; {changing_share:.0%} of the panorama changes all the same")
-
-
 def of_either_part(run: TestedRun) -> bool:
     """Return whether the motion may be that of either of two parts of the frames, and nobody can know from these which."""
     return any(test.judged(run) for test in (_grain, _standing, _layers))
@@ -308,7 +319,7 @@ def _halves(run: TestedRun) -> Found | None:
         "standard errors that the coherence lacks to 1, median over the instants; "
         f"least is {cuts.coherence[least]:.3g}, before frame {cuts.firsts[least]:.0f}"
     )
-    return Found(run.explained.halves.disagreement, where, what_to_do=run.freer_model)
+    return Found(run.explained.halves.disagreement, where)
 
 
 @AGREEMENT.doubtful_above(

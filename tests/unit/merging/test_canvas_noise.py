@@ -130,3 +130,15 @@ def test_uncertain_light_changes_flux_in_proportion() -> None:
     light = Light.of_frames(np.ones(N), std=np.full(N, 0.03))
     source = replace(capture_of(MemorySource(np.zeros((N, 60, 80)))), light=light)
     np.testing.assert_allclose(whole_std(np.full((60, 80), 0.5, np.float32), source), 0.015, rtol=1e-3)
+
+
+@pytest.mark.parametrize("averaged", [True, False])
+def test_flux_of_pixel_that_was_lit_in_every_frame_is_a_lower_bound(averaged: bool) -> None:
+    """Half a dark frame of 1,000 passes for the mean: the lamp is that bright, or brighter."""
+    flux, weight = np.full((6, 8), 0.5, np.float32), np.full((6, 8), 1e3, np.float32)
+    flux[2, 3] = np.log(2 * 1e3 + 1)
+    still = CanvasNoise.of(MemorySource(np.zeros((N, 6, 8))), STILL, SPAN, Canvas(6, 8, rescaling(1)), np.zeros(N))
+    noise = still if averaged else CanvasNoise(response=BinaryResponse())
+    [(_, found)] = noise.of_tile(flux, weight, 0, 0)
+    np.testing.assert_array_equal(np.argwhere(np.isinf(found.whole)), [[2, 3]])
+    assert np.isfinite(found.photons).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano.geometry import patch_centres, transform_points, translation
-from photonpano.motion.models import agreeing, tolerances_px
+from photonpano.motion.models import APART, agreeing, tolerances_px, travelled
 from photonpano.values import Located, Patches
 
 SHAPE = (120, 160)
@@ -61,3 +61,21 @@ def test_pairs_among_others_are_as_they_are_alone() -> None:
     np.testing.assert_array_equal(found[2].homography, lost.homography)
     assert np.trace(found[2].information) < 1e-3 * np.trace(lost.information)
     assert not np.array_equal(found[3].homography, pairs[3].homography)
+
+
+@pytest.mark.parametrize(("walks", "px"), [("", 30.0), ("both ways", 0.0), ("anywhere", 0.0)])
+def test_only_what_rests_tells_how_far_the_camera_travels(walks: str, px: float) -> None:
+    """The camera travels ahead and to the side: things move away from one point, by 3 px from each of 11 nodes to the next."""
+    rng, places = np.random.default_rng(0), (patch_centres(SHAPE) - [79.5, 59.5]) / 200
+    away = np.array([3.0, 0.5]) - 4 * places
+    pairs, left, std_px = np.array([(node + 1, node) for node in range(10)]), [], 0.05
+    for _ in pairs:
+        shifts = away / np.median(np.linalg.norm(away, axis=1)) * rng.uniform(2, 4, (len(places), 1))
+        if walks == "both ways":
+            shifts *= np.sign(places[:, 1:])
+        if walks == "anywhere":
+            turned = rng.uniform(0, 2 * np.pi, len(places))
+            shifts = np.linalg.norm(shifts, axis=1)[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+        left.append(shifts + rng.normal(0, std_px, shifts.shape))
+    motions, layers = [_pair(std_px)] * len(pairs), np.full((11, len(places)), APART + 1)
+    assert travelled(pairs, motions, np.array(left), layers, np.tile(places, (10, 1, 1))) == pytest.approx(px, rel=0.1)
