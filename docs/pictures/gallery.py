@@ -26,7 +26,7 @@ _BARS = (
 _PERIOD = 57.7  # of the bars of the first element; that of the next is shorter by the sixth root of 2
 _REACH = 8  # px of the upright chart by which bars may lie beside their places
 _FRAMES = (5, 10, 20, 40, 70, 100)
-_PULSAR, _AROUND, _STEP = (272, 295), 60, 0.5  # x and y of the pulsar, and what is shown around it, in px of 4x4 pixels
+_PULSAR, _AROUND, _STEP = (272, 222), 60, 0.5  # x and y of the pulsar, and what is shown around it, in px of 4x4 pixels
 _KNOWN_DEG, _KNOWN_CENTRE = -3.40, (231.0, 233.0)  # turn of the fan by frame, and its axis: where merged frames vary most
 
 
