@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 _OF_LOCKED = re.compile(rf"\.(.+)\.(lock|{NEW}|{OLD})")  # what the holder of a lock makes, and the file or folder that it locks
 _PARTIAL = re.compile(r"\.(.+\.)?[0-9a-f]{8}\.partial(\.\w+)?")
-_UNPACKED = ".unpacked.npy"
+_UNPACKED = re.compile(r"(.+\.(gz|npz|h5|hdf5|mat))\.unpacked(\..+)?\.npy")  # a file, and the array that was unpacked from it
 _IDLE_S = 600.0  # an unfinished file to which nothing was written for this time is left over
 
 
@@ -325,8 +325,8 @@ def _is_leftover(path: Path) -> bool:
         return False
     if (locks := _locked_by(path)) is not None:
         return not in_use(locks) and (path.is_dir() or is_lock(path))
-    if path.name.endswith(f".gz{_UNPACKED}"):
-        return path.with_name(path.name.removesuffix(_UNPACKED)).is_file()
+    if archive := _UNPACKED.fullmatch(path.name):
+        return path.with_name(archive[1]).is_file()
     return _PARTIAL.fullmatch(path.name) is not None and time.time() - path.stat().st_mtime > _IDLE_S
 
 

@@ -1,3 +1,7 @@
+from .arrays import FrameAxis as FrameAxis
+from .arrays import frame_array as frame_array
+from .arrays import is_array_file as is_array_file
+from .arrays import unpacked_array as unpacked_array
 from .files import COLOURS as COLOURS
 from .files import OpenFiles as OpenFiles
 from .files import as_written as as_written

@@ -6,10 +6,9 @@ import gzip
 import logging
 import math
 import operator
-import os
+import shutil
 import zlib
 from collections.abc import Sequence
-from functools import lru_cache
 from gzip import GzipFile
 from io import BytesIO
 from pathlib import Path
@@ -189,8 +188,8 @@ def gzipped_npy_header(path: Location) -> NpyHeader:
 def unpacked(path: Location) -> Path:
     """Return the path of a .npy file with the content of a .npy.gz file.
 
-    For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. It is written, and a warning logged, unless it is there with the
-    checksum that the archive ends with.
+    For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. It is written, and a warning logged, unless it was
+    unpacked from the same file before.
 
     Raises:
         InputError: the file is damaged, or holds something else.
@@ -199,33 +198,18 @@ def unpacked(path: Location) -> Path:
     path = local(path)
     promised = gzipped_npy_header(path).file_bytes
     target = path.with_name(f"{path.name}.unpacked.npy")
-    if not _is_content(target, path, promised):
+    if not is_unpacked_from(target, path):
         require_space(target, promised)
         logger.warning("%s is unpacked to %s, once", path, target.name)
         with atomic_path(target) as temporary:
             _unpack(path, temporary, promised)
+            shutil.copystat(path, temporary)
     return target
 
 
-def _is_content(target: Path, path: Path, promised: int) -> bool:
-    """Return whether a file has the checksum that an archive ends with; one of several parts is always unpacked again."""
-    if target.is_symlink() or not target.is_file() or target.stat().st_size != promised:
-        return False
-    with reading(path), path.open("rb") as archive:
-        archive.seek(-8, os.SEEK_END)
-        recorded = int.from_bytes(archive.read(4), "little")
-    return _crc32(target, target.stat().st_ctime_ns) == recorded
-
-
-@lru_cache(16)
-def _crc32(path: Path, changed_ns: int) -> int:
-    """Return the checksum of a file, which is read again if it has changed."""
-    del changed_ns
-    checksum = 0
-    with reading(path), path.open("rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            checksum = zlib.crc32(block, checksum)
-    return checksum
+def is_unpacked_from(target: Path, path: Path) -> bool:
+    """Return whether a file was unpacked from another as it is now: both then have the same time of change."""
+    return not target.is_symlink() and target.is_file() and target.stat().st_mtime_ns == path.stat().st_mtime_ns
 
 
 def _unpack(path: Path, target: Path, promised: int) -> None:
