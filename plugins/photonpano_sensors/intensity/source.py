@@ -51,8 +51,8 @@ class IntensitySource(Closing, ABC):
     def refuse_binary(self, path: Path, pictures: str) -> None:
         """Refuse frames of zeros and ones with an `InputError`; `pictures` is Python code that reads all of them.
 
-        From one frame to the next, levels of black and white jump by as much as their mean allows. A codec with loss halves that at
-        most, unless nothing is left of the frames; grey levels reach a hundredth.
+        From one frame to the next, levels of black and white jump by as much as their mean allows. A codec with loss halves
+        that at most, unless little is left of the frames; grey levels reach a hundredth.
         """
         try:
             levels = [self._levels_of(each) for each in self.info.spread(_LOOKED_AT, min(2, self.info.n_frames))]
@@ -67,8 +67,8 @@ class IntensitySource(Closing, ABC):
             self.close()
             if values not in _BITS:
                 raise InputError(
-                    f"{path} seems to hold binary frames that a codec changed: levels jump from dark to bright from one frame to "
-                    "the next, as photons do. Which pixels were lit is lost: record without compression, or with ffv1"
+                    f"{path} seems to hold binary frames that a codec changed: levels jump from dark to bright from one frame "
+                    "to the next, as photons do. Which pixels were lit is lost: record without compression, or with ffv1"
                 )
             saved = f'numpy.save("cube.npy", numpy.packbits(numpy.array({pictures}) > 99, axis=-1))'
             only = f"binary frames, of {values[0]} and {values[1]} only"

@@ -68,6 +68,17 @@ def test_swissspad_arrays_are_distinguished_by_correlation(
             np.testing.assert_array_equal(source.frames(FrameSpan(0, 3)), frames[:3])
 
 
+def test_smooth_scenes_of_swissspad_are_told_by_the_borders_of_zones(tmp_path: Path, bin_file: Callable) -> None:
+    rng = np.random.default_rng(3)
+    scene = cv2.GaussianBlur(rng.standard_normal((512, 512)), (0, 0), 12)
+    lit = (-np.expm1(-0.1 * np.exp(scene / scene.std() / 4))).astype(np.float32)
+    for name, rows in (("swissspad-half", 256), ("swissspad-full", 512)):
+        path = tmp_path / f"{name}.bin"
+        frames = [rng.random((rows, 512), np.float32) < lit[:rows] for _ in range(512 * 256 // rows)]
+        path.write_bytes(bin_file(name, np.array(frames, np.uint8)))
+        assert set(recognised(path)) == {name}
+
+
 @pytest.mark.parametrize("n_frames", [256, 1000])
 def test_spad512_is_recognised_by_file_size(tmp_path: Path, n_frames: int) -> None:
     path = tmp_path / "frames.bin"
