@@ -100,8 +100,8 @@ def record_of(
         "warnings": [
             *time_warnings(findings.left_out, plan.run.time_limit),
             *timeline_warnings(timeline, plan.output.directory),
-            *level_warnings(levels),
             *motion_warnings(motion, timeline),
+            *level_warnings(levels),
             *refinement_warnings(explained.refinements),
         ],
     }
@@ -490,12 +490,12 @@ def timeline_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
 
 def motion_warnings(motion: FrameMotion, timeline: Timeline | None = None) -> list[str]:
     """Warn of frames whose motion is uncertain, or that show the scene and are left out."""
-    warnings = uncertain_frames(motion)
+    warnings = []
     lost = ~motion.located if timeline is None else ~motion.located & timeline.shown
     if lost.any():
         n_left_out, n_frames = int(np.sum(lost)), len(lost)
         warnings.append(f"{n_left_out} of {n_frames} frames lie outside the located exposures and are left out")
-    return warnings
+    return warnings + uncertain_frames(motion)
 
 
 def uncertain_frames(motion: FrameMotion) -> list[str]:
