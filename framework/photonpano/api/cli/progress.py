@@ -57,7 +57,14 @@ class Bars:
         """Draw the bar of a stage of `total` units."""
         with _bar(self._console, unit) as bar:
             task = bar.add_task(title, total=total)
-            yield lambda done: bar.advance(task, done)
+
+            def advance(done: int) -> None:
+                bar.advance(task, done)
+                if bar.finished:  # what is left to do with the units has no bar
+                    bar.update(task, description=f"{title}, to be finished")
+
+            yield advance
+            bar.update(task, description=title)
 
     def note(self, message: str) -> None:
         """Print a line."""
@@ -143,6 +150,7 @@ class _Stage:
         # The first units take longer than the others: loops are compiled.
         is_known = _TOLD_FROM * self._total <= done < self._total
         left = f", about {duration(seconds * (self._total - done) / done)} left" if is_known else ""
+        left = ", to be finished" if done >= self._total else left
         return f"{self._title}: {count(done)} of {count(self._total)} {self._unit} after {duration(seconds)}{left}"
 
     def finished(self) -> str:
