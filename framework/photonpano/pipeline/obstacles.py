@@ -1,4 +1,4 @@
-"""Find what makes a capture hard to locate: another order of pixels, repeated frames, what stands still or repeats, shots."""
+"""Find what makes a capture hard to locate: another order of pixels, repeated frames, what stands still, shots."""
 
 from __future__ import annotations
 
@@ -7,20 +7,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from photonpano.capture import Capture, capture_of
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, LocationError, PhotonpanoError, described
 from photonpano.execution.context import Context, Progress
 from photonpano.geometry import corners, inverse, transform_points
-from photonpano.locating.images import correlation_peaks
 from photonpano.merging import binned_mean
-from photonpano.merging.accumulate import weights_of
 from photonpano.motion.graph import components
 from photonpano.motion.level import SHORTEST_DARK, Timeline
 from photonpano.motion.locate import LocatedLevel
@@ -33,14 +31,7 @@ from photonpano.robust import robust_std
 from photonpano.specs.plan import Plan
 from photonpano.values import BoolArray, FloatArray, FrameSpan, Group, true_spans
 
-_PLACES, _FRAMES = 5, 256  # spans all over the capture, and most frames of each
-_ALIKE = 0.7  # an image repeats if another shift fits at least this well, as a share of the best one
-_DIP = 0.5  # between two peaks, the correlation falls below this share of the highest one
-_AGREE = 0.2  # largest difference of the periods of spans from their median, relative to it
-_SURE = 6.0  # standard deviations from which the best correlation is not chance
-_MOST_PEAKS = 200  # most peaks that are compared
-_REACH = 1 / 3  # largest shift that is looked at, as a share of the frame
-_FILTER_BLUR_PX = 1.0  # standard deviation of the Gaussian that blurs a colour filter array
+_PLACES = 5  # spans all over the capture
 _STANDING = 0.3  # share of the frame from which what stands still is named
 _MASKED = 0.5  # share of the pixels that are masked, from which a mask may be the wrong way round
 _BLOCK_FRAMES, _FEW_FRAMES = 256, 16  # frames that are compared at a time, if they are packed and if not
@@ -98,58 +89,6 @@ def obstacles(source: Source) -> Iterator[str]:
             f"{share:.0%} of the frame stands still while the rest moves, as a window or dirt in front of the sensor does: "
             "mask it under corrections, or cut it off."
         )
-    spans = source.info.spread(_PLACES, min(_FRAMES, max(2, source.info.n_frames // _PLACES - 1)))
-    found = [each for span in spans if (each := _repetition_within(source, span)) is not None]
-    period = float(np.median(found)) if found else 0.0
-    if 2 * sum(abs(each - period) < _AGREE * period for each in found) > len(spans):
-        yield (
-            f"The image repeats every {period:.0f} px, so that pairs fit at several places: "
-            "use shorter groups, between which it moves by less than half of that."
-        )
-
-
-def _repetition_within(source: Source, span: FrameSpan) -> float | None:
-    middle = (span.start + span.stop) // 2
-    if middle == span.start:
-        return None
-    parts = FrameSpan(span.start, middle), FrameSpan(middle, span.stop)
-    return repetition_px(*(_sum(source, part) for part in parts))
-
-
-def _sum(source: Source, span: FrameSpan) -> NDArray[Any]:
-    """Sum the frames of a span; colours are made alike, and blurred, so that their filter array is not seen."""
-    capture = capture_of(source).masked_in(span)
-    weights = weights_of(capture)
-    if capture.colour is None or weights is None:
-        return np.where(capture.valid, capture.counts(span), 0)
-    lit, near = (
-        ndimage.gaussian_filter(image, _FILTER_BLUR_PX) for image in (capture.corrected_counts(span) * weights, weights)
-    )
-    return np.asarray(lit / np.maximum(near, 1e-6))
-
-
-def repetition_px(first: NDArray[Any], second: NDArray[Any]) -> float | None:
-    """Return the distance after which an image repeats, from two sums of frames (H, W); None if it does not.
-
-    Photon noise plays no part, since the two sums do not share it.
-    """
-    height, width = first.shape
-    padded = 2 * height, 2 * width
-    window = np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1])
-    views = [window * (image - np.average(image, weights=window)) for image in (first, second)]
-    spectra = [fft.rfft2(view, padded) for view in views]
-    alike = fft.irfft2(spectra[1] * spectra[0].conj(), padded)
-    if not alike.max() > _SURE * np.sqrt(np.sum(views[0] ** 2) * np.sum(views[1] ** 2) * np.sum(window**4)) / np.sum(window**2):
-        return None
-    overlap = fft.irfft2(np.abs(fft.rfft2(window, padded)) ** 2, padded)
-    down, across = (np.minimum(np.arange(2 * size), 2 * size - np.arange(2 * size)) for size in (height, width))
-    near = np.logical_and.outer(down <= _REACH * height, across <= _REACH * width)
-    surface = np.divide(alike, overlap, out=np.zeros(padded), where=near)
-    shifts, _ = correlation_peaks(surface, _ALIKE, _MOST_PEAKS)
-    between = shifts[0] + np.linspace(0, 1, 33)[:, np.newaxis, np.newaxis] * (shifts[1:] - shifts[0])
-    along = ndimage.map_coordinates(surface, np.moveaxis(between, -1, 0)[::-1], order=1, mode="grid-wrap")
-    apart = np.hypot(*(shifts[1:] - shifts[0]).T)[along.min(axis=0, initial=np.inf) < _DIP * surface.max()]
-    return float(apart.min()) if apart.size else None
 
 
 def timeline_of(source: Source, context: Context) -> Timeline:
