@@ -39,14 +39,14 @@ from photonpano.reading import (
     PixelOrder,
     StoredFrames,
     ThreeChannels,
-    any_npy_header,
     arrived_frames,
     as_written,
     eight_frames_are_first,
     frames_are_last,
     has_channels,
     is_array_file,
-    is_gzip,
+    is_matlab_file,
+    npy_header,
     objections,
     of_channel,
     other_order,
@@ -55,7 +55,6 @@ from photonpano.reading import (
     sampled_frames,
     size_of,
     unpacked,
-    unpacked_array,
     unpacked_content,
 )
 
@@ -239,13 +238,13 @@ _AnySource: TypeAlias = PackedFileSource | _NpyBits | _NpySums | ThreeChannels
 
 
 def _unpacked(config: _AnyConfig) -> dict[str, Any]:
-    """Return what changes in a config when its array is unpacked to a .npy file, frames first; nothing for a .npy file."""
+    """Return what changes in a config when its array is unpacked to a .npy file; nothing for a .npy file."""
     if not is_array_file(config.path):
         if config.array is None:
             return {}
         raise InputError(f"{config.path} is no .npz, HDF5 or MATLAB file; leave out array: {config.array}")
-    axis = getattr(config, "frame_axis", None)
-    changed = {"path": unpacked_array(config.path, config.array, axis), "array": None}
+    axis = getattr(config, "frame_axis", None) if is_matlab_file(config.path) else None
+    changed = {"path": unpacked(config.path, config.array, axis), "array": None}
     return changed if axis is None else changed | {"frame_axis": "first"}
 
 
@@ -253,13 +252,13 @@ def _open_npy(config: _AnyConfig) -> _AnySource:
     """Open a capture; raises an `InputError`, or an `OutputError` where a compressed file cannot be unpacked."""
     config = config.model_copy(update=_unpacked(config))
     header = _whole_header(config)
-    return _npy_source(config, unpacked(config.path) if is_gzip(config.path) else config.path, header)
+    return _npy_source(config, config.path, header)
 
 
 def _arrived_npy(config: _AnyConfig) -> Arrived:
     """Open the frames that are there of a file that is still being written."""
     if is_array_file(config.path):
-        raise InputError(f"{config.path} can only be read when it is whole; follow a .npy file")
+        raise InputError(f"{config.path} is unpacked, so that no frame can be read before all are there; follow a .npy file")
     if (n_frames := arrived_frames(config.path)) is None:
         return Arrived(None)
     if isinstance(config, NpyConfig) and config.frame_axis == "last":
@@ -287,8 +286,7 @@ def _npy_source(config: _AnyConfig, path: Location, header: NpyHeader) -> _AnySo
 def _whole_header(config: _AnyConfig) -> NpyHeader:
     """Return the header of a capture, of which nothing is missing and whose frames lie along the axis of the config."""
     path, header = config.path, _header(config)
-    if not is_gzip(path):
-        require_whole(path, header)
+    require_whole(path, header)
     if isinstance(config, NpyConfig) and config.frame_axis is None and len(header.shape) == 3:
         samples = sampled_frames(path, header)
         if samples and frames_are_last(samples, header.shape):
@@ -301,7 +299,7 @@ def _whole_header(config: _AnyConfig) -> NpyHeader:
 
 def _header(config: _AnyConfig) -> NpyHeader:
     """Return the header of the capture, which may be incomplete; raise if it does not agree with the config."""
-    path, header = config.path, any_npy_header(config.path)
+    path, header = config.path, npy_header(config.path)
     axes = "frames, height, bytes of a row"
     if isinstance(config, PackedNpyConfig):
         if header.dtype != np.uint8 and len(header.shape) > 2 and min(header.shape) > 0:
@@ -446,10 +444,7 @@ def _require_order(config: PackedNpyConfig) -> None:
 
 
 def _require_values(config: NpyConfig) -> None:
-    """Read some frames; raises what opening the capture and reading them raises. A compressed file is not unpacked for that."""
-    if is_gzip(config.path):
-        _whole_header(config)
-        return
+    """Read some frames; raises what opening the capture and reading them raises."""
     with _open_npy(config) as source:
         for span in source.info.spread(_CHECKED, 1):
             source.frames(span)
@@ -465,8 +460,8 @@ def _recognise(use: str, path: Location) -> Recognised | None:
     if not _is_alone(path):
         return None
     try:
-        stored = unpacked_array(path, None, None) if is_array_file(path) else path
-        header = any_npy_header(stored)
+        stored = unpacked(path) if is_array_file(path) else path
+        header = npy_header(stored)
         seen = _seen(stored, header)
         if seen is None and use == "packed-npy":  # too short to tell, or cut short
             _header(PackedNpyConfig(path=stored))

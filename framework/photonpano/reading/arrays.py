@@ -1,8 +1,10 @@
-"""Read arrays of frames in .npz, HDF5 and MATLAB files, and unpack one to a .npy file, once."""
+"""Read arrays of frames in .npy.gz, .npz, HDF5 and MATLAB files, and unpack one to a .npy file, once."""
 
 from __future__ import annotations
 
+import gzip
 import logging
+import math
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,12 +19,12 @@ from photonpano.errors import InputError
 from photonpano.files.folders import atomic_path, require_space
 from photonpano.files.paths import Location, Url
 from photonpano.reading.files import library, read_start, reading
-from photonpano.reading.npy import frames_are_last, is_unpacked_from, read_npy_header, sampled_spans
+from photonpano.reading.npy import frames_are_last, read_npy_header, require_frames, sampled_spans
 from photonpano.text import listed
 
 FrameAxis: TypeAlias = Literal["first", "last"]
 
-_ZIP, _HDF, _MATLAB = b"PK\x03\x04", b"\x89HDF", b"MATLAB "
+_GZIP, _ZIP, _HDF, _MATLAB = b"\x1f\x8b", b"PK\x03\x04", b"\x89HDF", b"MATLAB "
 _DAMAGED = "cannot be read as a file of arrays: it is damaged or something else; copy it again"
 _BLOCK_BYTES = 16 * 1024**2  # read at once
 _MOST = 65535  # the largest sum of binary frames
@@ -31,50 +33,76 @@ logger = logging.getLogger(__name__)
 
 
 def is_array_file(path: Location) -> TypeGuard[Path]:
-    """Return whether a path is an .npz, HDF5 or MATLAB file, by its first bytes."""
-    return not isinstance(path, Url) and path.is_file() and read_start(path, 7).startswith((_ZIP, _HDF, _MATLAB))
+    """Return whether a path is a .npy.gz, .npz, HDF5 or MATLAB file, by its first bytes."""
+    return not isinstance(path, Url) and path.is_file() and read_start(path, 7).startswith((_GZIP, _ZIP, _HDF, _MATLAB))
+
+
+def is_matlab_file(path: Path) -> bool:
+    """Return whether MATLAB wrote a file, by its first bytes."""
+    return read_start(path, len(_MATLAB)) == _MATLAB
 
 
 class FrameArray(NamedTuple):
-    """An array (frames, height, width) of a file, or (height, width, frames), whose values are read in blocks."""
+    """An array (frames, height, width) of a file, whose values are read in blocks; in MATLAB, frames are the last axis."""
 
-    name: str
-    stored: Any  # an array of numpy or h5py, in the order of the bytes
+    name: str  # empty for the only array of a .npy.gz file
+    stored: Any  # an array of numpy, h5py, or in a compressed .npy file, in the order of the bytes
     of_matlab: bool  # whether MATLAB wrote it, which counts axes from the last one in the order of the bytes
 
     def frame_axis(self, others: int = 0) -> FrameAxis | None:
-        """Return which axis is that of the frames if likeness shows that it is not the usual one.
+        """Return "first" if likeness shows that the first axis of an array of MATLAB is that of the frames.
 
         Args:
             others: number of frames of the capture in other files.
         """
         shape = self.stored.shape
-        if len(shape) != 3:
+        if not self.of_matlab or len(shape) != 3:
             return None
         spans = sampled_spans(shape[0], shape[1] * shape[2])
         samples = [np.asarray(self.stored[span.start : span.stop]) for span in spans]
-        if not frames_are_last(samples, (*shape[:2], shape[2] + others)):
-            return None
-        return "first" if self.of_matlab else "last"
+        return "first" if frames_are_last(samples, (*shape[:2], shape[2] + others)) else None
 
     def shape(self, axis: FrameAxis | None) -> tuple[int, ...]:
-        """Return the shape with the frames first; `axis` is where they lie in the file, None for the usual one."""
-        of_frame = self.stored.shape[1:] if self._axis(axis) == 0 else self.stored.shape[:-1]
-        return self.stored.shape[self._axis(axis)], *(of_frame[::-1] if self.of_matlab else of_frame)
+        """Return the shape with the frames first; `axis` is where they lie in MATLAB, None for the last."""
+        shape = self.stored.shape
+        if not self.of_matlab:
+            return tuple(shape)
+        return (shape[-1], *shape[-2::-1]) if axis == "first" else (shape[0], *shape[:0:-1])
 
     def blocks(self, axis: FrameAxis | None) -> Iterator[tuple[slice, NDArray[Any]]]:
-        """Yield some frames at a time, (n, H, W), and their place; see `shape`."""
-        last = self._axis(axis) == -1
-        n_frames = self.stored.shape[self._axis(axis)]
-        step = max(1, _BLOCK_BYTES * n_frames // max(1, self.stored.size * self.stored.dtype.itemsize))
+        """Yield some frames at a time, (n, H, W), in order, and their place; see `shape`."""
+        n_frames, *of_frame = self.shape(axis)
+        step = max(1, _BLOCK_BYTES // max(1, math.prod(of_frame) * self.stored.dtype.itemsize))
         for start in range(0, n_frames, step):
             place = slice(start, min(start + step, n_frames))
-            values = np.moveaxis(self.stored[..., place], -1, 0) if last else np.asarray(self.stored[place])
-            yield place, values.transpose(0, *range(values.ndim - 1, 0, -1)) if self.of_matlab else values
+            if not self.of_matlab:
+                yield place, np.asarray(self.stored[place])
+                continue
+            values = np.moveaxis(self.stored[..., place], -1, 0) if axis == "first" else np.asarray(self.stored[place])
+            yield place, values.transpose(0, *range(values.ndim - 1, 0, -1))
 
-    def _axis(self, axis: FrameAxis | None) -> Literal[0, -1]:
-        usual = "last" if self.of_matlab else "first"
-        return 0 if axis in (None, usual) else -1
+
+class _Compressed:
+    """The array of a compressed .npy file, whose values are read once, in order."""
+
+    def __init__(self, path: Path, file: IO[bytes] | gzip.GzipFile) -> None:
+        if (header := read_npy_header(file)) is None:
+            raise InputError(f"{path} holds no .npy file; compress one that numpy.save has written")
+        require_frames(path, header, "frames, height, width")
+        self.shape, self.dtype, self._path, self._file = header.shape, header.dtype, path, file
+
+    def __getitem__(self, place: slice) -> NDArray[Any]:
+        shape = (place.stop - place.start, *self.shape[1:])
+        wanted = math.prod(shape) * self.dtype.itemsize
+        with reading(self._path, "is cut short or damaged: it cannot be unpacked; copy it again"):
+            data = self._file.read(wanted)
+            more = self._file.read(1) if place.stop == self.shape[0] else b""  # at its end, the checksum is compared
+        if more or len(data) < wanted:
+            raise InputError(
+                f"{self._path} is damaged: the header of its array promises {'fewer' if more else 'more'} bytes than there "
+                "are; copy or record it again"
+            )
+        return np.frombuffer(data, self.dtype).reshape(shape)
 
 
 @contextmanager
@@ -86,14 +114,17 @@ def frame_array(path: Path, name: str | None) -> Iterator[FrameArray]:
     """
     with reading(path, _DAMAGED):
         start = read_start(path, 10)
-        if start.startswith(_ZIP):
+        if start.startswith(_GZIP):
+            with gzip.open(path) as unzipped:
+                yield FrameArray("", _Compressed(path, unzipped), False)
+        elif start.startswith(_ZIP):
             with ZipFile(path) as archive:
                 members = {member.removesuffix(".npy"): member for member in archive.namelist() if member.endswith(".npy")}
                 found = _chosen(path, name, {key: _shape(archive.open(member)) for key, member in members.items()})
                 with archive.open(members[found]) as file:
-                    yield FrameArray(found, np.lib.format.read_array(file, allow_pickle=False), False)
+                    yield FrameArray(found, _Compressed(path, file), False)
         elif start.startswith(_HDF) or start == b"MATLAB 7.3":
-            step = -1 if (of_matlab := start.startswith(_MATLAB)) else 1
+            step = -1 if (of_matlab := is_matlab_file(path)) else 1
             with library("h5py", "photonpano[hdf5]", str(path)).File(path) as file:
                 shapes: dict[str, tuple[int, ...]] = {}
                 file.visititems(lambda key, each: shapes.update({key: each.shape[::step]}) if hasattr(each, "shape") else None)
@@ -131,33 +162,31 @@ def _chosen(path: Path, name: str | None, shapes: dict[str, tuple[int, ...]]) ->
     raise InputError(f"{path} holds {there}; {what}")
 
 
-def unpacked_array(path: Path, name: str | None, axis: FrameAxis | None) -> Path:
-    """Return the path of a .npy file with an array of a file, frames first.
+def unpacked(path: Path, name: str | None = None, axis: FrameAxis | None = None) -> Path:
+    """Return the path of a .npy file with an array of a file.
 
     For `capture.h5` with the array `frames` it is `capture.h5.unpacked.frames.npy`. It is written, and a warning logged, unless
-    it is there from the same file. Whole numbers that are stored as fractions, as MATLAB does, become uint16.
+    it was unpacked from the same file before. Whole numbers that are stored as fractions, as MATLAB does, become uint16.
 
     Args:
         path: the file.
         name: that of the array; None for the only one.
-        axis: where its frames lie; None for the axis that the frames show, or else the usual one: the last in a file of MATLAB,
-            the first in others.
+        axis: where frames lie in a file of MATLAB, and are then moved from; None for where they show to lie, or the last axis.
 
     Raises:
-        InputError: there is no such array, or it does not hold whole numbers.
+        InputError: there is no such array, it does not hold whole numbers, or the file is damaged.
         OutputError: the .npy file cannot be written, or does not fit on its disk.
     """
     with frame_array(path, name) as array:
         dtype = array.stored.dtype
         if dtype.kind not in "buif":
             raise InputError(f"{path} has an array {array.name} of {dtype} values; frames are bool or whole numbers")
-        written, axis = axis, axis or array.frame_axis()
-        target = path.with_name(
-            ".".join([path.name, "unpacked", *array.name.split("/"), *([written] if written else []), "npy"])
-        )
-        if is_unpacked_from(target, path):
+        names = [path.name, "unpacked", *array.name.split("/"), axis, "npy"]
+        target = path.with_name(".".join(filter(None, names)))
+        if target.is_file() and not target.is_symlink() and target.stat().st_mtime_ns == path.stat().st_mtime_ns:
             return target
         axis = axis or array.frame_axis()
+        moved = f" (its frames lie along the {axis} axis)" if axis else ""
         shape, stored = array.shape(axis), np.dtype(np.uint16) if dtype.kind == "f" else dtype
         require_space(target, int(np.prod(shape)) * stored.itemsize)
         with atomic_path(target) as temporary:
@@ -165,8 +194,7 @@ def unpacked_array(path: Path, name: str | None, axis: FrameAxis | None) -> Path
             for place, values in array.blocks(axis):
                 _require_whole(path, array, values)
                 if not place.start:
-                    found = f" (its frames lie along the {axis} axis)" if axis else ""
-                    logger.warning("%s is unpacked to %s, once%s", path, target.name, found)
+                    logger.warning("%s is unpacked to %s, once%s", path, target.name, moved)
                 frames[place] = values
             frames.flush()
             shutil.copystat(path, temporary)

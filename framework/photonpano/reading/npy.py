@@ -1,27 +1,21 @@
-"""Read and check headers of .npy and .npy.gz files, count the frames that are there, and unpack .npy.gz files once."""
+"""Read and check headers of .npy files, count the frames that are there, and tell from frames how they are stored."""
 
 from __future__ import annotations
 
-import gzip
-import logging
 import math
 import operator
-import shutil
-import zlib
 from collections.abc import Sequence
 from gzip import GzipFile
 from io import BytesIO
-from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.files.folders import atomic_path, require_space
 from photonpano.files.paths import Location, Url
 from photonpano.photometry import BitOrder
-from photonpano.reading.files import OpenFiles, is_gzip, read_range, read_start, reading, size_of
+from photonpano.reading.files import OpenFiles, read_range, read_start, reading, size_of
 from photonpano.values import FrameSpan
 
 _HEADER_BYTES = 4096  # bytes of a URL that are read for the header; that of a capture has 128
@@ -120,8 +114,6 @@ def arrived_frames(path: Location) -> int | None:
     """
     if isinstance(path, Url):
         raise InputError(f"{path} is a URL, which cannot be followed: follow a file, or a pipe")
-    if is_gzip(path):
-        raise InputError(f"{path} is compressed, so that no frame can be read before all are there; follow a .npy file")
     if not path.exists() or size_of(path) < _SHORTEST_HEADER:
         return None
     header = npy_header(path)
@@ -140,103 +132,6 @@ def _guess(start: bytes) -> str:
     if start.startswith(b"\x93NUM"):
         return " that can be read: its header is damaged; write it again"
     return ", by its first bytes; write it with numpy.save"
-
-
-logger = logging.getLogger(__name__)
-
-
-def local(path: Location) -> Path:
-    """Return the path of a compressed file; an `InputError` for a URL, of which it can only be read from its beginning."""
-    if isinstance(path, Url):
-        raise InputError(f"{path} is compressed with gzip, and cannot be read in parts; unpack it there, or download it")
-    return path
-
-
-def unpacked_start(path: Path, n_bytes: int) -> bytes:
-    """Return the first bytes of a file, unpacked if it is compressed; none if it cannot be read."""
-    if not is_gzip(path):
-        return read_start(path, n_bytes)
-    try:
-        with gzip.open(path) as file:
-            return file.read(n_bytes)
-    except (OSError, EOFError, zlib.error):
-        return b""
-
-
-def any_npy_header(path: Location) -> NpyHeader:
-    """Read the header of a .npy or .npy.gz file; raises as `npy_header` and `gzipped_npy_header`."""
-    return gzipped_npy_header(path) if is_gzip(path) else npy_header(path)
-
-
-def gzipped_npy_header(path: Location) -> NpyHeader:
-    """Read the header of the array in a .npy.gz file, without its data.
-
-    Raises:
-        InputError: the file cannot be read, or holds something else; or it is a URL.
-    """
-    path = local(path)
-    try:
-        with gzip.open(path) as file:
-            header = read_npy_header(file)
-    except (OSError, EOFError, zlib.error) as error:
-        raise _damaged(path) from error
-    if header is None:
-        raise InputError(f"{path} holds no .npy file; compress one that numpy.save has written")
-    return header
-
-
-def unpacked(path: Location) -> Path:
-    """Return the path of a .npy file with the content of a .npy.gz file.
-
-    For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. It is written, and a warning logged, unless it was
-    unpacked from the same file before.
-
-    Raises:
-        InputError: the file is damaged, or holds something else.
-        OutputError: the unpacked file cannot be written, or does not fit on its disk.
-    """
-    path = local(path)
-    promised = gzipped_npy_header(path).file_bytes
-    target = path.with_name(f"{path.name}.unpacked.npy")
-    if not is_unpacked_from(target, path):
-        require_space(target, promised)
-        logger.warning("%s is unpacked to %s, once", path, target.name)
-        with atomic_path(target) as temporary:
-            _unpack(path, temporary, promised)
-            shutil.copystat(path, temporary)
-    return target
-
-
-def is_unpacked_from(target: Path, path: Path) -> bool:
-    """Return whether a file was unpacked from another as it is now: both then have the same time of change."""
-    return not target.is_symlink() and target.is_file() and target.stat().st_mtime_ns == path.stat().st_mtime_ns
-
-
-def _unpack(path: Path, target: Path, promised: int) -> None:
-    """Unpack at most as many bytes as the header promises: a damaged file must not fill the disk."""
-    size = 0
-    with target.open("wb") as out, gzip.open(path) as file:
-        while block := _next_block(path, file):
-            size += len(block)
-            if size > promised:
-                break
-            out.write(block)
-    if size != promised:
-        more = "more" if size > promised else f"{size}"
-        raise InputError(
-            f"{path} is damaged: the header of its array promises {promised} bytes, there are {more}; copy or record it again"
-        )
-
-
-def _next_block(path: Path, file: gzip.GzipFile) -> bytes:
-    try:
-        return file.read(_BLOCK_BYTES)
-    except (OSError, EOFError, zlib.error) as error:
-        raise _damaged(path) from error
-
-
-def _damaged(path: Path) -> InputError:
-    return InputError(f"{path} is cut short or damaged: gzip cannot unpack it; copy it again")
 
 
 class PixelOrder(NamedTuple):
@@ -404,7 +299,7 @@ class Content(NamedTuple):
 
 
 def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:
-    """Read runs of consecutive frames from all over a .npy file, or from the beginning of a .npy.gz file.
+    """Read runs of consecutive frames from all over a .npy file.
 
     Args:
         path: the file.
@@ -412,15 +307,9 @@ def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:
 
     Returns:
         Arrays (n, rows, columns, ...), 3 million values together. Of large frames, only the first columns are read. An empty
-        list where the file is cut short, or the beginning of a .npy.gz file holds no whole frame.
+        list where the file is cut short.
     """
     n_frames, n_rows, n_columns, *_ = header.shape
-    values_of_frame = int(np.prod(header.shape[1:]))
-    if is_gzip(path):
-        start = unpacked_start(local(path), header.offset + _VALUES * header.dtype.itemsize)[header.offset :]
-        whole = min(n_frames, len(start) // (values_of_frame * header.dtype.itemsize))
-        frames = np.frombuffer(start, header.dtype, whole * values_of_frame)
-        return [frames.reshape(whole, *header.shape[1:])] if whole else []
     if size_of(path) < header.file_bytes:
         return []
     columns = min(n_columns, max(1, _VALUES // (_SHORTEST_RUN * n_rows)))

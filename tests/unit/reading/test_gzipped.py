@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonpano import OutputError
-from photonpano.reading.npy import unpacked
+from photonpano.reading import unpacked
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
 
