@@ -249,7 +249,7 @@ def _unpacked(config: _AnyConfig) -> dict[str, Any]:
 
 
 def _open_npy(config: _AnyConfig) -> _AnySource:
-    """Open a capture; raises an `InputError`, or an `OutputError` where a compressed file cannot be unpacked."""
+    """Open a capture; raises an `InputError`, also where a file cannot be unpacked."""
     config = config.model_copy(update=_unpacked(config))
     header = _whole_header(config)
     return _npy_source(config, config.path, header)

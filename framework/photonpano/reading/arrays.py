@@ -15,7 +15,7 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from photonpano.errors import InputError
+from photonpano.errors import InputError, OutputError
 from photonpano.files.folders import atomic_path, require_space
 from photonpano.files.paths import Location, Url
 from photonpano.reading.files import library, read_start, reading
@@ -174,8 +174,8 @@ def unpacked(path: Path, name: str | None = None, axis: FrameAxis | None = None)
         axis: where frames lie in a file of MATLAB, and are then moved from; None for where they show to lie, or the last axis.
 
     Raises:
-        InputError: there is no such array, it does not hold whole numbers, or the file is damaged.
-        OutputError: the .npy file cannot be written, or does not fit on its disk.
+        InputError: there is no such array, it does not hold whole numbers, the file is damaged, or the .npy file cannot be
+            written, or does not fit on its disk.
     """
     with frame_array(path, name) as array:
         dtype = array.stored.dtype
@@ -188,16 +188,20 @@ def unpacked(path: Path, name: str | None = None, axis: FrameAxis | None = None)
         axis = axis or array.frame_axis()
         moved = f" (its frames lie along the {axis} axis)" if axis else ""
         shape, stored = array.shape(axis), np.dtype(np.uint16) if dtype.kind == "f" else dtype
-        require_space(target, int(np.prod(shape)) * stored.itemsize)
-        with atomic_path(target) as temporary:
-            frames = np.lib.format.open_memmap(temporary, "w+", stored, shape)
-            for place, values in array.blocks(axis):
-                _require_whole(path, array, values)
-                if not place.start:
-                    logger.warning("%s is unpacked to %s, once%s", path, target.name, moved)
-                frames[place] = values
-            frames.flush()
-            shutil.copystat(path, temporary)
+        try:
+            require_space(target, int(np.prod(shape)) * stored.itemsize)
+            with atomic_path(target) as temporary:
+                frames = np.lib.format.open_memmap(temporary, "w+", stored, shape)
+                for place, values in array.blocks(axis):
+                    _require_whole(path, array, values)
+                    if not place.start:
+                        logger.warning("%s is unpacked to %s, once%s", path, target.name, moved)
+                    frames[place] = values
+                frames.flush()
+                shutil.copystat(path, temporary)
+        except OutputError as error:
+            remedy = "link or copy it to a folder that you may write to, with room for it"
+            raise InputError(f"{path} is unpacked to a file beside it: {error}; or {remedy}") from error
     return target
 
 
