@@ -20,7 +20,6 @@ from photonpano.values import FrameSpan
 
 _HEADER_BYTES = 4096  # bytes of a URL that are read for the header; that of a capture has 128
 _SHORTEST_HEADER = 128  # bytes of the shortest header that numpy writes
-_BLOCK_BYTES = 1024**2
 _CHANNELS = 3
 # Minimum score of a difference that is not chance. Scores of noise scatter by 1.2: one in 60,000 exceeds 5.
 _MIN_SCORE = 5.0
