@@ -82,11 +82,6 @@ def pixels(value: float | None) -> str:
     return "\N{EN DASH}" if value is None else f"{value:.2g}" if abs(value) < 0.1 else three_digits(value)
 
 
-def two_digits(value: float) -> str:
-    """Write a number to two digits, or whole if it has more before its point, without an exponent."""
-    return f"{value:,.0f}" if abs(value) >= 99.5 else f"{value:.2g}"
-
-
 def share(value: float) -> str:
     """Write a share as a percentage; 100 % and 0 % are exact."""
     percent = 100 * value

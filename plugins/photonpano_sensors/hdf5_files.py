@@ -185,16 +185,6 @@ def _shape_of_frames(path: Path, frame_axis: FrameAxis) -> tuple[int, int, int]:
         return n_frames, height, width
 
 
-def _require_axis(path: Path, n_others: int) -> None:
-    """Raise an `InputError` if a part shows that its frames lie along the first axis."""
-    with frame_array(path, _VARIABLE) as array:
-        if array.frame_axis(n_others) == "first":
-            raise InputError(
-                f"{path} has its frames along the first axis of {array.stored.shape[::-1]}, where values are most alike; write "
-                "frame_axis: first, or frame_axis: last if it is right"
-            )
-
-
 def _packed_frames(path: Path, frame_axis: FrameAxis) -> NDArray[np.uint8]:
     """Return all frames, (n, H, ceil(W / 8)), packed along the width; raises an `InputError` if they are not binary."""
     with frame_array(path, _VARIABLE) as array:
@@ -241,8 +231,12 @@ class MatPartsSource(BinarySource):
         self._paths = _parts(config.path)
         axis = config.frame_axis or "last"
         shapes = [_shape_of_frames(path, axis) for path in self._paths]
-        if config.frame_axis is None:
-            _require_axis(self._paths[0], sum(height for _, height, _ in shapes[1:]))
+        with frame_array(self._paths[0], _VARIABLE) as array:
+            if config.frame_axis is None and array.frame_axis(sum(height for _, height, _ in shapes[1:])) == "first":
+                raise InputError(
+                    f"{self._paths[0]} has its frames along the first axis of {array.stored.shape[::-1]}, where values are "
+                    "most alike; write frame_axis: first, or frame_axis: last if it is right"
+                )
         for path, shape in zip(self._paths, shapes, strict=True):
             if shape[1:] != shapes[0][1:]:
                 raise InputError(

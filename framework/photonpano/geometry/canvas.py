@@ -21,6 +21,7 @@ from photonpano.geometry.homographies import BLOCK_FRAMES, corners, rescaling, t
 from photonpano.values import FloatArray, Homography
 
 ProjectionName: TypeAlias = Literal["planar", "cylindrical", "spherical", "mercator", "panini", "stereographic"]
+_Terms: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 _SIDE_DIRECTIONS = 65  # directions along each side of what frames cover, whose places on a canvas are its bounds
 
 
@@ -28,8 +29,8 @@ _SIDE_DIRECTIONS = 65  # directions along each side of what frames cover, whose 
 class Projection:
     """A projection."""
 
-    across: Callable[[FloatArray], tuple[FloatArray, FloatArray]]  # returns p and s for a
-    down: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]  # returns q, r and t for b
+    across: _Terms  # returns p and s for a, and nothing of account
+    down: _Terms  # returns q, r and t for b
     points: Callable[[FloatArray], FloatArray]  # returns the points of (..., 3) rays: (..., 2)
     periodic: bool = False  # whether a is an angle, so that a full turn comes back to where it began
     # how far from ahead it goes along a, and along b, in degrees: further out, it grows without bounds
@@ -37,7 +38,7 @@ class Projection:
 
     def rays(self, points: FloatArray) -> FloatArray:
         """Return the rays of (..., 2) points: (..., 3)."""
-        (p, s), (q, r, t) = self.across(points[..., 0]), self.down(points[..., 1])
+        (p, s, _), (q, r, t) = self.across(points[..., 0]), self.down(points[..., 1])
         return np.stack([p * r, np.broadcast_to(q, p.shape), s * r + t], axis=-1)
 
     def bounds(self, a: tuple[float, float], b: tuple[float, float]) -> FloatArray:
@@ -51,25 +52,17 @@ class Projection:
         return found
 
 
-def _straight(coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return coordinates, np.ones_like(coordinates)
+def _flat(coordinates: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return coordinates, np.ones_like(coordinates), np.zeros_like(coordinates)
 
 
-def _round(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return np.sin(angles), np.cos(angles)
+def _round(angles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return np.sin(angles), np.cos(angles), np.zeros_like(angles)
 
 
-def _from_behind(coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _from_behind(coordinates: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Look at a cylinder, or a sphere, from behind its middle."""
-    return coordinates, 1 - coordinates**2 / 4
-
-
-def _flat(b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return b, np.ones_like(b), np.zeros_like(b)
-
-
-def _curved(b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return np.sin(b), np.cos(b), np.zeros_like(b)
+    return coordinates, 1 - coordinates**2 / 4, np.zeros_like(coordinates)
 
 
 def _on_plane(rays: FloatArray) -> FloatArray:
@@ -106,9 +99,9 @@ def _stereographic(rays: FloatArray) -> FloatArray:
 
 # The projections by name. The rays of "planar" are homogeneous pixels of the reference frame, not directions.
 PROJECTIONS: dict[str, Projection] = {
-    "planar": Projection(_straight, _flat, _on_plane),
+    "planar": Projection(_flat, _flat, _on_plane),
     "cylindrical": Projection(_round, _flat, _on_cylinder, periodic=True, widest=(np.inf, 80)),
-    "spherical": Projection(_round, _curved, _on_sphere, periodic=True),
+    "spherical": Projection(_round, _round, _on_sphere, periodic=True),
     "mercator": Projection(_round, lambda b: _flat(np.sinh(b)), _on_mercator, periodic=True, widest=(np.inf, 85)),
     "panini": Projection(_from_behind, _flat, _on_panini, widest=(150, 80)),
     "stereographic": Projection(
@@ -176,7 +169,7 @@ class Canvas:
     def columns(self) -> tuple[FloatArray, FloatArray]:
         """Return p and s of each column, (W,): the ray of a pixel (x, y) is `(p[x] r[y], q[y], s[x] r[y] + t[y])`."""
         x = np.arange(self.width, dtype=np.float64)
-        return self._projection.across(x if self.planar else (x - self.transform[0, 2]) / self.transform[0, 0])
+        return self._projection.across(x if self.planar else (x - self.transform[0, 2]) / self.transform[0, 0])[:2]
 
     def rows(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return q, r and t of each row: (H,)."""

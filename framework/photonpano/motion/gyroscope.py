@@ -34,7 +34,7 @@ from photonpano.motion.level import Timeline
 from photonpano.motion.pairs import GYROSCOPE, instants_of
 from photonpano.motion.rotations import RotationTrajectory
 from photonpano.motion.velocity import Contrast, Images, structure_of, varying_spans
-from photonpano.text import two_digits
+from photonpano.text import pixels
 from photonpano.values import Decision, Edge, FloatArray, Group, Homography, Located
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ class Gyroscope:
                 solved = inverse(solution.homographies[edge.fixed]) @ solution.homographies[edge.moving]
                 away.append(float(corner_displacements(solved, motion, self.frame_shape).mean()))
                 expected.append(float(np.hypot(edge.motion.evidence["std_px"], std_px)))
-        px, expected_px = two_digits(np.median(away)), two_digits(np.median(expected))
+        px, expected_px = pixels(np.median(away)), pixels(np.median(expected))
         differs = f"{px} px from one exposure to the next, where {expected_px} px are expected"
         if np.median(away) > _CONTRADICTION * np.median(expected):
             raise InputError(

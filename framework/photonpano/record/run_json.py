@@ -49,7 +49,7 @@ from photonpano.residuals.findings import Findings
 from photonpano.residuals.halves import Agreements
 from photonpano.residuals.refinement import Explained, Refinement
 from photonpano.specs.plan import Choice, Plan
-from photonpano.text import listed, two_digits
+from photonpano.text import listed, pixels
 from photonpano.values import (
     Decision,
     Edge,
@@ -339,8 +339,8 @@ def _levels_decision(results: Sequence[LevelResult]) -> Decision:
     else:
         compared = "less" if last.converged else "still more" if converges(results) else "hardly less than before, but more"
         reason = (
-            f"the last level changed the motion by {two_digits(last.change_px)} px, {compared} than its expected error of "
-            f"{two_digits(last.uncertainty.mean_px)} px"
+            f"the last level changed the motion by {pixels(last.change_px)} px, {compared} than its expected error of "
+            f"{pixels(last.uncertainty.mean_px)} px"
         )
     return Decision("levels", len(results), reason)
 
@@ -510,7 +510,7 @@ def uncertain_frames(motion: FrameMotion) -> list[str]:
         return []
     worst_px = {span: float(std_px[span.start : span.stop].max()) for span in true_spans(uncertain)}
     spans = sorted(worst_px, key=lambda span: -worst_px[span])
-    named = [f"{span} (up to {two_digits(worst_px[span])} px)" for span in spans[:SHOWN_SPANS]]
+    named = [f"{span} (up to {pixels(worst_px[span])} px)" for span in spans[:SHOWN_SPANS]]
     more = f" and {len(spans) - SHOWN_SPANS} more spans" if len(spans) > SHOWN_SPANS else ""
     return [
         f"the motion of {int(uncertain.sum())} of {len(std_px)} frames is uncertain: its expected error exceeds "
