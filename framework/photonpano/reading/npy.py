@@ -126,8 +126,6 @@ def _guess(start: bytes) -> str:
         return ": it is empty"
     if start.startswith(b"\x1f\x8b"):
         return ": it is compressed with gzip; unpack it with gunzip"
-    if start.startswith(b"PK"):
-        return ": it is an archive; save the array in it with numpy.save"
     if start.startswith(b"\x93NUM"):
         return " that can be read: its header is damaged; write it again"
     return ", by its first bytes; write it with numpy.save"

@@ -101,8 +101,8 @@ def test_pair_that_stripes_leave_undetermined_is_not_located(run: Callable, make
         run(make_level(answer=along_stripes))
     assert str(caught.value).startswith(
         "level 1: none of the 30 pairs of exposures could be located\n"
-        "  frames 10 to 19 onto frames 0 to 9: the images do not determine the motion: its expected error is 10,000,000 px at a "
-        "corner\n"
+        "  frames 10 to 19 onto frames 0 to 9: the images do not determine the motion: its expected error is 10,000,000 px "
+        "at a corner\n"
     )
 
 
