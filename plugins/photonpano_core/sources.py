@@ -39,13 +39,14 @@ from photonpano.reading import (
     PixelOrder,
     StoredFrames,
     ThreeChannels,
-    any_npy_header,
     arrived_frames,
     as_written,
     eight_frames_are_first,
     frames_are_last,
     has_channels,
-    is_gzip,
+    is_array_file,
+    is_matlab_file,
+    npy_header,
     objections,
     of_channel,
     other_order,
@@ -158,7 +159,11 @@ _CHECKED = 16  # frames whose values are checked before a run
 _PLAIN = re.compile(r"[\w./~+-]+")  # paths that YAML takes without quotes
 _TYPES = {"bits": "bool", "sums": "numpy.uint16"}
 _IN_COLOUR = ", in three channels"
-_PATH = "the .npy file, or its URL; a file compressed with gzip is unpacked once, to a file beside it"
+_PATH = (
+    "the .npy file, or its URL; a file compressed with gzip, or an array in an .npz, HDF5 or MATLAB file, is unpacked once, to "
+    "a file beside it"
+)
+_ARRAY = "name of the array in an .npz, HDF5 or MATLAB file; needed if it has several"
 
 
 class PackedNpyConfig(Config):
@@ -168,6 +173,7 @@ class PackedNpyConfig(Config):
     """
 
     path: SpecLocation = Field(description=_PATH)
+    array: str | None = Field(None, description=_ARRAY)
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
     width: int | None = Field(
         None, ge=1, description="columns of a frame, in px; needed only if the width is not a multiple of eight"
@@ -204,6 +210,7 @@ class NpyConfig(Config):
     """
 
     path: SpecLocation = Field(description=_PATH)
+    array: str | None = Field(None, description=_ARRAY)
     holds: Literal["bits", "sums"] = Field(
         description="bits: binary frames, of 0 and 1, of 0 and 255, or bool; sums: each frame is the sum of binary frames"
     )
@@ -230,14 +237,28 @@ _AnyConfig: TypeAlias = PackedNpyConfig | NpyConfig
 _AnySource: TypeAlias = PackedFileSource | _NpyBits | _NpySums | ThreeChannels
 
 
+def _unpacked(config: _AnyConfig) -> dict[str, Any]:
+    """Return what changes in a config when its array is unpacked to a .npy file; nothing for a .npy file."""
+    if not is_array_file(config.path):
+        if config.array is None:
+            return {}
+        raise InputError(f"{config.path} is no .npz, HDF5 or MATLAB file; leave out array: {config.array}")
+    axis = getattr(config, "frame_axis", None) if is_matlab_file(config.path) else None
+    changed = {"path": unpacked(config.path, config.array, axis), "array": None}
+    return changed if axis is None else changed | {"frame_axis": "first"}
+
+
 def _open_npy(config: _AnyConfig) -> _AnySource:
-    """Open a capture; raises an `InputError`, or an `OutputError` where a compressed file cannot be unpacked."""
+    """Open a capture; raises an `InputError`, also where a file cannot be unpacked."""
+    config = config.model_copy(update=_unpacked(config))
     header = _whole_header(config)
-    return _npy_source(config, unpacked(config.path) if is_gzip(config.path) else config.path, header)
+    return _npy_source(config, config.path, header)
 
 
 def _arrived_npy(config: _AnyConfig) -> Arrived:
     """Open the frames that are there of a file that is still being written."""
+    if is_array_file(config.path):
+        raise InputError(f"{config.path} is unpacked, so that no frame can be read before all are there; follow a .npy file")
     if (n_frames := arrived_frames(config.path)) is None:
         return Arrived(None)
     if isinstance(config, NpyConfig) and config.frame_axis == "last":
@@ -265,8 +286,7 @@ def _npy_source(config: _AnyConfig, path: Location, header: NpyHeader) -> _AnySo
 def _whole_header(config: _AnyConfig) -> NpyHeader:
     """Return the header of a capture, of which nothing is missing and whose frames lie along the axis of the config."""
     path, header = config.path, _header(config)
-    if not is_gzip(path):
-        require_whole(path, header)
+    require_whole(path, header)
     if isinstance(config, NpyConfig) and config.frame_axis is None and len(header.shape) == 3:
         samples = sampled_frames(path, header)
         if samples and frames_are_last(samples, header.shape):
@@ -279,7 +299,7 @@ def _whole_header(config: _AnyConfig) -> NpyHeader:
 
 def _header(config: _AnyConfig) -> NpyHeader:
     """Return the header of the capture, which may be incomplete; raise if it does not agree with the config."""
-    path, header = config.path, any_npy_header(config.path)
+    path, header = config.path, npy_header(config.path)
     axes = "frames, height, bytes of a row"
     if isinstance(config, PackedNpyConfig):
         if header.dtype != np.uint8 and len(header.shape) > 2 and min(header.shape) > 0:
@@ -413,6 +433,7 @@ def _section(path: Location, keys: dict[str, Any]) -> str:
 
 def _require_order(config: PackedNpyConfig) -> None:
     """Refuse frames that are not packed, or in another order than by default, with the line of a spec that reads them."""
+    config = config.model_copy(update=_unpacked(config))
     header = _whole_header(config)
     if config.bit_order is not None or config.packed_along is not None:
         return
@@ -423,10 +444,7 @@ def _require_order(config: PackedNpyConfig) -> None:
 
 
 def _require_values(config: NpyConfig) -> None:
-    """Read some frames; raises what opening the capture and reading them raises. A compressed file is not unpacked for that."""
-    if is_gzip(config.path):
-        _whole_header(config)
-        return
+    """Read some frames; raises what opening the capture and reading them raises."""
     with _open_npy(config) as source:
         for span in source.info.spread(_CHECKED, 1):
             source.frames(span)
@@ -442,17 +460,19 @@ def _recognise(use: str, path: Location) -> Recognised | None:
     if not _is_alone(path):
         return None
     try:
-        header = any_npy_header(path)
-        seen = _seen(path, header)
+        stored = unpacked(path) if is_array_file(path) else path
+        header = npy_header(stored)
+        seen = _seen(stored, header)
         if seen is None and use == "packed-npy":  # too short to tell, or cut short
-            _header(PackedNpyConfig(path=path))
+            _header(PackedNpyConfig(path=stored))
             seen = _Seen(use, {})
     except InputError:
         return None
     if seen is None or seen.use != use or seen.keys.get("holds") == "sums":
         return None
     colour = _IN_COLOUR if len(header.shape) == 4 else ""
-    because = f"{header.dtype} of shape {header.shape} in a .npy file{colour}{', where ' if seen.because else ''}{seen.because}"
+    what = "a .npy file" if stored == path else "a file of arrays"
+    because = f"{header.dtype} of shape {header.shape} in {what}{colour}{', where ' if seen.because else ''}{seen.because}"
     return Recognised({"path": as_written(path), **seen.keys}, because)
 
 
@@ -460,7 +480,7 @@ _contribution = partial(
     SourceContribution,
     build=lambda config, _: _open_npy(config),
     recognises_urls=True,
-    suffixes=(".npy", ".gz"),
+    suffixes=(".npy", ".gz", ".npz", ".h5", ".hdf5", ".mat"),
     arrived=_arrived_npy,
 )
 PACKED_NPY = _contribution(
@@ -549,4 +569,5 @@ PACKED_RAW = SourceContribution(
     build=lambda config, _: _open_raw(config),
     check=lambda config: () if config.path == _STANDARD_INPUT else objections(_open_raw, config),
     arrived=_arrived_raw,
+    suffixes=(".bin", ".raw"),
 )

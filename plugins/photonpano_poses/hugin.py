@@ -71,6 +71,9 @@ def hugin(poses: Poses) -> dict[str, str]:
 
     canvas, camera, (height, width) = poses.canvas, poses.camera, poses.frame_shape
     assert canvas is not None
+    if canvas.projection not in _PROJECTIONS:
+        known = "planar, cylindrical or spherical"
+        raise InputError(f"no project is written of a {canvas.projection} panorama; render it with render.projection: {known}")
     lens, to_world = hugin_lens(camera, poses.frame_shape), np.eye(3)
     per_radian = canvas.transform[0, 0] * (camera.focal_px if canvas.planar else 1)
     # Where the canvas looks straight ahead, from its border.

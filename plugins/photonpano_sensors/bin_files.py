@@ -42,7 +42,8 @@ Pixels = TypeVar("Pixels", bound=np.generic)
 
 _ZONES = 4
 _FILE_BYTES = 512 * 256 * 64  # of 512 frames of the half array, or 256 of the full one
-_COMPARED = 64  # frames of the full array, or pairs of frames of the half array, compared to tell them apart
+_SUMS = 8  # parts of a file whose frames are summed, to tell the half from the full array
+_STRIP = 4  # columns beside a border of zones that are averaged
 _CLIP_QUANTILE = 0.9  # brightness is clipped at this quantile: hot pixels must not outweigh the scene
 _STANDARD_ERRORS = 5.0  # minimum difference of the two correlations
 _SPAD512 = FrameLayout((512, 512), (512, 64))
@@ -197,19 +198,33 @@ def _array_of(path: Path) -> tuple[Literal["half", "full"] | None, str]:
 
     A frame of the full array has the size of two frames of the half array. In a file of the half array, the two halves of these
     bytes are the same pixels at nearly the same time, which correlate most. In a file of the full array they are 128 rows
-    apart, and pixels two rows apart correlate more. (Not one row, because odd and even rows may differ systematically.)
+    apart, and pixels two rows apart correlate more. (Not one row, because odd and even rows may differ systematically.) Where
+    that does not decide, as of a smooth scene, the sides of the borders between zones do: in the wrong layout they are 128
+    columns apart, in sums of few frames, which motion does not blur as much.
     """
-    frames = np.memmap(path, np.uint8, "r").reshape(-1, *FULL.stored_shape)[:: _FILE_BYTES // FULL.stored_bytes // _COMPARED]
-    sums = np.unpackbits(frames, axis=-1, bitorder="little").sum(axis=0, dtype=np.float64)
+    frames = np.memmap(path, np.uint8, "r").reshape(_SUMS, -1, *FULL.stored_shape)
+    parts = np.stack([np.unpackbits(each, axis=-1, bitorder="little").sum(axis=0, dtype=np.float64) for each in frames])
+    sums = parts.sum(axis=0)
     first, second = np.split(np.minimum(sums, np.quantile(sums, _CLIP_QUANTILE)), 2)
-    halves, rows = (
-        correlation(first, second),
-        correlation(np.stack([first[:-2], second[:-2]]), np.stack([first[2:], second[2:]])),
-    )
-    numbers = f"correlations of {np.tanh(halves):.2f} between the halves of their frames, {np.tanh(rows):.2f} between rows"
-    if abs(halves - rows) < _STANDARD_ERRORS * np.sqrt(2 / first.size):
-        return None, f"which the half and the full array have; {numbers} do not decide it"
-    return ("half", numbers) if halves > rows else ("full", numbers)
+    blocks = np.minimum(parts, np.quantile(parts, _CLIP_QUANTILE)).reshape(*parts.shape[:2], 2 * _ZONES, -1)
+    right, left = (side.mean(axis=-1) for side in (blocks[..., -_STRIP:], blocks[..., :_STRIP]))
+    inside = [0, 1, 2, 4, 5, 6]  # blocks of 128 columns that do not end a row of the half array
+    tests = {
+        "between the halves of their frames, {:.2f} between rows": (
+            (first, second),
+            (np.stack([first[:-2], second[:-2]]), np.stack([first[2:], second[2:]])),
+        ),
+        "across zones in the layout of the half array, {:.2f} in that of the full one": (
+            (right[..., inside], left[..., [1 + block for block in inside]]),
+            (right[..., :-2], left[..., 2:]),
+        ),
+    }
+    for words, (of_half, of_full) in tests.items():
+        half, full = correlation(*of_half), correlation(*of_full)
+        numbers = f"correlations of {np.tanh(half):.2f} {words.format(np.tanh(full))}"
+        if abs(half - full) >= _STANDARD_ERRORS * np.sqrt(2 / of_half[0].size):
+            return ("half" if half > full else "full"), numbers
+    return None, f"which the half and the full array have; {numbers} do not decide it"
 
 
 def correlation(first: NDArray[Any], second: NDArray[Any]) -> float:

@@ -1,16 +1,11 @@
-"""Sources of HDF5 and MATLAB files: `ubicept-h5`, with one dataset a frame, and `mat-parts`, with many frames in each file.
-
-A file of MATLAB 7.3 is HDF5; the older ones are read by scipy.
-"""
+"""Sources of HDF5 and MATLAB files: `ubicept-h5`, with one dataset a frame, and `mat-parts`, with many frames in each file."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import accumulate, pairwise
 from pathlib import Path
 from threading import Lock
@@ -24,8 +19,10 @@ from photonpano import Bayer, Config, FrameSpan, InputError, Recognised, Require
 from photonpano.photometry import BinarySumResponse
 from photonpano.reading import (
     BinarySource,
+    FrameAxis,
     FrameLayout,
     SingleFrameSource,
+    frame_array,
     missing_file,
     objections,
     read_json,
@@ -38,8 +35,6 @@ _SUFFIX = ".ubi.h5"
 _HDF = b"\x89HDF\r\n\x1a\n"
 _DAMAGED_UBI = "cannot be read as a .ubi.h5 file: it is damaged or something else; copy it again"
 _VARIABLE = "OUTPUT"
-_BLOCK_FRAMES = 64  # frames that are packed at once
-_DAMAGED_MAT = "cannot be read as a MATLAB file: it is damaged or something else; copy it again"
 
 
 class UbiceptConfig(Config):
@@ -181,70 +176,27 @@ UBICEPT_H5 = SourceContribution(
 )
 
 
-def _shape_of_frames(path: Path) -> tuple[int, int, int]:
-    """Return (frames, height, width) from the headers of a file; raises an `InputError` if it has no frames in OUTPUT."""
-    with reading(path, _DAMAGED_MAT):
-        if _is_hdf(path):
-            with _hdf_values(path) as values:
-                shape = values.shape[::-1]  # HDF5 has the dimensions of MATLAB in reverse order
-        else:
-            from scipy.io import whosmat
-
-            shapes = {name: shape for name, shape, _ in whosmat(str(path))}
-            if _VARIABLE not in shapes:
-                raise _missing(path)
-            shape = shapes[_VARIABLE]
-    if len(shape) not in (2, 3) or min(shape) < 1:
-        raise InputError(f"{path} has {_VARIABLE} of shape {shape}; frames are (height, width, frames)")
-    height, width, n_frames = (*shape, 1)[:3]  # MATLAB drops the last dimension if it is 1
-    return int(n_frames), int(height), int(width)
+def _shape_of_frames(path: Path, frame_axis: FrameAxis) -> tuple[int, int, int]:
+    """Return (frames, height, width) of a part, whose values are not read; raises an `InputError` if it has no frames."""
+    with frame_array(path, _VARIABLE) as array:
+        if len(array.stored.shape) != 3 or min(array.stored.shape) < 1:
+            raise InputError(f"{path} has {_VARIABLE} of shape {array.stored.shape[::-1]}; frames are (height, width, frames)")
+        n_frames, height, width = array.shape(frame_axis)
+        return n_frames, height, width
 
 
-def _packed_frames(path: Path) -> NDArray[np.uint8]:
+def _packed_frames(path: Path, frame_axis: FrameAxis) -> NDArray[np.uint8]:
     """Return all frames, (n, H, ceil(W / 8)), packed along the width; raises an `InputError` if they are not binary."""
-    with reading(path, _DAMAGED_MAT):
-        if _is_hdf(path):
-            with _hdf_values(path) as values:
-                stored = values[()].T
-        else:
-            from scipy.io import loadmat
-
-            stored = loadmat(str(path), variable_names=[_VARIABLE])[_VARIABLE]
-        frames = np.moveaxis(np.atleast_3d(stored), -1, 0)
-        if frames.dtype.kind not in "biuf":
+    with frame_array(path, _VARIABLE) as array:
+        if array.stored.dtype.kind not in "biuf":
             raise InputError(f"{path} has {_VARIABLE} that is no array of real numbers; frames are (height, width, frames)")
-        packed = np.empty((*frames.shape[:2], -(-frames.shape[2] // 8)), np.uint8)
-        for start in range(0, len(frames), _BLOCK_FRAMES):
-            block = slice(start, start + _BLOCK_FRAMES)
-            lit = frames[block] == 1
-            if not np.all(lit | (frames[block] == 0)):
+        packed = []
+        for _, values in array.blocks(frame_axis):
+            lit = values == 1
+            if not np.all(lit | (values == 0)):
                 raise InputError(f"{path} holds values other than 0 and 1: its frames are not binary")
-            packed[block] = np.packbits(lit, axis=-1)
-    return packed
-
-
-def _is_hdf(path: Path) -> bool:
-    """Return whether a file is one of MATLAB 7.3, by its first bytes."""
-    start = read_start(path, 10)
-    return start == b"MATLAB 7.3" or start.startswith(b"\x89HDF")
-
-
-@contextmanager
-def _hdf_values(path: Path) -> Iterator[Any]:
-    """Open the array of the frames, (frames, width, height), whose values are not read yet."""
-    if importlib.util.find_spec("h5py") is None:
-        install = 'pip install "photonpano[hdf5]" (in a checkout: pip install ".[hdf5]")'
-        raise InputError(f"{path} is a file of MATLAB 7.3: reading it needs h5py, which is not installed: {install}")
-    import h5py
-
-    with h5py.File(path) as file:
-        if _VARIABLE not in file:
-            raise _missing(path)
-        yield file[_VARIABLE]
-
-
-def _missing(path: Path) -> InputError:
-    return InputError(f"{path} has no variable {_VARIABLE}; its frames must be (height, width, frames) of that name")
+            packed.append(np.packbits(lit, axis=-1))
+    return np.concatenate(packed)
 
 
 _NAME = re.compile(r"part_([1-9][0-9]*)\.mat")
@@ -259,6 +211,11 @@ class MatPartsConfig(Config):
         description=f"the folder of part_1.mat, part_2.mat and so on, each with frames of zeros and ones as OUTPUT (height, "
         f"width, frames); an optional {_INFO} with no_parts and no_frames must agree with them"
     )
+    frame_axis: FrameAxis | None = Field(
+        None,
+        description="axis of the frames: last for (height, width, frames), first for (frames, height, width); by default last, "
+        "and parts that show that it is the first are refused",
+    )
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; leave it out if unknown")
 
 
@@ -272,7 +229,14 @@ class MatPartsSource(BinarySource):
 
     def __init__(self, config: MatPartsConfig) -> None:
         self._paths = _parts(config.path)
-        shapes = [_shape_of_frames(path) for path in self._paths]
+        axis = config.frame_axis or "last"
+        shapes = [_shape_of_frames(path, axis) for path in self._paths]
+        with frame_array(self._paths[0], _VARIABLE) as array:
+            if config.frame_axis is None and array.frame_axis(sum(height for _, height, _ in shapes[1:])) == "first":
+                raise InputError(
+                    f"{self._paths[0]} has its frames along the first axis of {array.stored.shape[::-1]}, where values are "
+                    "most alike; write frame_axis: first, or frame_axis: last if it is right"
+                )
         for path, shape in zip(self._paths, shapes, strict=True):
             if shape[1:] != shapes[0][1:]:
                 raise InputError(
@@ -290,7 +254,7 @@ class MatPartsSource(BinarySource):
         _, height, width = shapes[0]
         super().__init__(self._starts[-1], FrameLayout((height, width), (height, -(-width // 8))), config.frame_rate_hz)
         self._lock = Lock()
-        self._packed = lru_cache(_MOST_PARTS)(_packed_frames)
+        self._packed = lru_cache(_MOST_PARTS)(partial(_packed_frames, frame_axis=axis))
 
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Yield the frames of a span, one part after the other: see `BinarySource`."""

@@ -10,12 +10,15 @@ from photonpano import Config, SpecLocation
 
 
 class ZarrConfig(Config):
-    """A capture in an array of zarr version 3: uint8 (frames, height, ceil(width / 8)), eight pixels to a byte."""
+    """A capture in an array of zarr version 3: uint8 (frames, height, ceil(width / 8)), eight pixels to a byte, or bits."""
 
     path: SpecLocation = Field(description="the folder of the array, or its URL")
     frame_rate_hz: float | None = Field(None, gt=0, description="frames a second, in Hz; by default from the array, if known")
     width: int | None = Field(
         None, ge=1, description="columns of a frame, in px; by default from the array, or else eight for each byte"
+    )
+    holds: Literal["packed", "bits"] = Field(
+        "packed", description="packed: eight pixels to a byte; bits: a pixel to a value, 0 and 1, 0 and 255, or bool"
     )
     bit_order: Literal["big", "little"] | None = Field(
         None,

@@ -28,9 +28,11 @@ def _recognise(path: Location) -> Recognised | None:
     """Take arrays that open without further keys."""
     if path.suffix.lower() != ".zarr" and (isinstance(path, Url) or not (path / "zarr.json").is_file()):
         return None
-    if _check(ZarrConfig(path=path)):
-        return None
-    return Recognised({"path": as_written(path)}, "an array of packed frames of zarr version 3")
+    if not _check(ZarrConfig(path=path)):
+        return Recognised({"path": as_written(path)}, "an array of packed frames of zarr version 3")
+    if not _check(ZarrConfig(path=path, holds="bits")):
+        return Recognised({"path": as_written(path), "holds": "bits"}, "an array of bits of zarr version 3")
+    return None
 
 
 def _exporter(_config: OmeZarrConfig, _context: StageContext) -> Exporter:
@@ -44,7 +46,7 @@ def photonpano_sources() -> Iterator[SourceContribution]:
     """Offer the source of zarr arrays."""
     yield SourceContribution(
         name="zarr",
-        summary="Binary frames in a zarr array, eight pixels to a byte, in a folder or an object store",
+        summary="Binary frames in a zarr array, packed or not, in a folder or an object store",
         config=ZarrConfig,
         build=lambda config, _: opened(config),
         check=_check,

@@ -33,6 +33,8 @@ _VERSION = 1  # of the attributes
 _FILE = "zarr.json"
 _MOST_METADATA_BYTES = 1024**2  # the longest metadata that are read
 _CODECS = ("bytes", "zstd", "blosc", "gzip", "crc32c")
+_BITS = "write holds: bits"
+_CHECKED = 16  # frames whose values are checked before a run
 _AGAIN = "write it again with photonpano convert"
 
 
@@ -188,7 +190,7 @@ def _members(array: Location) -> str:
 
 def _require_frames(array: Location, found: _Metadata) -> None:
     shape, layout = found.shape, "a capture is uint8 (frames, height, bytes of a row), as from numpy.packbits(cube, axis=-1)"
-    if found.data_type != "uint8":
+    if found.data_type not in ("uint8", "bool"):
         raise InputError(f"{array} holds {found.data_type} values, not bytes of eight pixels; {layout}")
     if len(shape) != 3:
         raise InputError(f"{array} has the shape {shape}; {layout}")
@@ -230,6 +232,11 @@ def _read_layout(config: ZarrConfig) -> tuple[_Metadata, FrameLayout, float | No
     array, metadata = config.path, _read_metadata(config.path)
     own = _read_attributes(array, metadata)
     _, height, row_bytes = metadata.shape
+    if config.holds == "bits":
+        _require_whole(array, metadata)
+        return metadata, FrameLayout((height, row_bytes), (height, row_bytes), to_rows=_packed_bits), config.frame_rate_hz
+    if metadata.data_type == "bool":
+        raise InputError(f"{array} is not packed: its values are bool; {_BITS}")
     width = config.width or (own.width if own else 8 * row_bytes)
     if -(-width // 8) != row_bytes:
         remedy = "correct the width" if config.width else "write the right width in the spec"
@@ -242,6 +249,12 @@ def _read_layout(config: ZarrConfig) -> tuple[_Metadata, FrameLayout, float | No
     return metadata, layout, config.frame_rate_hz or (own.frame_rate_hz if own else None)
 
 
+def _packed_bits(stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if np.any((stored > 1) & (stored < 255)):
+        raise InputError("the array has values other than 0 and 1, or 0 and 255, so that it does not hold bits")
+    return np.packbits(stored != 0, axis=-1)
+
+
 def require_layout(config: ZarrConfig) -> None:
     """Refuse an array that `opened` refuses, or that others wrote and whose frames show that they are packed in another way."""
     array, (metadata, _, _) = config.path, _read_layout(config)
@@ -249,12 +262,16 @@ def require_layout(config: ZarrConfig) -> None:
         return
     with opened(config) as source:
         assert isinstance(source, BinarySource)
+        if config.holds == "bits":
+            for span in source.info.spread(_CHECKED, 1):
+                source.packed(span)
+            return
         spans = sampled_spans(source.info.n_frames, metadata.shape[1] * metadata.shape[2])
         samples = [source.packed(span) for span in spans]
     if content := unpacked_content(samples):
         raise InputError(
             f"{array} is not packed: its values are {'0 and ' if content.holds == 'bits' else 'sums up to '}{content.highest}; "
-            "pack frames of zeros and ones with numpy.packbits(cube, axis=-1)"
+            + (_BITS if content.holds == "bits" else "save sums as .npy, and read them with npy")
         )
     if other := other_order(samples):
         along_width = other.order.packed_along == "width"
@@ -294,7 +311,7 @@ class _Chunks(BinarySource):
 
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Yield the frames of a span, chunk by chunk: see `BinarySource`."""
-        return self._pieces.of(span)
+        yield from ((place, self.layout.rows(stored)) for place, stored in self._pieces.of(span))
 
     def _frames(self, span: FrameSpan) -> NDArray[np.uint8]:
         """Return the frames of one chunk along the axis of the frames: (n, rows, bytes of a row)."""

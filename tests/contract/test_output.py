@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from photonpano.geometry import corners, transform_points
 from photonpano.photometry import tone_mapped
@@ -91,7 +92,10 @@ def test_picture_is_the_panorama_in_srgb(folder: Path, record: dict[str, Any]) -
     flux = tifffile.imread(folder / "panorama.tiff")
     white = record["panorama"]["white_flux"]
     assert white == pytest.approx(np.nanquantile(flux, 0.995))
-    np.testing.assert_array_equal(picture, tone_mapped(flux, white))
+    seen = ~np.isnan(flux)
+    np.testing.assert_array_equal(picture[seen], np.maximum(tone_mapped(flux, white)[seen], 1))
+    with Image.open(folder / "panorama.png") as opened:  # what no frame saw is transparent
+        np.testing.assert_array_equal(np.asarray(opened.convert("RGBA"))[..., 3] > 0, seen)
 
 
 def test_trajectory_maps_frames_to_the_reference_frame(trajectory: dict[str, np.ndarray]) -> None:

@@ -50,7 +50,9 @@ def test_panorama_and_coverage_have_three_colours(coloured: RunResult) -> None:
 def test_picture_is_in_colour_and_balanced(coloured: RunResult) -> None:
     flux = tifffile.imread(coloured.directory / "panorama.tiff")
     picture = cv2.imread(str(coloured.directory / "panorama.png"), cv2.IMREAD_UNCHANGED)
-    assert picture.shape == flux.shape
+    assert picture.shape == (*flux.shape[:2], 4)
+    np.testing.assert_array_equal(picture[..., 3] > 0, ~np.isnan(flux).all(axis=-1))
+    picture = picture[..., :3]
     assert picture[..., 0].mean() < 0.1 * picture[..., 2].mean()  # blue first
     assert np.nanmean(flux[..., 2]) > 0.5 * np.nanmean(flux[..., 0])
     assert "<img" in (coloured.directory / "report.html").read_text(encoding="utf-8")

@@ -208,4 +208,5 @@ def test_other_shots_are_numbered_by_their_length_and_those_that_fail_are_left_o
     offsets_s = [(prior and prior.time_offset_s, document["time_offset_s"]) for prior, document in priors]
     assert offsets_s == [(7.6, 7.6), (7.5, 7.5)]
     name = tmp_path / "run.panorama-3"
-    assert caplog.messages == [f"no panorama of frames 40 to 59, another shot, was written into {name}: too dark"]
+    from_frame = "frames count from frame 40 of the capture"
+    assert caplog.messages == [f"no panorama of frames 40 to 59, another shot, was written into {name}: {from_frame}: too dark"]

@@ -87,15 +87,17 @@ def test_failed_run_leaves_a_report_until_a_run_succeeds(with_a_wall: Callable, 
     assert report.name == "run.failed.html"
     assert [file.name for file in report.parent.iterdir() if not file.name.startswith(".")] == [report.name]
 
-    record = run_plan(parse_spec(spec | {"graph": {"disconnected": "largest"}}, output=out)).record
+    largest = spec | {"graph": {"disconnected": "largest"}, "render": {"reference": "first"}}
+    record = run_plan(parse_spec(largest, output=out)).record
     assert not report.exists()
     with np.load(out / "trajectory.npz") as trajectory:
         np.testing.assert_array_equal(np.flatnonzero(trajectory["located"]), np.arange(150, 300))
+        assert trajectory["reference"] == 150  # the located frame that is next to the first
         np.testing.assert_allclose(trajectory["homographies"][150], np.eye(3), atol=1e-12)
     warnings = record["warnings"]
-    assert warnings[0] == "level 1: 6 of 12 exposures are not located (frames 0 to 24 and others)"
+    assert warnings[0] == "150 of 300 frames lie outside the located exposures and are left out"
     assert all("is uncertain: its expected error exceeds" in warning for warning in warnings[1:-1])
-    assert warnings[-1] == "150 of 300 frames lie outside the located exposures and are left out"
+    assert warnings[-1] == "level 1: 6 of 12 exposures are not located (frames 0 to 24 and others)"
 
 
 def test_failure_distinguishes_dark_from_blurred(run: Callable, simulated: Callable) -> None:

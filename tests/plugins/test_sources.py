@@ -133,6 +133,20 @@ TestNpyBitsInColour = of(InOneFile, "npy", config=BITS, stored=lambda _, frames:
 TestNpyBitsFramesLast = of(
     InOneFile, "npy", config=BITS | LAST, grows=False, stored=lambda _, frames: frames_last(frames * np.uint8(255))
 )
+
+
+class InNpz(InOneFile):
+    """An array in an .npz file, which is unpacked to a .npy file."""
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        np.savez_compressed(folder / "capture.npz", frames=self.stored(frames), times=np.arange(3))
+        return {"path": folder / "capture.npz"}
+
+
+TestNpyBitsInNpz = of(InNpz, "npy", config=BITS, grows=False, stored=lambda _, frames: frames.astype(bool))
+TestPackedInNpz = of(
+    InNpz, "packed-npy", config={"width": 27}, grows=False, stored=lambda _, frames: np.packbits(frames, axis=-1)
+)
 TestNpySums = of(InOneFile, "npy", config=SUMS, bit_depth=10, stored=lambda _, frames: frames.astype(">i8"))
 TestNpySumsFramesLast = of(
     InOneFile, "npy", config=SUMS | LAST, bit_depth=10, grows=False, stored=lambda _, frames: frames_last(frames)
@@ -187,6 +201,22 @@ class ZarrConformance(SourceConformance):
 
 TestZarr = of(ZarrConformance, "zarr")
 TestCompressedZarr = of(ZarrConformance, "zarr", compressed=True)
+
+
+class ZarrOfBitsConformance(SourceConformance):
+    wrong = (NO_FILE,)
+
+    def write(self, frames: np.ndarray, folder: Path) -> dict[str, Any]:
+        zarr = pytest.importorskip("zarr", reason="the array is written by zarr itself")
+        chunks = -(-len(frames) // 3), 7, 11
+        array = zarr.create_array(
+            folder / "bits.zarr", shape=frames.shape, chunks=chunks, dtype=bool, config={"write_empty_chunks": True}
+        )
+        array[:] = frames.astype(bool)
+        return {"path": folder / "bits.zarr", "holds": "bits"}
+
+
+TestZarrOfBits = of(ZarrOfBitsConformance, "zarr")
 
 
 class BinConformance(SourceConformance):

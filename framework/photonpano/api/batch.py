@@ -34,7 +34,7 @@ from photonpano.notebooks import facts, from_here, table
 from photonpano.plugins.registry import discover
 from photonpano.record.batch_row import BatchRow, ranked
 from photonpano.specs.loading import read_spec
-from photonpano.text import columns, counted
+from photonpano.text import columns, counted, pixels
 
 _NO_FILE = "this source reads no file or folder, as the captures of a batch are; name another, such as auto"
 
@@ -293,5 +293,5 @@ def _line(row: BatchRow) -> str:
     if row.status == "failed":
         return f"{row.label}: failed: {row.reason.partition(chr(10))[0]}"
     error = row.expected_error_px
-    expected = "" if error is None else f", expected error {error:.2g} px"
+    expected = "" if error is None else f", expected error {pixels(error)} px"
     return f"{row.label}: {row.verdict}{expected}{', finished before' if row.was_finished else ''}"

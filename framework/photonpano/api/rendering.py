@@ -74,7 +74,9 @@ class RenderResult:
     settings={
         "scale": typer.Option(metavar="X", help="Pixels of the panorama per pixel of a frame."),
         "projection": typer.Option(
-            metavar="NAME", help="planar, cylindrical, spherical, or auto; other than planar for a camera that only rotates."
+            metavar="NAME",
+            help="planar, cylindrical, spherical, mercator, panini, stereographic, or auto; other than planar for a camera "
+            "that only rotates.",
         ),
         "extent": typer.Option(
             metavar="BOX",

@@ -14,7 +14,7 @@ from photonpano.pipeline.run import END_AFTER_S, RunResult, run
 from photonpano.record.run_json import findings_of
 from photonpano.record.schema import DetailRecord, PanoramaRecord, RunRecord
 from photonpano.specs import load_spec
-from photonpano.text import byte_size, counted, duration, share
+from photonpano.text import byte_size, counted, duration, pixels, share
 
 
 def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
@@ -36,7 +36,8 @@ def lines_of_run(result: RunResult, *, strict: bool = False) -> Iterator[str]:
         yield f"{decision.what:<9} {decision.value}: {decision.reason}"
     for refinement in record["refinements"]:
         if refinement["rounds"]:  # the first of them is the largest
-            yield f"refined   {refinement['change_px']:.2g} px on average by {refinement['use']}: {refinement['rounds'][0]}"
+            change = f"{pixels(refinement['change_px'])} px on average by {refinement['use']}"
+            yield f"refined   {change}: {refinement['rounds'][0]}"
     if record.get("levels"):
         yield f"found     {_found(record)}"
     if detail := record.get("detail"):

@@ -27,7 +27,7 @@ from photonpano.evaluation import load_panorama as read_panorama
 from photonpano.evaluation.inputs import read_tiff
 from photonpano.files.folders import NEW, OLD, in_use, is_lock, locked, recover, remove
 from photonpano.files.paths import location
-from photonpano.geometry import FrameTrajectory
+from photonpano.geometry import PROJECTIONS, FrameTrajectory
 from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import through_lens
 from photonpano.pipeline.components import open_source
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 _OF_LOCKED = re.compile(rf"\.(.+)\.(lock|{NEW}|{OLD})")  # what the holder of a lock makes, and the file or folder that it locks
 _PARTIAL = re.compile(r"\.(.+\.)?[0-9a-f]{8}\.partial(\.\w+)?")
-_UNPACKED = ".unpacked.npy"
+_UNPACKED = re.compile(r"(.+\.(gz|npz|h5|hdf5|mat))\.unpacked(\..+)?\.npy")  # a file, and the array that was unpacked from it
 _IDLE_S = 600.0  # an unfinished file to which nothing was written for this time is left over
 
 
@@ -195,10 +195,11 @@ def load_xarray(run_folder: Path | str) -> xarray.Dataset:
     panorama, motion = load_panorama(folder), load_run_trajectory(folder)
     (height, width), place, planar = panorama.flux.shape[:2], panorama.canvas, motion.projection == "planar"
     x, y = ((np.arange(side) - place[axis, 2]) / place[axis, axis] for axis, side in enumerate((width, height)))
-    units = "px of the reference frame" if planar else "degrees"
-    down = "tangent of the angle" if motion.projection == "cylindrical" else units
+    turns, of_canvas = PROJECTIONS[motion.projection].periodic, "radians in the middle"
+    units = "px of the reference frame" if planar else "degrees" if turns else of_canvas
+    down = {"planar": units, "spherical": units, "cylindrical": "tangent of the angle"}.get(motion.projection, of_canvas)
     coordinates: dict[str, object] = {
-        "x": ("x", x if planar else np.degrees(x), {"units": units}),
+        "x": ("x", np.degrees(x) if turns else x, {"units": units}),
         "y": ("y", np.degrees(y) if motion.projection == "spherical" else y, {"units": down}),
     }
     dimensions = ("y", "x") if panorama.flux.ndim == 2 else ("y", "x", "colour")
@@ -325,8 +326,8 @@ def _is_leftover(path: Path) -> bool:
         return False
     if (locks := _locked_by(path)) is not None:
         return not in_use(locks) and (path.is_dir() or is_lock(path))
-    if path.name.endswith(f".gz{_UNPACKED}"):
-        return path.with_name(path.name.removesuffix(_UNPACKED)).is_file()
+    if archive := _UNPACKED.fullmatch(path.name):
+        return path.with_name(archive[1]).is_file()
     return _PARTIAL.fullmatch(path.name) is not None and time.time() - path.stat().st_mtime > _IDLE_S
 
 

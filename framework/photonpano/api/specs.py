@@ -13,6 +13,7 @@ import typer
 from photonpano.api.command import CHANGES, SPEC, command
 from photonpano.contracts.protocols import Source
 from photonpano.errors import InputError, PhotonpanoError
+from photonpano.execution.context import Progress, Quiet, usual
 from photonpano.files.folders import atomic_path, require_harmless, require_new
 from photonpano.pipeline.components import foreseen_groups, open_source, scale_of
 from photonpano.plugins.contributions import KINDS
@@ -63,7 +64,7 @@ def forecast(plan: Plan) -> Forecast:
 
     _require_levels(plan)
     with open_source(plan) as source:
-        return forecast_from(plan, source)
+        return forecast_from(plan, source, Quiet())
 
 
 @command(
@@ -72,7 +73,9 @@ def forecast(plan: Plan) -> Forecast:
     plan="spec",
     with_forecast=typer.Option("--forecast", help="Try the middle of the capture, and predict time and memory of the run."),
 )
-def explain(plan: Plan, *, with_forecast: bool = False, catalog: Catalog | None = None) -> str:
+def explain(
+    plan: Plan, *, with_forecast: bool = False, catalog: Catalog | None = None, progress: Progress | None = None
+) -> str:
     """Write a spec with all defaults, explained in comments.
 
     The text is a spec itself. Its comments name the plugin of each component, the origin of each value that does not stand in
@@ -82,6 +85,7 @@ def explain(plan: Plan, *, with_forecast: bool = False, catalog: Catalog | None 
         plan: from `load_spec` or `parse_spec`.
         with_forecast: whether comments at the end give what `forecast` predicts, or why its trial failed.
         catalog: the catalog that the plan was made with; by default what the installed plugins offer.
+        progress: receives the stages of the trial; by default, bars in a notebook and nothing elsewhere.
 
     Returns:
         YAML.
@@ -95,7 +99,7 @@ def explain(plan: Plan, *, with_forecast: bool = False, catalog: Catalog | None 
     with open_source(plan, look=with_forecast) as source:
         title = f"# {plan.file or 'the spec'} as it will run, on {source.info}"
         writer = _Writer(plan, discover() if catalog is None else catalog, list(_levels(plan, source)))
-        prediction = [f"# {line}" for line in _forecast_lines(plan, source)] if with_forecast else []
+        prediction = [f"# {line}" for line in _forecast_lines(plan, source, usual(progress))] if with_forecast else []
     return "\n".join([title, *writer.lines(), *prediction]) + "\n"
 
 
@@ -124,11 +128,11 @@ def _levels(plan: Plan, source: Source) -> Iterator[str]:
         yield f"level {number}: {len(groups)} groups of {frames} frames, {pairs} pairs, {scale}"
 
 
-def _forecast_lines(plan: Plan, source: Source) -> list[str]:
+def _forecast_lines(plan: Plan, source: Source, progress: Progress) -> list[str]:
     from photonpano.pipeline.forecast import forecast as forecast_from
 
     try:
-        found = forecast_from(plan, source)
+        found = forecast_from(plan, source, progress)
     except PhotonpanoError as error:
         return ["the trial in the middle of the capture failed, as the run may:", *str(error).splitlines()]
     each = ", ".join(f"{name}: {duration(seconds)}" for name, seconds in found.seconds.items())

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from photonpano.contracts.protocols import Source, Trajectory
 from photonpano.geometry import PATCHES, Canvas, corner_displacements, corners, jacobian, transform_points
+from photonpano.text import pixels
 from photonpano.values import (
     Bayer,
     BoolArray,
@@ -262,7 +263,7 @@ def require_near_knots(
     if not missed_px <= allowed_px:
         raise BrokenContract(
             f"the trajectory misses half of its knots by {missed_px:.3g} px or more, where their expected error is "
-            f"{expected_px:.2g} px"
+            f"{pixels(expected_px)} px"
         )
     if not len(between):
         return
@@ -443,7 +444,7 @@ def why_undetermined(motion: Located, frame_shape: tuple[int, int]) -> str | Non
         worst_px = float(np.sqrt((errors**2).sum(axis=1).max()))
     if worst_px <= limit_px:
         return None
-    return f"the images do not determine the motion: its expected error is {worst_px:.2g} px at a corner"
+    return f"the images do not determine the motion: its expected error is {pixels(worst_px)} px at a corner"
 
 
 def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -240,6 +240,7 @@ def _motion_scores(run: RunTrajectory, truth: Truth) -> tuple[TrajectoryScore, R
     return replace(motion, alignment=plane @ motion.alignment), None
 
 
+_MOST_PX = 32_766  # OpenCV warps no larger pictures
 _ROUNDING_PX = 1e-6  # smaller differences are rounding errors: equal motions differ by 1e-14 px
 
 
@@ -275,6 +276,8 @@ def on_canvas(
     """
     pixels = np.stack(np.meshgrid(np.arange(float(common.width)), np.arange(float(common.height))), axis=-1)
     places = canvas.pixels(common.on_plane(pixels) @ (canvas.plane_to_rays @ inverse(alignment)).T).astype(np.float32)
+    if (factor := _MOST_PX / max(picture.shape[:2])) < 1:
+        picture = np.asarray(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
     reduction = np.array([canvas.width / picture.shape[1], canvas.height / picture.shape[0]], np.float32)
     x, y = np.moveaxis((places + 0.5) / reduction - 0.5, -1, 0)
     moved = cv2.remap(picture, np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.INTER_LINEAR)

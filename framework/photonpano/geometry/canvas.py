@@ -1,11 +1,11 @@
 """The canvas of a panorama: its size, its projection, and the map to its pixels.
 
 Convention:
-    A ray is a direction (x, y, z) of the reference camera, x right, y down, z ahead, of any length. A point is (a, b), in
-    radians for all projections but "planar". The ray of a point is `(p(a) r(b), q(b), s(a) r(b))`: it takes three
-    multiplications once p, s of each column and q, r of each row are known.
+    A ray is a direction (x, y, z) of the reference camera, x right, y down, z ahead, of any length. A point is (a, b), near
+    (0, 0) in radians for all projections but "planar". The ray of a point is `(p(a) r(b), q(b), s(a) r(b) + t(b))`: it takes
+    three multiplications once p, s of each column and q, r, t of each row are known.
 
-The canvas of a camera that turns is what its frames cover of a cylinder or a sphere.
+The canvas of a camera that turns is what its frames cover of a cylinder, a sphere, or another surface.
 """
 
 from __future__ import annotations
@@ -20,29 +20,49 @@ from photonpano.geometry.camera import Camera, nearest_rotations
 from photonpano.geometry.homographies import BLOCK_FRAMES, corners, rescaling, transform_points, translation
 from photonpano.values import FloatArray, Homography
 
-ProjectionName: TypeAlias = Literal["planar", "cylindrical", "spherical"]
+ProjectionName: TypeAlias = Literal["planar", "cylindrical", "spherical", "mercator", "panini", "stereographic"]
+_Terms: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+_SIDE_DIRECTIONS = 65  # directions along each side of what frames cover, whose places on a canvas are its bounds
 
 
 @dataclass(frozen=True, slots=True)
 class Projection:
     """A projection."""
 
-    across: Callable[[FloatArray], tuple[FloatArray, FloatArray]]  # returns p and s for a
-    down: Callable[[FloatArray], tuple[FloatArray, FloatArray]]  # returns q and r for b
+    across: _Terms  # returns p and s for a, and nothing of account
+    down: _Terms  # returns q, r and t for b
     points: Callable[[FloatArray], FloatArray]  # returns the points of (..., 3) rays: (..., 2)
+    periodic: bool = False  # whether a is an angle, so that a full turn comes back to where it began
+    # how far from ahead it goes along a, and along b, in degrees: further out, it grows without bounds
+    widest: tuple[float, float] = (np.inf, np.inf)
 
     def rays(self, points: FloatArray) -> FloatArray:
         """Return the rays of (..., 2) points: (..., 3)."""
-        (p, s), (q, r) = self.across(points[..., 0]), self.down(points[..., 1])
-        return np.stack([p * r, np.broadcast_to(q, p.shape), s * r], axis=-1)
+        (p, s, _), (q, r, t) = self.across(points[..., 0]), self.down(points[..., 1])
+        return np.stack([p * r, np.broadcast_to(q, p.shape), s * r + t], axis=-1)
+
+    def bounds(self, a: tuple[float, float], b: tuple[float, float]) -> FloatArray:
+        """Return the lowest and the highest point that a box of angles reaches, in radians: (2, 2)."""
+        across, down = (np.linspace(*each, _SIDE_DIRECTIONS) for each in ((0.0, 0.0) if self.periodic else a, b))
+        angles = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        points = self.points(PROJECTIONS["spherical"].rays(angles))
+        found = np.stack([points.min(axis=0), points.max(axis=0)])
+        if self.periodic:
+            found[:, 0] = a
+        return found
 
 
-def _straight(coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return coordinates, np.ones_like(coordinates)
+def _flat(coordinates: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return coordinates, np.ones_like(coordinates), np.zeros_like(coordinates)
 
 
-def _round(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return np.sin(angles), np.cos(angles)
+def _round(angles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return np.sin(angles), np.cos(angles), np.zeros_like(angles)
+
+
+def _from_behind(coordinates: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Look at a cylinder, or a sphere, from behind its middle."""
+    return coordinates, 1 - coordinates**2 / 4, np.zeros_like(coordinates)
 
 
 def _on_plane(rays: FloatArray) -> FloatArray:
@@ -62,11 +82,31 @@ def _on_sphere(rays: FloatArray) -> FloatArray:
     return np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1)
 
 
+def _on_mercator(rays: FloatArray) -> FloatArray:
+    across, down = np.moveaxis(_on_cylinder(rays), -1, 0)
+    return np.stack([across, np.arcsinh(down)], axis=-1)
+
+
+def _on_panini(rays: FloatArray) -> FloatArray:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return 2 * rays[..., :2] / (np.hypot(rays[..., 0], rays[..., 2]) + rays[..., 2])[..., None]
+
+
+def _stereographic(rays: FloatArray) -> FloatArray:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(2 * rays[..., :2] / (np.linalg.norm(rays, axis=-1) + rays[..., 2])[..., None])
+
+
 # The projections by name. The rays of "planar" are homogeneous pixels of the reference frame, not directions.
 PROJECTIONS: dict[str, Projection] = {
-    "planar": Projection(_straight, _straight, _on_plane),
-    "cylindrical": Projection(_round, _straight, _on_cylinder),
-    "spherical": Projection(_round, _round, _on_sphere),
+    "planar": Projection(_flat, _flat, _on_plane),
+    "cylindrical": Projection(_round, _flat, _on_cylinder, periodic=True, widest=(np.inf, 80)),
+    "spherical": Projection(_round, _round, _on_sphere, periodic=True),
+    "mercator": Projection(_round, lambda b: _flat(np.sinh(b)), _on_mercator, periodic=True, widest=(np.inf, 85)),
+    "panini": Projection(_from_behind, _flat, _on_panini, widest=(150, 80)),
+    "stereographic": Projection(
+        _from_behind, lambda b: (b, np.ones_like(b), -(b**2) / 4), _stereographic, widest=(150, np.inf)
+    ),
 }
 
 
@@ -118,8 +158,8 @@ class Canvas:
 
     @property
     def period_px(self) -> float | None:
-        """Columns of a full turn; None for a planar canvas."""
-        return None if self.planar else float(2 * np.pi * self.transform[0, 0])
+        """Columns of a full turn; None where a is no angle."""
+        return float(2 * np.pi * self.transform[0, 0]) if self._projection.periodic else None
 
     @property
     def is_full_turn(self) -> bool:
@@ -127,12 +167,12 @@ class Canvas:
         return self.period_px is not None and abs(self.width - self.period_px) < 1e-6 * self.width
 
     def columns(self) -> tuple[FloatArray, FloatArray]:
-        """Return p and s of each column, (W,): the ray of a pixel (x, y) is `(p[x] r[y], q[y], s[x] r[y])`."""
+        """Return p and s of each column, (W,): the ray of a pixel (x, y) is `(p[x] r[y], q[y], s[x] r[y] + t[y])`."""
         x = np.arange(self.width, dtype=np.float64)
-        return self._projection.across(x if self.planar else (x - self.transform[0, 2]) / self.transform[0, 0])
+        return self._projection.across(x if self.planar else (x - self.transform[0, 2]) / self.transform[0, 0])[:2]
 
-    def rows(self) -> tuple[FloatArray, FloatArray]:
-        """Return q and r of each row: (H,)."""
+    def rows(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return q, r and t of each row: (H,)."""
         y = np.arange(self.height, dtype=np.float64)
         return self._projection.down(y if self.planar else (y - self.transform[1, 2]) / self.transform[1, 1])
 
@@ -148,10 +188,11 @@ class Canvas:
         Of the columns of full turns, which are the same place, it is the one on the canvas.
         """
         points = self._projection.points(rays)
-        period = self.period_px
-        if period is None:
+        if self.planar:
             return points
         places = np.asarray(points * np.diag(self.transform)[:2] + self.transform[:2, 2])
+        if (period := self.period_px) is None:
+            return places
         first = min(-0.5, (self.width - 1 - period) / 2)
         places[..., 0] -= period * np.floor((places[..., 0] - first) / period)
         return places
@@ -290,7 +331,7 @@ def covered_by(rotations: FloatArray, camera: Camera, frame_shape: tuple[int, in
 
 
 def canvas_around(covered: Covered, camera: Camera, scale: float, projection: str, horizon: FloatArray | None = None) -> Canvas:
-    """Return the smallest canvas of a cylinder or a sphere that holds what frames cover.
+    """Return the smallest canvas of a projection, not of a plane, that holds what frames cover.
 
     At scale 1, a pixel at b = 0 is as large as one at the centre of the reference frame. The seam of a full turn
     is at a = pi, behind the reference camera.
@@ -299,12 +340,11 @@ def canvas_around(covered: Covered, camera: Camera, scale: float, projection: st
         covered: what the canvas holds.
         camera: of the reference frame.
         scale: pixels of the canvas per pixel of the reference frame.
-        projection: "cylindrical" or "spherical".
+        projection: its name.
         horizon: (3, 3) of the canvas.
     """
-    down = np.tan if projection == "cylindrical" else np.asarray
     per_radian = camera.focal_px * scale
-    (first, last), (low, high) = covered.a, (float(down(each)) for each in covered.b)
+    (first, low), (last, high) = PROJECTIONS[projection].bounds(covered.a, covered.b).tolist()
     if covered.full_turn:
         # A multiple of 4, so that the poles are at borders of pixels, too.
         per_radian = 4 * max(1, round(np.pi * per_radian / 2)) / (2 * np.pi)

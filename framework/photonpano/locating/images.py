@@ -23,6 +23,7 @@ from photonpano.photometry import (
     stabilised_flux,
     without_local_mean,
 )
+from photonpano.text import pixels
 from photonpano.values import BoolArray, FloatArray, Homography, Located, NotLocated, VirtualExposure
 
 # Fraction of pixels clipped to black and to white, so that single hot pixels do not reduce the contrast of the rest.
@@ -303,7 +304,8 @@ def motion_from_images(
     std_px = float(np.sqrt(np.trace(to_corners[:, estimated] @ covariance @ to_corners[:, estimated].T) / 4))
     if not std_px <= limits.max_std_px:
         return NotLocated(
-            f"the images leave the corners uncertain by {std_px:.2g} px, more than max_std_px = {limits.max_std_px:g}", found
+            f"the images leave the corners uncertain by {pixels(std_px)} px, more than max_std_px = {limits.max_std_px:g}",
+            found,
         )
     return Located(homography, to_step.T @ information @ to_step, std_px, found)
 

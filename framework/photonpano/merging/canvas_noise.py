@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -347,16 +348,21 @@ class DynamicRange:
     """The range of flux in a panorama, gathered tile by tile."""
 
     noise: CanvasNoise  # of its canvas
-    low: float = float("inf")  # the lowest flux that exceeds its standard deviation; infinite before there is one
+    low: float = float("inf")  # the lowest flux that noise alone does not reach; infinite before there is one
     high: float = 0.0  # the highest
     n_saturated: int = 0  # number of values of pixels that were lit in every frame
     n_seen: int = 0  # number of values of pixels that were seen
     frames: float = 0.0  # frames that saw each value, added up
 
     def add(self, flux: FluxImage, weight: FluxImage, std: FluxImage) -> None:
-        """Add a part of the panorama, with its standard deviation by photons."""
+        """Add a part of the panorama, with its standard deviation by photons.
+
+        The lowest of many values would be that of the noisiest pixel: values count that exceed their noise by more than the
+        largest of as many draws of noise does, and those of saturated pixels, which are lower bounds.
+        """
+        by_chance = np.float32(NormalDist().inv_cdf(1 - 0.5 / max(1, flux.size)))
         with np.errstate(invalid="ignore"):
-            measured = flux[flux >= std]
+            measured = flux[(flux >= by_chance * std) | self.noise.saturated(flux, weight)]
         if measured.size:
             self.low, self.high = min(self.low, float(measured.min())), max(self.high, float(measured.max()))
         self.n_saturated += int(np.count_nonzero(self.noise.saturated(flux, weight)))
@@ -365,7 +371,7 @@ class DynamicRange:
 
     @property
     def decibels(self) -> float | None:
-        """Ratio of the highest and the lowest flux that exceed their standard deviation; None if none does."""
+        """Ratio of the highest and the lowest flux that noise alone does not reach; None if there is none."""
         return FluxRange(self.low, self.high).decibels if 0 < self.low <= self.high else None
 
     @property

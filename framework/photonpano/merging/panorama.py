@@ -18,6 +18,7 @@ from photonpano.errors import CanvasTooLargeError, ExtentError, LocationError, P
 from photonpano.execution.context import Context
 from photonpano.execution.threads import InOrder
 from photonpano.geometry import (
+    PROJECTIONS,
     Camera,
     Canvas,
     Covered,
@@ -44,8 +45,8 @@ _MAX_EXCESS = 16
 _LEAST_SCALE = 0.05  # that render.scale may have
 # Up to the first field of view, "auto" takes a plane; beyond the second, a plane is refused.
 _PLANAR_DEGREES, _WIDEST_PLANE_DEGREES = 90, 100
-# Up to the first distance from b = 0, "auto" takes a cylinder; beyond the second, a cylinder is refused.
-_CYLINDER_DEGREES, _TALLEST_CYLINDER_DEGREES = 45, 80
+_CYLINDER_DEGREES = 45  # up to this distance from b = 0, "auto" takes a cylinder
+_ROUNDING_DEGREES = 1e-6
 _TURN = 360
 
 
@@ -53,7 +54,7 @@ _TURN = 360
 class View:
     """How a panorama is projected."""
 
-    projection: str = "auto"  # "planar", "cylindrical", "spherical", or "auto"
+    projection: str = "auto"  # one of `PROJECTIONS`, or "auto"
     level: bool = False  # whether the horizon is level, or that of the reference frame
     camera: Camera | None = None  # of the frames; None if it is not known
     turns: bool = False  # whether the camera only turns, so that a cylinder or a sphere can show what it sees
@@ -127,11 +128,15 @@ def _canvas(homographies: FloatArray, frame_shape: tuple[int, int], scale: float
         horizon = level_horizon(rotations)
         covered = covered_by(horizon @ rotations, view.camera, frame_shape)
     low, high = np.degrees(covered.b) if isinstance(extent, str) else (extent[1], extent[3])
-    if projection == "cylindrical" and max(-low, high) > _TALLEST_CYLINDER_DEGREES:  # far taller than what it shows
-        raise ProjectionError(
-            f"the frames reach {max(-low, high):.0f} degrees up or down, and a cylinder holds up to "
-            f"{_TALLEST_CYLINDER_DEGREES}; write render.projection: spherical"
-        )
+    first, last = np.degrees(covered.a) if isinstance(extent, str) else (extent[0], extent[2])
+    for reached, widest, where in zip(
+        (max(-first, last), max(-low, high)), PROJECTIONS[projection].widest, ("aside", "up or down"), strict=True
+    ):
+        if reached > widest + _ROUNDING_DEGREES:  # far larger than what it shows
+            raise ProjectionError(
+                f"the frames reach {reached:.0f} degrees {where}, and a {projection} panorama holds up to {widest:g}; write "
+                "render.projection: spherical"
+            )
     whole = canvas_around(covered, view.camera, scale, projection, horizon)
     if extent == "panorama":
         return whole
@@ -200,9 +205,8 @@ def _part_around(whole: Canvas, covered: Covered, box: tuple[int, int, int, int]
             f"{list(box)} lies outside the panorama, which holds a from {first:.0f} to {last:.0f} and b from {low:.0f} to "
             f"{high:.0f}, in degrees"
         )
-    per_radian, b = whole.transform[0, 0], np.radians([b0, b1])
-    across = np.radians([a0, a1]) * per_radian
-    down = (np.tan(b) if whole.projection == "cylindrical" else b) * per_radian
+    bounds = PROJECTIONS[whole.projection].bounds((np.radians(a0), np.radians(a1)), (np.radians(b0), np.radians(b1)))
+    across, down = (bounds * whole.transform[0, 0]).T
     (left, right), (top, bottom) = ((int(np.floor(start + 1e-6)), int(np.ceil(stop - 1e-6))) for start, stop in (across, down))
     origin = np.rint(whole.transform[:2, 2] + 0.5).astype(int)
     return whole.part(left + int(origin[0]), top + int(origin[1]), bottom - top, right - left)

@@ -300,6 +300,7 @@ class Grid(NamedTuple):
     s0: float  # of the middle column
     q: NDArray[np.float64]  # (h,) of the rows of the box
     r: NDArray[np.float64]  # (h,) of the rows
+    t: NDArray[np.float64]  # (h,) of the rows
     top: int  # first row of the box
     left: int  # first column
     total: NDArray[np.float32]  # (H, W) float32 sums of counts
@@ -317,7 +318,10 @@ class Grid(NamedTuple):
     def parts(self, footprint: Footprint) -> list[Grid]:
         """Return the same sums, with the boxes that a frame may touch."""
         down, boxes = slice(footprint.rows.start, footprint.rows.stop), footprint.columns if footprint.rows else ()
-        rows, across = self._replace(q=self.q[down], r=self.r[down], top=down.start), [slice(x.start, x.stop) for x in boxes]
+        rows, across = (
+            self._replace(q=self.q[down], r=self.r[down], t=self.t[down], top=down.start),
+            [slice(x.start, x.stop) for x in boxes],
+        )
         return [rows._replace(p=self.p[x], s=self.s[x], left=x.start) for x in across]
 
 
@@ -350,11 +354,11 @@ def image_row(  # noqa: PLR0917
         u: (W,) output, x; -9 behind the camera and beyond the lens.
         v: (W,) output, y.
     """
-    p, s, q, r, p0, s0 = grid.p, grid.s, grid.q[row], grid.r[row], grid.p0, grid.s0
+    p, s, q, r, p0, s0 = grid.p, grid.s, grid.q[row], grid.r[row], grid.p0, grid.r[row] * grid.s0 + grid.t[row]
     x0, y0, z0 = np.float32(matrix[0, 0] * r), np.float32(matrix[1, 0] * r), np.float32(matrix[2, 0] * r)
-    x1 = np.float32(matrix[0, 0] * r * p0 + matrix[0, 1] * q + matrix[0, 2] * r * s0)
-    y1 = np.float32(matrix[1, 0] * r * p0 + matrix[1, 1] * q + matrix[1, 2] * r * s0)
-    z1 = np.float32(matrix[2, 0] * r * p0 + matrix[2, 1] * q + matrix[2, 2] * r * s0)
+    x1 = np.float32(matrix[0, 0] * r * p0 + matrix[0, 1] * q + matrix[0, 2] * s0)
+    y1 = np.float32(matrix[1, 0] * r * p0 + matrix[1, 1] * q + matrix[1, 2] * s0)
+    z1 = np.float32(matrix[2, 0] * r * p0 + matrix[2, 1] * q + matrix[2, 2] * s0)
     x2, y2, z2 = np.float32(matrix[0, 2] * r), np.float32(matrix[1, 2] * r), np.float32(matrix[2, 2] * r)
     one, two, behind, nowhere = np.float32(1), np.float32(2), np.float32(_BEHIND), np.float32(-9)
     if lens.limit == np.inf:

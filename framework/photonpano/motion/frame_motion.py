@@ -65,7 +65,10 @@ def view_of(motion: FrameMotion, source: Source, projection: str = "auto", *, le
 
 
 def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, reference: int) -> FrameMotion:
-    """Evaluate the result of the last level, of at least one, at every frame; that at `reference` is the identity."""
+    """Evaluate the result of the last level, of at least one, at every frame.
+
+    That at `reference` is the identity, or at the next frame that is located.
+    """
     last = levels[-1]
     frames, span = np.arange(stream.n_frames), last.located.covered
     located = (span.start <= frames) & (frames < span.stop)
@@ -73,6 +76,9 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
         located &= timeline.shown
     std_px, remaining_px = np.where(located, last.uncertainty.at(frames), np.inf), last.uncertainty.remaining_at(frames)
     homographies = np.concatenate([last.trajectory.at(block) for block in np.split(frames, frames[BLOCK_FRAMES::BLOCK_FRAMES])])
+    if not located[reference]:
+        reference = int(frames[located][np.abs(frames[located] - reference).argmin()])
+        homographies = normalised(np.linalg.inv(homographies[reference]) @ homographies)
     trajectory = FrameTrajectory(homographies)
     camera = camera_of_motion(last.trajectory)
     return FrameMotion(

@@ -22,6 +22,7 @@ from photonpano.geometry import (
     corners,
     inverse,
     jacobian,
+    nearest_rotations,
     normalised,
     right_handed_axes,
     rotation_matrices,
@@ -33,6 +34,7 @@ from photonpano.motion.level import Timeline
 from photonpano.motion.pairs import GYROSCOPE, instants_of
 from photonpano.motion.rotations import RotationTrajectory
 from photonpano.motion.velocity import Contrast, Images, structure_of, varying_spans
+from photonpano.text import pixels
 from photonpano.values import Decision, Edge, FloatArray, Group, Homography, Located
 
 if TYPE_CHECKING:
@@ -198,6 +200,7 @@ class Gyroscope:
         Raises:
             InputError: they differ by much more than expected.
         """
+        self._require_signs(edges)
         away, expected, weights = [0.0], [0.0], {True: 0.0, False: 0.0}
         for edge in edges:
             if not isinstance(edge.motion, Located) or edge.motion.information is None:
@@ -209,7 +212,8 @@ class Gyroscope:
                 solved = inverse(solution.homographies[edge.fixed]) @ solution.homographies[edge.moving]
                 away.append(float(corner_displacements(solved, motion, self.frame_shape).mean()))
                 expected.append(float(np.hypot(edge.motion.evidence["std_px"], std_px)))
-        differs = f"{np.median(away):.2g} px from one exposure to the next, where {np.median(expected):.2g} px are expected"
+        px, expected_px = pixels(np.median(away)), pixels(np.median(expected))
+        differs = f"{px} px from one exposure to the next, where {expected_px} px are expected"
         if np.median(away) > _CONTRADICTION * np.median(expected):
             raise InputError(
                 f"{self.rates.file}: the rates contradict the images by {differs}; is it of this capture, and are "
@@ -218,6 +222,27 @@ class Gyroscope:
         share = weights[True] / max(sum(weights.values()), 1e-12)
         reason = f"of what pairs of exposures show of rotations, {share:.0%} is by the gyroscope"
         return Decision("gyroscope_agreement", f"differs by {differs}", reason)
+
+    def _require_signs(self, edges: Sequence[Edge]) -> None:
+        """Raise an `InputError` if pairs of exposures turn about an axis in the opposite sense of the rates."""
+        located = [(each, each.motion.homography) for each in edges if isinstance(each.motion, Located)]
+        chain = [np.eye(3)]  # the rotations from each exposure to the first, by the rates
+        for _, homography in (each for each in located if each[0].locator == GYROSCOPE):
+            chain.append(chain[-1] @ self.camera.rotations(homography))
+        pairs = [(edge, homography) for edge, homography in located if edge.locator != GYROSCOPE]
+        seen = rotation_vectors(
+            nearest_rotations(self.camera.rotations(np.array([each for _, each in pairs]).reshape(-1, 3, 3)))
+        )
+        told = rotation_vectors(np.array([chain[edge.fixed].T @ chain[edge.moving] for edge, _ in pairs]).reshape(-1, 3, 3))
+        products, squares = seen * told, np.maximum((told**2).sum(axis=0), np.finfo(float).tiny)
+        slope = products.sum(axis=0) / squares
+        std = np.sqrt(((products - slope * told**2) ** 2).sum(axis=0)) / squares
+        if (slope < -_SIGNIFICANT * std).any():
+            axis = int(np.argmin(slope / np.maximum(std, np.finfo(float).tiny)))
+            raise InputError(
+                f"{self.rates.file}: about the axis {'xyz'[axis]} of the camera, pairs of exposures turn {-slope[axis]:.2g} "
+                "times as far as the rates, the other way round; negate its column, or flip the frames if they are mirrored"
+            )
 
 
 class _AlongRates(Contrast):

@@ -25,7 +25,7 @@ from photonpano.pipeline.obstacles import ApartError, parts_of, shots_of, timeli
 from photonpano.pipeline.state import State, model_of, within
 from photonpano.residuals.findings import Findings
 from photonpano.specs.plan import Plan
-from photonpano.text import listed
+from photonpano.text import listed, pixels
 from photonpano.values import Decision, FrameSpan, Journal
 
 _MOST_LENSES = 4  # times that the last level is run again, through the lens that it has found
@@ -205,7 +205,7 @@ def _smooth_path(plan: Plan, source: Source, reference: int, context: Context) -
     )
     if plan.motion.start == "none":
         reason += "; without it, pairs of exposures could not be located"
-    text = f"shifts along a spline with {found.n_knots} knots, within {found.trajectory.std_px:.2g} px"
+    text = f"shifts along a spline with {found.n_knots} knots, within {pixels(found.trajectory.std_px)} px"
     return found.trajectory, Decision("start", text, reason)
 
 
@@ -241,7 +241,7 @@ def _model_decisions(plan: Plan, results: Sequence[LevelResult]) -> list[Decisio
     if plan.motion.model != "auto":
         return []
     rivals = [f"{name} {rival.deviance:,.0f} ({rival.unknowns:,})" for name, rival in located.rivals.items()]
-    walks = [f"{name} {px:.2g} px" for name, px in located.solution.walks_px.items()]
+    walks = [f"{name} {pixels(px)} px" for name, px in located.solution.walks_px.items()]
     reason = f"beyond shift and roll, the ends of a frame move by {listed(walks) or 'nothing'} over the capture"
     if (focal_px := located.solution.turning_px) is not None and walks:
         reason += f", and perspective follows the shift: a camera of about {focal_px:,.0f} px that turns and travels"

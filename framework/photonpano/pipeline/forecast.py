@@ -11,7 +11,7 @@ import numpy as np
 from photonpano.capture import part_of
 from photonpano.contracts.protocols import Source, camera_of_motion
 from photonpano.errors import PhotonpanoError
-from photonpano.execution.context import Context
+from photonpano.execution.context import Context, Progress
 from photonpano.execution.threads import Stopwatch, one_thread_inside, thread_count
 from photonpano.geometry import Canvas, canvas_of_box
 from photonpano.merging.colour import channels_of
@@ -52,14 +52,14 @@ class Forecast:
     canvas: tuple[int, int]
 
 
-def forecast(plan: Plan, source: Source) -> Forecast:
+def forecast(plan: Plan, source: Source, progress: Progress) -> Forecast:
     """Run all of the pipeline on a part of the capture, and extrapolate: time is proportional to the number of frames.
 
     Raises:
         PhotonpanoError: the trial failed, as the run would.
     """
     threads, n_frames = thread_count(plan.run.threads), source.info.n_frames
-    context = Context(threads=threads)
+    context = Context(threads=threads, progress=progress)
     groups = resample(build_levels(plan, source, [])[0], n_frames, Stopwatch())
     length = float(np.median([len(group.span) for group in groups]))
     with suppress(PhotonpanoError):  # what fails here fails in the trial, too, or is too short for it

@@ -256,7 +256,8 @@ def run_others(plan: Plan, record: RunRecord, run: Callable[[Plan], ResultT], pr
             yield run(narrowed.having("output", directory=folder))
         except Exception as error:
             message = str(error) if isinstance(error, PhotonpanoError) else described(error)
-            logger.warning("no panorama of %s, another shot, was written into %s: %s", shot, folder, message)
+            from_frame = f"frames count from frame {shot.start} of the capture: " if shot.start else ""
+            logger.warning("no panorama of %s, another shot, was written into %s: %s%s", shot, folder, from_frame, message)
 
 
 def _narrowed(plan: Plan, shot: FrameSpan, rate_hz: float | None) -> Plan:

@@ -99,6 +99,8 @@ def tried(state: State, propose: Pass) -> Trial:
     """Try a pass. The state before is kept if the new motion cannot be estimated, or explains the photons worse."""
     if (proposal := propose(state)) is None:
         return Trial(state)
+    if (name := getattr(propose, "__name__", "")).isidentifier():
+        state.context.progress.note(f"a pass is tried: {name.replace('_', ' ')}")
     try:
         if (proposed := proposal.make()) is None:
             return Trial(state)

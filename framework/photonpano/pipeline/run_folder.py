@@ -26,7 +26,7 @@ from photonpano.motion.frame_motion import FrameMotion
 from photonpano.motion.loop import LevelResult
 from photonpano.photometry import tone_mapped
 from photonpano.record.contents import MAPS, RECORD, REPORT, content_of, contents_of, names_of_results, recorded_json
-from photonpano.record.picture_files import photo_sphere, png_of, with_xmp
+from photonpano.record.picture_files import photo_sphere, png_of, png_with_holes, with_xmp
 from photonpano.record.schema import RunRecord
 
 SHOWN_FILES = 3  # files that a message names
@@ -59,7 +59,10 @@ class RunFolder:
 
     def write_results(self, panorama: RenderedPanorama, motion: FrameMotion) -> None:
         """Write panorama.png (8 bits, sRGB) and trajectory.npz."""
-        png, sphere = png_of(panorama.picture), photo_sphere(panorama.canvas, panorama.picture.shape[:2])
+        sphere = photo_sphere(panorama.canvas, panorama.picture.shape[:2])
+        flux = panorama.thumbnail.flux
+        unseen = np.isnan(flux).reshape(*flux.shape[:2], -1).all(axis=-1)
+        png = png_with_holes(panorama.picture, np.asarray(unseen))
         with self.writing():
             (self.staging / "panorama.png").write_bytes(png if sphere is None else with_xmp(png, sphere))
             motion_arrays: dict[str, Any] = {

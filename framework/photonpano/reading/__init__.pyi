@@ -1,9 +1,13 @@
+from .arrays import FrameAxis as FrameAxis
+from .arrays import frame_array as frame_array
+from .arrays import is_array_file as is_array_file
+from .arrays import is_matlab_file as is_matlab_file
+from .arrays import unpacked as unpacked
 from .files import COLOURS as COLOURS
 from .files import OpenFiles as OpenFiles
 from .files import as_written as as_written
 from .files import bayer_array as bayer_array
 from .files import files_in as files_in
-from .files import is_gzip as is_gzip
 from .files import library as library
 from .files import missing_file as missing_file
 from .files import natural_order as natural_order
@@ -23,11 +27,9 @@ from .npy import Content as Content
 from .npy import NpyHeader as NpyHeader
 from .npy import OtherOrder as OtherOrder
 from .npy import PixelOrder as PixelOrder
-from .npy import any_npy_header as any_npy_header
 from .npy import arrived_frames as arrived_frames
 from .npy import eight_frames_are_first as eight_frames_are_first
 from .npy import frames_are_last as frames_are_last
-from .npy import gzipped_npy_header as gzipped_npy_header
 from .npy import has_channels as has_channels
 from .npy import npy_header as npy_header
 from .npy import other_order as other_order
@@ -35,9 +37,7 @@ from .npy import require_frames as require_frames
 from .npy import require_whole as require_whole
 from .npy import sampled_frames as sampled_frames
 from .npy import sampled_spans as sampled_spans
-from .npy import unpacked as unpacked
 from .npy import unpacked_content as unpacked_content
-from .npy import unpacked_start as unpacked_start
 from .sources import BinarySource as BinarySource
 from .sources import BlockSource as BlockSource
 from .sources import Closing as Closing

@@ -341,11 +341,6 @@ def read_start(path: Location, n_bytes: int) -> bytes:
         return b""
 
 
-def is_gzip(path: Location) -> bool:
-    """Return whether a file is compressed with gzip, by its first bytes."""
-    return read_start(path, 2) == b"\x1f\x8b"
-
-
 class OpenFiles:
     """Reads pieces of files from any thread. A file is opened when it is first read, and at most 16 stay open."""
 

@@ -1,33 +1,25 @@
-"""Read and check headers of .npy and .npy.gz files, count the frames that are there, and unpack .npy.gz files once."""
+"""Read and check headers of .npy files, count the frames that are there, and tell from frames how they are stored."""
 
 from __future__ import annotations
 
-import gzip
-import logging
 import math
 import operator
-import os
-import zlib
 from collections.abc import Sequence
-from functools import lru_cache
 from gzip import GzipFile
 from io import BytesIO
-from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.errors import InputError
-from photonpano.files.folders import atomic_path, require_space
 from photonpano.files.paths import Location, Url
 from photonpano.photometry import BitOrder
-from photonpano.reading.files import OpenFiles, is_gzip, read_range, read_start, reading, size_of
+from photonpano.reading.files import OpenFiles, read_range, read_start, reading, size_of
 from photonpano.values import FrameSpan
 
 _HEADER_BYTES = 4096  # bytes of a URL that are read for the header; that of a capture has 128
 _SHORTEST_HEADER = 128  # bytes of the shortest header that numpy writes
-_BLOCK_BYTES = 1024**2
 _CHANNELS = 3
 # Minimum score of a difference that is not chance. Scores of noise scatter by 1.2: one in 60,000 exceeds 5.
 _MIN_SCORE = 5.0
@@ -121,8 +113,6 @@ def arrived_frames(path: Location) -> int | None:
     """
     if isinstance(path, Url):
         raise InputError(f"{path} is a URL, which cannot be followed: follow a file, or a pipe")
-    if is_gzip(path):
-        raise InputError(f"{path} is compressed, so that no frame can be read before all are there; follow a .npy file")
     if not path.exists() or size_of(path) < _SHORTEST_HEADER:
         return None
     header = npy_header(path)
@@ -136,123 +126,9 @@ def _guess(start: bytes) -> str:
         return ": it is empty"
     if start.startswith(b"\x1f\x8b"):
         return ": it is compressed with gzip; unpack it with gunzip"
-    if start.startswith(b"PK"):
-        return ": it is an archive; save the array in it with numpy.save"
     if start.startswith(b"\x93NUM"):
         return " that can be read: its header is damaged; write it again"
     return ", by its first bytes; write it with numpy.save"
-
-
-logger = logging.getLogger(__name__)
-
-
-def local(path: Location) -> Path:
-    """Return the path of a compressed file; an `InputError` for a URL, of which it can only be read from its beginning."""
-    if isinstance(path, Url):
-        raise InputError(f"{path} is compressed with gzip, and cannot be read in parts; unpack it there, or download it")
-    return path
-
-
-def unpacked_start(path: Path, n_bytes: int) -> bytes:
-    """Return the first bytes of a file, unpacked if it is compressed; none if it cannot be read."""
-    if not is_gzip(path):
-        return read_start(path, n_bytes)
-    try:
-        with gzip.open(path) as file:
-            return file.read(n_bytes)
-    except (OSError, EOFError, zlib.error):
-        return b""
-
-
-def any_npy_header(path: Location) -> NpyHeader:
-    """Read the header of a .npy or .npy.gz file; raises as `npy_header` and `gzipped_npy_header`."""
-    return gzipped_npy_header(path) if is_gzip(path) else npy_header(path)
-
-
-def gzipped_npy_header(path: Location) -> NpyHeader:
-    """Read the header of the array in a .npy.gz file, without its data.
-
-    Raises:
-        InputError: the file cannot be read, or holds something else; or it is a URL.
-    """
-    path = local(path)
-    try:
-        with gzip.open(path) as file:
-            header = read_npy_header(file)
-    except (OSError, EOFError, zlib.error) as error:
-        raise _damaged(path) from error
-    if header is None:
-        raise InputError(f"{path} holds no .npy file; compress one that numpy.save has written")
-    return header
-
-
-def unpacked(path: Location) -> Path:
-    """Return the path of a .npy file with the content of a .npy.gz file.
-
-    For `capture.npy.gz` it is `capture.npy.gz.unpacked.npy`. It is written, and a warning logged, unless it is there with the
-    checksum that the archive ends with.
-
-    Raises:
-        InputError: the file is damaged, or holds something else.
-        OutputError: the unpacked file cannot be written, or does not fit on its disk.
-    """
-    path = local(path)
-    promised = gzipped_npy_header(path).file_bytes
-    target = path.with_name(f"{path.name}.unpacked.npy")
-    if not _is_content(target, path, promised):
-        require_space(target, promised)
-        logger.warning("%s is unpacked to %s, once", path, target.name)
-        with atomic_path(target) as temporary:
-            _unpack(path, temporary, promised)
-    return target
-
-
-def _is_content(target: Path, path: Path, promised: int) -> bool:
-    """Return whether a file has the checksum that an archive ends with; one of several parts is always unpacked again."""
-    if target.is_symlink() or not target.is_file() or target.stat().st_size != promised:
-        return False
-    with reading(path), path.open("rb") as archive:
-        archive.seek(-8, os.SEEK_END)
-        recorded = int.from_bytes(archive.read(4), "little")
-    return _crc32(target, target.stat().st_ctime_ns) == recorded
-
-
-@lru_cache(16)
-def _crc32(path: Path, changed_ns: int) -> int:
-    """Return the checksum of a file, which is read again if it has changed."""
-    del changed_ns
-    checksum = 0
-    with reading(path), path.open("rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            checksum = zlib.crc32(block, checksum)
-    return checksum
-
-
-def _unpack(path: Path, target: Path, promised: int) -> None:
-    """Unpack at most as many bytes as the header promises: a damaged file must not fill the disk."""
-    size = 0
-    with target.open("wb") as out, gzip.open(path) as file:
-        while block := _next_block(path, file):
-            size += len(block)
-            if size > promised:
-                break
-            out.write(block)
-    if size != promised:
-        more = "more" if size > promised else f"{size}"
-        raise InputError(
-            f"{path} is damaged: the header of its array promises {promised} bytes, there are {more}; copy or record it again"
-        )
-
-
-def _next_block(path: Path, file: gzip.GzipFile) -> bytes:
-    try:
-        return file.read(_BLOCK_BYTES)
-    except (OSError, EOFError, zlib.error) as error:
-        raise _damaged(path) from error
-
-
-def _damaged(path: Path) -> InputError:
-    return InputError(f"{path} is cut short or damaged: gzip cannot unpack it; copy it again")
 
 
 class PixelOrder(NamedTuple):
@@ -420,7 +296,7 @@ class Content(NamedTuple):
 
 
 def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:
-    """Read runs of consecutive frames from all over a .npy file, or from the beginning of a .npy.gz file.
+    """Read runs of consecutive frames from all over a .npy file.
 
     Args:
         path: the file.
@@ -428,15 +304,9 @@ def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:
 
     Returns:
         Arrays (n, rows, columns, ...), 3 million values together. Of large frames, only the first columns are read. An empty
-        list where the file is cut short, or the beginning of a .npy.gz file holds no whole frame.
+        list where the file is cut short.
     """
     n_frames, n_rows, n_columns, *_ = header.shape
-    values_of_frame = int(np.prod(header.shape[1:]))
-    if is_gzip(path):
-        start = unpacked_start(local(path), header.offset + _VALUES * header.dtype.itemsize)[header.offset :]
-        whole = min(n_frames, len(start) // (values_of_frame * header.dtype.itemsize))
-        frames = np.frombuffer(start, header.dtype, whole * values_of_frame)
-        return [frames.reshape(whole, *header.shape[1:])] if whole else []
     if size_of(path) < header.file_bytes:
         return []
     columns = min(n_columns, max(1, _VALUES // (_SHORTEST_RUN * n_rows)))

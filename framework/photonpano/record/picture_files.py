@@ -17,6 +17,7 @@ from photonpano.errors import OutputError
 from photonpano.files.folders import atomic_folder, atomic_path
 from photonpano.geometry import Canvas
 from photonpano.plugins.contributions import Requirement, install_command
+from photonpano.values import BoolArray
 
 Picture = NDArray[np.uint8] | NDArray[np.uint16]  # of 16 bits in a folder of PNGs only
 
@@ -76,6 +77,15 @@ def png_of(picture: Picture) -> bytes:
     if not encoded:
         raise OutputError(f"OpenCV could not encode a picture of {picture.shape} as PNG")
     return png.tobytes()
+
+
+def png_with_holes(picture: Picture, unseen: BoolArray) -> bytes:
+    """Return a picture as PNG whose pixels are transparent where nothing was seen, (H, W); what is black there becomes 1."""
+    if not unseen.any():
+        return png_of(picture)
+    unseen = unseen if picture.ndim == 2 else unseen[..., None]
+    png = png_of(np.where(unseen, 0, np.maximum(picture, 1)).astype(np.uint8))
+    return _with_chunk(png, b"tRNS", b"\0\0" * (1 if picture.ndim == 2 else 3))
 
 
 def advancing(made: Iterable[Picture], advance: Callable[[int], None]) -> Iterator[Picture]:
@@ -149,6 +159,9 @@ def photo_sphere(canvas: Canvas, shape: tuple[int, int]) -> str | None:
 def with_xmp(png: bytes, packet: str) -> bytes:
     """Return a PNG with an XMP packet; its pixels are not encoded again."""
     # Keyword, no compression, no language, no translated keyword.
-    text = _KEYWORD + b"\0\0\0\0\0" + packet.encode()
-    chunk = b"iTXt" + text
-    return png[:_HEADER] + struct.pack(">I", len(text)) + chunk + struct.pack(">I", zlib.crc32(chunk)) + png[_HEADER:]
+    return _with_chunk(png, b"iTXt", _KEYWORD + b"\0\0\0\0\0" + packet.encode())
+
+
+def _with_chunk(png: bytes, name: bytes, content: bytes) -> bytes:
+    chunk = name + content
+    return png[:_HEADER] + struct.pack(">I", len(content)) + chunk + struct.pack(">I", zlib.crc32(chunk)) + png[_HEADER:]

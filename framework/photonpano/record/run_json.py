@@ -49,7 +49,7 @@ from photonpano.residuals.findings import Findings
 from photonpano.residuals.halves import Agreements
 from photonpano.residuals.refinement import Explained, Refinement
 from photonpano.specs.plan import Choice, Plan
-from photonpano.text import listed
+from photonpano.text import listed, pixels
 from photonpano.values import (
     Decision,
     Edge,
@@ -100,8 +100,8 @@ def record_of(
         "warnings": [
             *time_warnings(findings.left_out, plan.run.time_limit),
             *timeline_warnings(timeline, plan.output.directory),
-            *level_warnings(levels),
             *motion_warnings(motion, timeline),
+            *level_warnings(levels),
             *refinement_warnings(explained.refinements),
         ],
     }
@@ -339,8 +339,8 @@ def _levels_decision(results: Sequence[LevelResult]) -> Decision:
     else:
         compared = "less" if last.converged else "still more" if converges(results) else "hardly less than before, but more"
         reason = (
-            f"the last level changed the motion by {last.change_px:.2g} px, {compared} than its expected error of "
-            f"{last.uncertainty.mean_px:.2g} px"
+            f"the last level changed the motion by {pixels(last.change_px)} px, {compared} than its expected error of "
+            f"{pixels(last.uncertainty.mean_px)} px"
         )
     return Decision("levels", len(results), reason)
 
@@ -490,12 +490,12 @@ def timeline_warnings(timeline: Timeline | None, directory: Path) -> list[str]:
 
 def motion_warnings(motion: FrameMotion, timeline: Timeline | None = None) -> list[str]:
     """Warn of frames whose motion is uncertain, or that show the scene and are left out."""
-    warnings = uncertain_frames(motion)
+    warnings = []
     lost = ~motion.located if timeline is None else ~motion.located & timeline.shown
     if lost.any():
         n_left_out, n_frames = int(np.sum(lost)), len(lost)
         warnings.append(f"{n_left_out} of {n_frames} frames lie outside the located exposures and are left out")
-    return warnings
+    return warnings + uncertain_frames(motion)
 
 
 def uncertain_frames(motion: FrameMotion) -> list[str]:
@@ -510,7 +510,7 @@ def uncertain_frames(motion: FrameMotion) -> list[str]:
         return []
     worst_px = {span: float(std_px[span.start : span.stop].max()) for span in true_spans(uncertain)}
     spans = sorted(worst_px, key=lambda span: -worst_px[span])
-    named = [f"{span} (up to {worst_px[span]:.2g} px)" for span in spans[:SHOWN_SPANS]]
+    named = [f"{span} (up to {pixels(worst_px[span])} px)" for span in spans[:SHOWN_SPANS]]
     more = f" and {len(spans) - SHOWN_SPANS} more spans" if len(spans) > SHOWN_SPANS else ""
     return [
         f"the motion of {int(uncertain.sum())} of {len(std_px)} frames is uncertain: its expected error exceeds "

@@ -130,7 +130,7 @@ class PanoramaRecord(TypedDict):
     """The panorama: `coverage_share` is the share of pixels that were seen, `white_flux` the flux that is white in the PNG.
 
     `picture_reduction` is the factor by which the PNG is smaller than the panorama, 1 unless that was rendered in tiles.
-    `dynamic_range_db` is the ratio of the highest and the lowest flux that exceed their standard deviation, and
+    `dynamic_range_db` is the ratio of the highest and the lowest flux that noise alone does not reach, and
     `measurable_range_db` what the mean number of frames over a pixel can measure, or the former if that is more, both None
     where nothing exceeds its noise; `saturated_share` is the share of the seen pixels that were lit in every frame. `decisions`
     are the names of those that renderer and exporters took.

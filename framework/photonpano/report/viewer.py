@@ -209,6 +209,11 @@ def views_of_instant(
     here = motion.homographies[frame] @ to_frame @ pixels  # on the reference plane
 
     def view(name: str, note: str, image: FluxImage, places: FloatArray, sharp: bool = False) -> dict[str, Any]:
+        # Of an image of more than 32,767 px a side, OpenCV takes parts only.
+        ends = np.nan_to_num([places.min(axis=1) - 1, places.max(axis=1) + 3])
+        parts = [slice(*each) for each in np.clip(ends, 0, image.shape[1::-1]).astype(int).T.tolist()]
+        if 0 not in (part := image[parts[1], parts[0]]).shape:
+            image, places = part, places - [[each.start] for each in parts]
         across, down = (each.reshape(shape).astype(np.float32) for each in places)
         how = cv2.INTER_NEAREST if sharp else cv2.INTER_LINEAR
         warped = cv2.remap(image, across, down, how, borderMode=cv2.BORDER_CONSTANT, borderValue=[float("nan")] * 4)

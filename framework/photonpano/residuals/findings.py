@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from photonpano.motion.level import Timeline
-from photonpano.text import listed
+from photonpano.text import listed, pixels
 from photonpano.values import Decision, FrameSpan
 
 _MOST_LISTED = 8  # spans without light that are named one by one
@@ -23,7 +23,7 @@ class Jump:
     @property
     def decision(self) -> Decision:
         """The cut of the motion there, for the record."""
-        jump = f"the image jumps by {self.size_px:.2g} px ({self.sigmas:.0f} standard deviations)"
+        jump = f"the image jumps by {pixels(self.size_px)} px ({self.sigmas:.0f} standard deviations)"
         if self.dark is not None:
             reason = f"{jump} while they show nothing; the interpolation is cut in the middle, at frame {self.frame}"
             return Decision("jump_in_the_dark", str(self.dark), reason)

@@ -282,6 +282,8 @@ def _compared(sums: FluxImage, response: Response, widest_px: float) -> _Agreeme
     if not seen.any():
         return found
     (top, bottom), (left, right) = (np.flatnonzero(seen.any(axis=(axis, 2)))[[0, -1]] for axis in (1, 0))
+    if top == bottom or left == right:  # a single row or column has no gradient across it
+        return found
     part = slice(top, bottom + 1), slice(left, right + 1)
     lit, weight = sums[:, 0][:, *part], np.maximum(sums[:, 1][:, *part], np.float32(1e-6))
     known, noise = seen[part].astype(np.float32), np.float32(0)

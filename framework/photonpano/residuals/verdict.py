@@ -20,7 +20,7 @@ from photonpano.residuals.findings import NOTHING, Findings
 from photonpano.residuals.measure import FEWEST_FRAMES
 from photonpano.residuals.patterns import parts_apart
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
-from photonpano.text import listed
+from photonpano.text import listed, pixels
 from photonpano.values import Verdict
 from photonpano.values.verdict import Found, Test, judged
 
@@ -145,7 +145,7 @@ def _narrow(run: TestedRun) -> Found | None:
     located = run.levels[-1].located
     model = located.solution.model
     apart_px = located.rivals["homography"].apart_px
-    where = f"times the expected error lie between {model.name} and any homographies, which are likelier: {apart_px:.2g} px"
+    where = f"times the expected error lie between {model.name} and any homographies, which are likelier: {pixels(apart_px)} px"
     return Found(times, where)
 
 
@@ -193,7 +193,7 @@ def _uncertain(run: TestedRun) -> Found | None:
     where = f"px on average, most at frame {np.argmax(np.where(motion.located, motion.std_px, 0))}"
     change_px = levels[-1].change_px if levels else None
     if change_px is not None and change_px > _UNCERTAIN_PX:
-        where += f"; the last level changed the motion by {change_px:.2g} px"
+        where += f"; the last level changed the motion by {pixels(change_px)} px"
     return Found(beside_px, where)
 
 
@@ -249,7 +249,7 @@ def _one_direction(run: TestedRun) -> Found | None:
         "the motion may be wrong by any distance along it, which this panorama does not show; keep other structures in view"
     )
     what = "the image says nothing of motion along one direction"
-    return Found(weak, f"{where}; {strong:.2g} px across it", what=what, what_to_do=what_to_do)
+    return Found(weak, f"{where}; {pixels(strong)} px across it", what=what, what_to_do=what_to_do)
 
 
 @FACTS.doubtful_above(

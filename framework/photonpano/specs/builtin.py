@@ -236,7 +236,7 @@ def ask_sources(catalog: Catalog, path: Location) -> tuple[list[tuple[Entry, Rec
 def _near_misses(spec: Spec, keys: Written, path: Location) -> list[tuple[str, str]]:
     """Return the problems that sources have with a capture whose files end as theirs do, with the name of each source.
 
-    Only sources count that accept the keys; if none has a problem, those that need others.
+    Sources that accept the keys come first, then those that need others.
     """
     problems, needing = list[tuple[str, str]](), list[tuple[str, str]]()
     files = [path] if isinstance(path, Url) or path.is_file() else islice(path.rglob("*"), _SEARCHED)
@@ -259,7 +259,7 @@ def _near_misses(spec: Spec, keys: Written, path: Location) -> list[tuple[str, s
             config = None
         if config is not None:
             problems += ((entry.name, each) for each in complaints(Choice(contribution, config, entry.origin)))
-    return problems or needing
+    return problems + needing
 
 
 def known_endings(catalog: Catalog) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ByteSize, Field, field_validator
 
-from photonpano.geometry import right_handed_axes
+from photonpano.geometry import ProjectionName, right_handed_axes
 from photonpano.plugins.contributions import KINDS, Config, SpecPath
 
 _Factor = Annotated[float, Field(gt=0, le=1000)]
@@ -153,10 +153,11 @@ class RenderSettings(Config):
         "image), or a box [x0, y0, x1, y1] in pixels of the reference frame: columns x0 to x1 - 1 and rows y0 to y1 - 1. On a "
         "cylinder or a sphere the box is in degrees: to the right and down from where the reference camera looks",
     )
-    projection: Literal["auto", "planar", "cylindrical", "spherical"] = Field(
+    projection: Literal["auto", ProjectionName] = Field(
         "auto",
         description="on what the panorama is drawn. If the camera only turns, auto takes a plane for up to 90 degrees, then a "
-        "cylinder for up to 45 degrees up and down, then a sphere; otherwise it is a plane",
+        "cylinder for up to 45 degrees up and down, then a sphere; otherwise it is a plane. mercator and stereographic keep "
+        "angles, panini keeps what is upright and what leads ahead straight; both of the latter hold up to 150 degrees aside",
     )
     horizon: Literal["reference", "level"] = Field(
         "reference",

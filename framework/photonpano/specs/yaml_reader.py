@@ -122,6 +122,9 @@ def joined(where: str, key: str | int) -> str:
     return f"{where}.{key}" if where else str(key)
 
 
+_WITH_COMMAS = re.compile(r"\d{1,3}(,\d{3})+(\.\d*)?")
+
+
 def given(data: object) -> str:
     """Describe a value, for the end of a message."""
     match data:
@@ -129,6 +132,8 @@ def given(data: object) -> str:
             return "nothing"
         case bool():
             return "true" if data else "false"
+        case str() if _WITH_COMMAS.fullmatch(data):
+            return f"{data!r}; write numbers without commas"
         case str():
             return repr(data) if len(data) <= 60 else f"{data[:57]!r}..."
         case list():

@@ -101,12 +101,6 @@ def detected(flux: ArrayLike, seed: int | np.random.Generator = 0) -> BoolArray:
     return np.asarray(np.random.default_rng(seed).random(flux.shape, np.float32) < -np.expm1(-flux), np.bool_)
 
 
-def z_scores(counts: ArrayLike, n_frames: int, flux: ArrayLike) -> FloatArray:
-    """Return the deviations of counts of a binary camera from a flux, in standard deviations of photon noise."""
-    chance = -np.expm1(-np.asarray(flux, np.float64))
-    return np.asarray((np.asarray(counts) - n_frames * chance) / np.sqrt(n_frames * chance * (1 - chance)))
-
-
 class MemorySource(Closing):
     """Binary frames held in memory: a `photonpano.Source`."""
 

@@ -23,7 +23,8 @@ class Reason:
     def finding(self) -> str:
         """What was found, and where."""
         where = f" ({self.where})" if self.where else ""
-        return f"{self.what}{where}: {self.figure:.3g}"
+        figure = f"{self.figure:,.0f}" if abs(self.figure) >= 999.5 else f"{self.figure:.3g}"
+        return f"{self.what}{where}: {figure}"
 
     def __str__(self) -> str:
         trusted = f", trusted up to {self.threshold:g}" if self.figure > self.threshold else ""

@@ -42,20 +42,34 @@ class IntensitySource(Closing, ABC):
         self.valid: NDArray[np.bool_] = np.ones(self.info.frame_shape, np.bool_)
         self.valid.flags.writeable = False
         self._table = linear.table
-        self._one_byte = encoding.bits <= 8
+        self._encoding, self._one_byte = encoding, encoding.bits <= 8
 
     @abstractmethod
     def _read(self, span: FrameSpan, levels: Levels) -> None:
         """Fill (n, H, W) with the levels of a span as they are in the file; raises an `InputError` if they cannot be read."""
 
     def refuse_binary(self, path: Path, pictures: str) -> None:
-        """Refuse frames of zeros and ones with an `InputError`; `pictures` is Python code that reads all of them."""
+        """Refuse frames of zeros and ones with an `InputError`; `pictures` is Python code that reads all of them.
+
+        From one frame to the next, levels of black and white jump by as much as their mean allows. A codec with loss halves
+        that at most, unless little is left of the frames; grey levels reach a hundredth.
+        """
         try:
-            values = np.unique([self._levels_of(each) for each in self.info.spread(_LOOKED_AT, 1)])
+            levels = [self._levels_of(each) for each in self.info.spread(_LOOKED_AT, min(2, self.info.n_frames))]
         except InputError:  # a damaged frame is refused when it is read
             return
-        if len(values) == 2 and values.tolist() in _BITS:
+        values = np.unique(levels).tolist()
+        black, white = self._encoding.black, self._encoding.white
+        first, last = (np.clip([each[index] for each in levels], black, white) for index in (0, -1))
+        mean = (first + last) / 2
+        lossy = ((first - last) ** 2).sum() / 4 > ((mean - black) * (white - mean)).sum() / 2
+        if values in _BITS or lossy:
             self.close()
+            if values not in _BITS:
+                raise InputError(
+                    f"{path} seems to hold binary frames that a codec changed: levels jump from dark to bright from one frame "
+                    "to the next, as photons do. Which pixels were lit is lost: record without compression, or with ffv1"
+                )
             saved = f'numpy.save("cube.npy", numpy.packbits(numpy.array({pictures}) > 99, axis=-1))'
             only = f"binary frames, of {values[0]} and {values[1]} only"
             raise InputError(f"{path} holds {only}, which are no grey levels; in Python, save them for packed-npy: {saved}")

@@ -131,7 +131,7 @@ def test_npy_file_grows_to_what_it_promises(tmp_path: Path, name: str, keys: dic
     [
         ("packed-npy", Url("https://example.org/a"), {}, "is a URL, which cannot be followed"),
         ("swissspad-half", Url("https://example.org/a"), {}, "is a URL, which cannot be followed"),
-        ("packed-npy", "a.npy.gz", {}, r"a\.npy\.gz is compressed, so that no frame can be read before all are there"),
+        ("packed-npy", "a.npy.gz", {}, r"a\.npy\.gz is unpacked, so that no frame can be read before all are there"),
         (
             "npy",
             "last.npy",

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from scipy.io import savemat
 
-from photonpano import FrameSpan, Recognised, Source, SourceContext, discover
+from photonpano import FrameSpan, InputError, Recognised, Source, SourceContext, discover
 from photonpano.photometry import BinaryResponse
 
 NAMES = (
@@ -65,6 +66,17 @@ def test_swissspad_arrays_are_distinguished_by_correlation(
         assert set(found) == {name}
         with opened(name, found[name].keys) as source:
             np.testing.assert_array_equal(source.frames(FrameSpan(0, 3)), frames[:3])
+
+
+def test_smooth_scenes_of_swissspad_are_told_by_the_borders_of_zones(tmp_path: Path, bin_file: Callable) -> None:
+    rng = np.random.default_rng(3)
+    scene = cv2.GaussianBlur(rng.standard_normal((512, 512)), (0, 0), 12)
+    lit = (-np.expm1(-0.1 * np.exp(scene / scene.std() / 4))).astype(np.float32)
+    for name, rows in (("swissspad-half", 256), ("swissspad-full", 512)):
+        path = tmp_path / f"{name}.bin"
+        frames = [rng.random((rows, 512), np.float32) < lit[:rows] for _ in range(512 * 256 // rows)]
+        path.write_bytes(bin_file(name, np.array(frames, np.uint8)))
+        assert set(recognised(path)) == {name}
 
 
 @pytest.mark.parametrize("n_frames", [256, 1000])
@@ -126,6 +138,20 @@ def test_unpacked_bits_are_recognised_by_their_values(tmp_path: Path, dtype: Any
     assert set(recognised(tmp_path / "cube.npy.gz")) == {"npy"}
 
 
+def test_arrays_in_files_of_arrays_are_recognised_as_in_a_npy_file(tmp_path: Path, clouds: Callable[..., np.ndarray]) -> None:
+    frames = clouds()
+    savemat(tmp_path / "cube.mat", {"OUTPUT": np.moveaxis(frames, 0, -1).astype(float)})
+    np.savez(tmp_path / "cube.npz", packed=np.packbits(frames, axis=-1, bitorder="little"), times=np.arange(len(frames)))
+    np.savez(tmp_path / "motion.npz", homographies=np.random.default_rng(0).random((40, 3, 3)), located=np.ones(40, np.bool_))
+    assert recognised(tmp_path / "cube.mat")["npy"].keys == {"path": str(tmp_path / "cube.mat"), "holds": "bits"}
+    found = recognised(tmp_path / "cube.npz")
+    assert found["packed-npy"].keys == {"path": str(tmp_path / "cube.npz"), "bit_order": "little"}
+    assert recognised(tmp_path / "motion.npz") == {}
+    for path, name in (("cube.mat", "npy"), ("cube.npz", "packed-npy")):
+        with opened(name, recognised(tmp_path / path)[name].keys) as source:
+            np.testing.assert_array_equal(source.frames(FrameSpan(3, 5)), frames[3:5])
+
+
 @pytest.mark.parametrize(
     ("axis", "bit_order", "keys"),
     [
@@ -173,6 +199,36 @@ def test_visionsim_is_recognised_by_transforms_json(tmp_path: Path) -> None:
         with opened("visionsim", found["visionsim"].keys) as source:
             np.testing.assert_array_equal(source.frames(source.info.span), FRAMES)
     assert recognised(tmp_path / "other.npy") == {}
+
+
+def test_zarr_arrays_are_recognised_packed_or_not(tmp_path: Path, clouds: Callable[..., np.ndarray]) -> None:
+    zarr = pytest.importorskip("zarr", reason="the arrays are written by zarr itself")
+    frames = clouds()
+    sums = frames.reshape(-1, 8, *frames.shape[1:]).sum(axis=1).astype(np.uint8)
+    arrays = {"packed": np.packbits(frames, axis=-1), "bits": frames, "bool": frames.astype(bool), "sums": sums}
+    for name, array in arrays.items():
+        zarr.create_array(tmp_path / f"{name}.zarr", data=array)
+    keys = {name: dict(found["zarr"].keys) for name in arrays if (found := recognised(tmp_path / f"{name}.zarr"))}
+    paths = {name: {"path": str(tmp_path / f"{name}.zarr")} for name in arrays}
+    holds = {"holds": "bits"}
+    assert keys == {"packed": paths["packed"], "bits": paths["bits"] | holds, "bool": paths["bool"] | holds}
+    for name in keys:
+        with opened("zarr", keys[name]) as source:
+            np.testing.assert_array_equal(source.frames(FrameSpan(3, 5)), frames[3:5])
+
+
+def test_parts_of_matlab_with_frames_first_are_read_only_if_that_is_written(
+    tmp_path: Path, clouds: Callable[..., np.ndarray]
+) -> None:
+    frames = clouds()
+    for number, part in enumerate(np.array_split(frames, 3), start=1):
+        savemat(tmp_path / f"part_{number}.mat", {"OUTPUT": part})
+    with pytest.raises(
+        InputError, match=r"part_1.mat has its frames along the first axis of \(128, 64, 96\), .* frame_axis: first"
+    ):
+        opened("mat-parts", {"path": tmp_path})
+    with opened("mat-parts", {"path": tmp_path, "frame_axis": "first"}) as source:
+        np.testing.assert_array_equal(source.frames(source.info.span), frames)
 
 
 def test_mat_parts_and_ubicept_are_recognised_by_name(tmp_path: Path) -> None:

@@ -158,6 +158,18 @@ def test_gaps_between_frames_are_a_warning(film: Callable[..., Path], caplog: py
     assert not caplog.text
 
 
+@pytest.mark.parametrize("codec", ["mpeg4", "mjpeg"])
+def test_binary_frames_are_no_grey_levels_after_a_codec_with_loss_either(
+    codec: str, write_video: Callable[..., Path], moving: Callable[..., np.ndarray]
+) -> None:
+    pixels = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    bits = (np.random.default_rng(0).random((12, 48, 64)) < 0.4).astype(np.uint8) * 255
+    with pytest.raises(InputError, match="seems to hold binary frames that a codec changed"):
+        VideoSource(VideoConfig(path=write_video(bits, "bits.avi", codec, pixels)), SourceContext())
+    noisy = moving(12) // 2 + np.random.default_rng(0).integers(0, 128, moving(12).shape, np.uint8)
+    VideoSource(VideoConfig(path=write_video(noisy, "grey.avi", codec, pixels)), SourceContext()).close()
+
+
 def test_binary_frames_are_no_grey_levels(tmp_path: Path) -> None:
     """The line of the message saves them."""
     frames = np.random.default_rng(0).random((12, 16, 24)) < 0.5

@@ -10,7 +10,6 @@ import pytest
 
 from photonpano import FrameSpan
 from photonpano.geometry import corners, transform_points
-from photonpano.testing.captures import z_scores
 from photonpano_simulator.camera import DrawnObject, SpadSensor, undistorted
 from photonpano_simulator.config import FrameObject, Lens, Sensor, SimulatorConfig
 
@@ -23,6 +22,12 @@ if TYPE_CHECKING:
 
 STILL: dict[str, Any] = {"path": {"kind": "pan", "length_px": 1e-6}, "n_frames": 2000}
 SHAPE, WIDE = (40, 52), (40, 60)
+
+
+def z_scores(counts: np.ndarray, n_frames: int, flux: Any) -> np.ndarray:
+    """Return the deviations of counts of a binary camera from a flux, in standard deviations of photon noise."""
+    chance = -np.expm1(-np.asarray(flux, np.float64))
+    return (counts - n_frames * chance) / np.sqrt(n_frames * chance * (1 - chance))
 
 
 def deviations(source: SimulatorSource, flux: np.ndarray) -> np.ndarray:

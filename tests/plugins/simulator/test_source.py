@@ -13,13 +13,18 @@ from pydantic import ValidationError
 
 from photonpano import FrameSpan, InputError, SourceContext
 from photonpano.capture.writing import write_packed
-from photonpano.testing.captures import z_scores
 from photonpano_simulator.camera import Draw, IntensityCamera, SpadSensor, generator
 from photonpano_simulator.config import CameraSimulatorConfig, IntensitySensor, Sensor, SimulatorConfig
 from photonpano_simulator.hooks import photonpano_sources
 from photonpano_simulator.source import SimulatorSource
 
 SIMULATOR, CAMERA, _ = photonpano_sources()
+
+
+def z_scores(counts: np.ndarray, n_frames: int, flux: Any) -> np.ndarray:
+    """Return the deviations of counts of a binary camera from a flux, in standard deviations of photon noise."""
+    chance = -np.expm1(-np.asarray(flux, np.float64))
+    return (counts - n_frames * chance) / np.sqrt(n_frames * chance * (1 - chance))
 
 
 def problems(**settings: Any) -> list[str]:

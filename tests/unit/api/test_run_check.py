@@ -220,6 +220,12 @@ def test_panorama_is_moved_onto_the_common_canvas_with_one_white() -> None:
     assert (darker < moved)[moved > 20].all()
 
 
+def test_pictures_larger_than_opencv_warps_are_compared_too() -> None:
+    wide = np.tile(np.repeat(np.array([50, 200], np.uint8), 400), (20, 50))
+    moved = on_canvas(wide, Canvas(*wide.shape, np.eye(3)), np.eye(3), Canvas(20, 2000, np.eye(3)), None)
+    assert moved[10, [200, 600, 1000, 1400, 1800]].tolist() == [50, 200, 50, 200, 50]
+
+
 @pytest.mark.parametrize("foreign", [{"a": np.zeros(3)}, {"homographies": np.eye(3)[None], "frame_shape": np.array([2, 2])}])
 def test_foreign_truth_beside_the_capture_does_not_end_a_comparison(
     small_run: RunResult, small_capture: Path, foreign: dict[str, np.ndarray], tmp_path: Path

@@ -125,7 +125,8 @@ def test_error_says_that_a_mask_leaves_few_pixels() -> None:
 
 
 def test_error_names_what_stands_still() -> None:
-    capture = replace(capture_of(MemorySource(np.zeros((64, *SHAPE), bool))), still=Still(0.38))
+    frames = np.random.default_rng(0).random((64, *SHAPE)) < 0.4
+    capture = replace(capture_of(MemorySource(frames)), still=Still(0.38))
     with pytest.raises(LocationError) as raised, naming_obstacles(capture):
         raise LocationError("none of the pairs could be located")
     assert str(raised.value).splitlines() == [

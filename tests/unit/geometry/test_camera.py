@@ -16,6 +16,7 @@ from photonpano.geometry import (
     level_horizon,
     likely_rotations,
     nearest_rotations,
+    outline_of,
     rotation_matrices,
     rotation_vectors,
     transform_points,
@@ -116,6 +117,14 @@ def test_projections_follow_their_definition() -> None:
     assert np.allclose(PROJECTIONS["cylindrical"].points(ray), [np.arctan2(x, z), y / np.hypot(x, z)])
     assert np.allclose(PROJECTIONS["spherical"].points(ray), [np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))])
     assert np.isnan(PROJECTIONS["planar"].points(ray)).all()
+    across, up = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))
+    mercator = [across, np.log(np.tan(np.pi / 4 + up / 2))]
+    assert np.allclose(PROJECTIONS["mercator"].points(ray), mercator)
+    panini = [2 * np.tan(across / 2), 2 * np.tan(up) / (1 + np.cos(across))]
+    assert np.allclose(PROJECTIONS["panini"].points(ray), panini)
+    away, about = np.arccos(z / np.linalg.norm(ray)), np.arctan2(y, x)
+    stereographic = 2 * np.tan(away / 2) * np.array([np.cos(about), np.sin(about)])
+    assert np.allclose(PROJECTIONS["stereographic"].points(ray), stereographic)
 
 
 def test_canvas_of_full_turn_spans_exactly_one_turn() -> None:
@@ -137,12 +146,23 @@ def test_frame_with_a_pole_inside_covers_it(pitch: float) -> None:
     assert pole[1] == pytest.approx(-0.5 if pitch > 0 else canvas.height - 0.5)
 
 
-def test_rays_of_pixels_map_back_to_them() -> None:
-    canvas = canvas_around(covered_by(turned(np.arange(0.0, 90, 5)), CAMERA, SHAPE), CAMERA, 1.5, "spherical")
-    (p, s), (q, r) = canvas.columns(), canvas.rows()
-    rays = np.stack([p * r[:, None], np.repeat(q[:, None], len(p), axis=1), s * r[:, None]], axis=-1)
+@pytest.mark.parametrize("name", sorted({*PROJECTIONS} - {"planar"}))
+def test_rays_of_pixels_map_back_to_them(name: str) -> None:
+    canvas = canvas_around(covered_by(turned(np.arange(0.0, 90, 5)), CAMERA, SHAPE), CAMERA, 1.5, name)
+    (p, s), (q, r, t) = canvas.columns(), canvas.rows()
+    rays = np.stack([p * r[:, None], np.repeat(q[:, None], len(p), axis=1), s * r[:, None] + t[:, None]], axis=-1)
     y, x = np.mgrid[: canvas.height, : canvas.width]
     assert np.allclose(canvas.pixels(rays), np.stack([x, y], axis=-1), atol=1e-8)
+
+
+@pytest.mark.parametrize("name", sorted({*PROJECTIONS} - {"planar"}))
+def test_canvas_holds_all_that_frames_cover_and_little_more(name: str) -> None:
+    rotations = turned(np.arange(-60.0, 61, 5), 10)
+    canvas = canvas_around(covered_by(rotations, CAMERA, SHAPE), CAMERA, 1.0, name)
+    places = canvas.pixels(CAMERA.directions(outline_of(SHAPE)) @ np.swapaxes(rotations, -1, -2)).reshape(-1, 2)
+    assert places.min() > -1.0
+    assert (places.max(axis=0) < [canvas.width, canvas.height]).all()
+    assert places[:, 0].max() - places[:, 0].min() > 0.95 * canvas.width - 3
 
 
 def test_level_horizon_of_tilted_reference_frame() -> None:

@@ -88,6 +88,18 @@ def test_dynamic_range_is_that_of_flux_above_its_noise(colours: int) -> None:
     assert found.measurable_decibels == pytest.approx(99.9, abs=0.1)
 
 
+@pytest.mark.parametrize("light", [1.0, 0.3, 0.1, 0.03])
+def test_range_does_not_grow_as_the_light_falls(light: float) -> None:
+    """The scene has 20 dB. The lowest of many noisy pixels would add to that."""
+    flux, n_frames = light * np.repeat([0.05, 0.5], 20_000).reshape(200, 200), 1000
+    counts = np.random.default_rng(0).binomial(n_frames, -np.expm1(-flux)).astype(np.float32)
+    measured, weight = -np.log1p(-counts / n_frames), np.full(counts.shape, n_frames, np.float32)
+    found = DynamicRange(noise=CanvasNoise(response=BinaryResponse()))
+    found.add(measured, weight, found.noise.std(measured, weight))
+    assert found.decibels is not None
+    assert found.decibels < 28
+
+
 def test_noise_of_weighted_pixels_is_that_of_their_counts(pan: Callable) -> None:
     """The weight of a frame of weight w is w, but its photons say as much as before."""
     rates, weights = np.full((8, 12), 0.2), np.linspace(0.3, 1, 96).reshape(8, 12).astype(np.float32)

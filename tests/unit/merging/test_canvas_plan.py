@@ -59,10 +59,15 @@ def test_box_in_degrees_is_that_part_of_the_panorama() -> None:
         # The camera looks up, so that its frames pass over what is above the reference camera.
         (
             *(360, "cylindrical", "panorama", 40),
-            "the frames reach 90 degrees up or down, and a cylinder holds up to 80; write render.projection: spherical",
+            "the frames reach 90 degrees up or down, and a cylindrical panorama holds up to 80; write render.projection: "
+            "spherical",
+        ),
+        (
+            *(250, "panini", "panorama", 0),
+            "the frames reach 156 degrees aside, and a panini panorama holds up to 150; write render.projection: spherical",
         ),
     ],
-    ids=["plane", "outside", "no box", "pole"],
+    ids=["plane", "outside", "no box", "pole", "far aside"],
 )
 def test_view_that_cannot_be_shown_is_refused(
     degrees: float, projection: str, extent: Extent, pitch: float, message: str

@@ -49,8 +49,8 @@ def chunks(turns: FloatArray, camera: Camera) -> list[Chunk]:
 
 
 def true_on(canvas: Canvas) -> FluxImage:
-    (p, s), (q, r) = canvas.columns(), canvas.rows()
-    rays = np.stack([np.outer(r, p), np.repeat(q[:, None], len(p), axis=1), np.outer(r, s)], axis=-1)
+    (p, s), (q, r, t) = canvas.columns(), canvas.rows()
+    rays = np.stack([np.outer(r, p), np.repeat(q[:, None], len(p), axis=1), np.outer(r, s) + t[:, None]], axis=-1)
     return brightness(rays @ np.linalg.inv(canvas.plane_to_rays @ CAMERA.matrix).T)
 
 
@@ -76,7 +76,7 @@ def alike(turns: FloatArray, valid: np.ndarray | None = None) -> MemorySource:
     return MemorySource(np.full((len(turns), *SHAPE), 7, np.uint8), valid)
 
 
-@pytest.mark.parametrize("projection", ["cylindrical", "spherical"])
+@pytest.mark.parametrize("projection", ["cylindrical", "spherical", "mercator"])
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 def test_full_turn_shows_the_scene_without_a_seam(projection: str, camera: Camera) -> None:
     turns = rotations()
@@ -86,6 +86,18 @@ def test_full_turn_shows_the_scene_without_a_seam(projection: str, camera: Camer
     assert seen[len(seen) // 2].all(), "no hole at the seam"
     assert_shows_the_scene(mean, canvas, seen)
     assert seen[:, [0, -1]].mean() > 0.7
+
+
+@pytest.mark.parametrize("projection", ["panini", "stereographic"])
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_wide_views_show_the_scene(projection: str, camera: Camera) -> None:
+    turns = rotations(np.arange(-70.0, 71, 5))
+    turns = np.linalg.inv(turns[14]) @ turns
+    canvas = around(turns, camera, projection)
+    mean, weight = mean_on(canvas, seen_through(capture(turns, camera), camera), turns)
+    seen = weight > 0.5
+    assert seen[len(seen) // 2, 5:-5].all()
+    assert_shows_the_scene(mean, canvas, seen)
 
 
 def test_lens_on_a_plane_straightens_frames() -> None:

@@ -1,5 +1,6 @@
 """A gyroscope: its file, the rotations by its rates, and the pairs that these tie, with their expected error."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +116,22 @@ def test_a_graph_of_the_gyroscope_alone_drifts_by_its_expected_error() -> None:
     of_pair = edges[0].motion.evidence["std_px"]
     # From the mean of 20 places of a walk, its ends are sqrt(20 / 3) steps away.
     assert std_px[[0, -1]] == pytest.approx(of_pair * np.sqrt(20 / 3), rel=0.3)
+
+
+def test_an_axis_that_turns_the_other_way_is_named() -> None:
+    """Alone, it differs by less than what is refused."""
+    times_s, model = np.arange(0, 1.001, 0.001)[:, None], MotionModel(kind="rotation", focal_px=FOCAL_PX)
+    turning = np.hstack([0.1 + 0 * times_s, 0.6 + 0 * times_s, 0.05 * np.sin(9 * times_s)])
+    seen = [replace(edge, locator="direct") for edge in gyroscope_of(turning, np.deg2rad(0.01)).edges(GROUPS)]
+    for sign in (1, -1):
+        other = gyroscope_of(turning * [1, 1, sign], np.deg2rad(0.5), np.deg2rad(1))
+        edges = (*seen, *other.edges(GROUPS))
+        located = solve(GROUPS, seen, 0, frame_shape=SHAPE, start=None, model=model)
+        if sign > 0:
+            other.agreement(edges, located, 0.05)
+        else:
+            with pytest.raises(InputError, match=r"about the axis z of the camera, pairs of exposures turn 1 times as far"):
+                other.agreement(edges, located, 0.05)
 
 
 def test_rates_that_contradict_the_images_are_refused() -> None:

@@ -20,6 +20,7 @@ from photonpano import (
     StreamInfo,
 )
 from photonpano.contracts.attribution import label_of
+from photonpano.execution.context import Quiet
 from photonpano.photometry import BinaryResponse
 from photonpano.pipeline.components import build_levels, build_source, scale_of
 from photonpano.pipeline.forecast import TRIAL_GROUPS, forecast
@@ -131,7 +132,7 @@ def test_auto_scale_halves_the_first_two_levels_if_a_later_one_refines_them(
 def test_forecast_predicts_time_memory_and_canvas(small_spec: dict[str, Any]) -> None:
     plan = parse_spec(small_spec | {"resample": {"with": {"group_size": 20}}, "levels": 2})
     with build_source(plan) as source:
-        found = forecast(plan, source)
+        found = forecast(plan, source, Quiet())
         n_frames = source.info.n_frames
     assert len(found.tried) == 20 * TRIAL_GROUPS < n_frames
     assert abs(found.tried.centre - (n_frames - 1) / 2) <= 1

@@ -123,7 +123,8 @@ def test_run_folder_holds_the_written_files(tmp_path: Path) -> None:
     assert set(files_in(directory)) == FILES
     np.testing.assert_array_equal(tifffile.imread(directory / "panorama.tiff"), FLUX)
     np.testing.assert_array_equal(tifffile.imread(directory / "coverage.tiff"), PANORAMA.weight)
-    np.testing.assert_array_equal(cv2.imread(str(directory / "panorama.png"), cv2.IMREAD_UNCHANGED), PICTURE)
+    shown = np.where(np.isnan(FLUX), 0, np.maximum(PICTURE, 1))
+    np.testing.assert_array_equal(cv2.imread(str(directory / "panorama.png"), cv2.IMREAD_UNCHANGED), shown)
     with np.load(directory / "trajectory.npz") as archive:
         names = "homographies canvas projection horizon frame_shape reference located std_px"
         assert set(archive.files) == set(names.split())

@@ -98,7 +98,7 @@ def test_what_cannot_be_read_is_refused_with_the_way_out(server: Any, cube: Path
     assert problem(f"{address}/cube.npy").startswith(f"{address}/cube.npy is cut short: its header (3000, 64, 32) promises")
     cube.write_bytes(gzip.compress(b"something"))
     assert problem(f"{address}/cube.npy") == (
-        f"{address}/cube.npy is compressed with gzip, and cannot be read in parts; unpack it there, or download it"
+        f"{address}/cube.npy is not a .npy file: it is compressed with gzip; unpack it with gunzip"
     )
     cube.write_bytes(b"something else")
     assert problem(f"{address}/cube.npy").startswith(f"{address}/cube.npy is not a .npy file, by its first bytes")

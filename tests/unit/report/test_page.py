@@ -12,6 +12,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from photonpano import FrameSpan, Group, NotLocated
+from photonpano.errors import LocationError
 from photonpano.motion.diagnosis import UntiedError
 from photonpano.report import figures, render_failure, render_report
 from photonpano.values import Edge
@@ -156,6 +157,12 @@ def untied(merged=None, reason="too dark"):
         "level 2: 2 of 8 pairs could not be located\n  frames 300 to 399 onto frames 200 to 299: too dark\nTry larger groups."
     )
     return UntiedError(message, 2, groups, edges, np.array([0, 0, 0, 1, 1, 2]), 0.1, merged)
+
+
+def test_page_of_a_failed_part_says_where_its_frames_begin(failed):
+    assert "Frames count from" not in text_of(render_failure(failed, LocationError("too dark")))
+    failed["spec"]["source"]["with"]["frames"] = [400, 600]
+    assert "Frames count from frame 400 of the capture." in text_of(render_failure(failed, LocationError("too dark")))
 
 
 def test_page_of_failed_run_shows_exposures_that_did_not_match(failed, record, exposure_of):

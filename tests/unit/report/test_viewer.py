@@ -89,3 +89,15 @@ def test_pictures_of_frames_have_all_photons():
     assert {each["hidden"] for each in found} == {0.5}
     seen = decoded_picture(found[20]["uri"])
     assert seen[:, :100].mean() == pytest.approx(seen[:, 140:].mean(), rel=0.05)
+
+
+def test_panoramas_wider_than_opencv_takes_show_what_a_frame_sees(motion, panorama):
+    capture, dark = capture_of_a_person(0), replace(panorama, white_flux=5000.0)
+    wide = replace(panorama.thumbnail, flux=np.pad(panorama.thumbnail.flux, ((0, 0), (0, 33_000)), constant_values=np.nan))
+    canvas = replace(panorama.canvas, width=panorama.canvas.width + 33_000)
+    shown = [
+        viewer.views_of_instant(30, motion, each, capture.source, capture.levels)[-1]["uri"]
+        for each in (dark, replace(dark, thumbnail=wide, canvas=canvas))
+    ]
+    assert shown[0] == shown[1]
+    assert decoded_picture(shown[0]).std() > 10

@@ -11,7 +11,8 @@ from photonpano import FrameSpan
 from photonpano.execution.context import Context
 from photonpano.geometry import FrameTrajectory, canvas_of, translation
 from photonpano.motion.frame_motion import FrameMotion
-from photonpano.residuals.halves import Halves, halves_of
+from photonpano.photometry import BinaryResponse
+from photonpano.residuals.halves import Halves, _compared, halves_of
 from photonpano.testing.captures import detected, seen_along, textured
 
 SHAPE, N_FRAMES = (64, 96), 400
@@ -86,6 +87,12 @@ def test_bare_edges_tie_nothing_along_them(halves: Callable, scene: np.ndarray, 
     assert strong < 0.1
     assert weak > 5
     assert min(abs(found.angles_deg[middle] - angle), abs(found.angles_deg[middle] - angle - 180)) < 3
+
+
+@pytest.mark.parametrize("shape", [(1, 40), (40, 1)])
+def test_a_single_row_or_column_ties_nothing(shape: tuple[int, int]) -> None:
+    sums = np.ones((4, 2, *shape, 1), np.float32) * np.float32(10)
+    assert _compared(sums, BinaryResponse(), 7.0).std_px == (7.0, 7.0)
 
 
 def test_stretch_that_sees_a_bare_edge_is_tied_to_nothing_where_the_path_returns(halves: Callable, scene: np.ndarray) -> None:

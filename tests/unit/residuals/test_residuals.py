@@ -134,7 +134,7 @@ def turning(distortion: tuple[float, ...], projection: str) -> tuple[FloatArray,
     canvas = plan_canvas(trajectory, span, TURNED, 1.0, 2**30, view=view)
     panorama = render(source, trajectory, span, canvas, 0.25, Context())
     residuals = measure(span, Predictions.of(source, panorama, canvas, trajectory, TURNED), Context())
-    (p, s), (q, r) = canvas.columns(), canvas.rows()
+    (p, s), (q, r, _) = canvas.columns(), canvas.rows()
     rays = np.stack([np.outer(r, p), np.repeat(q[:, None], len(p), axis=1), np.outer(r, s)], axis=-1)
     seen = panorama.weight > 40
     return residuals.reduced_chi2, panorama.flux[seen] / flux_of(rays)[seen]

@@ -1,4 +1,4 @@
-"""Show the progress of a command, bars on a terminal and a line every ten seconds elsewhere, and what its stages take."""
+"""Show the progress of a command, bars on a terminal and a line every ten seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ import os
 import sys
 import threading
 import time
-from collections import Counter, defaultdict
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
-from photonpano.api.cli.verbosity import STARTED_S, is_logged, is_quiet, is_verbose, log_shown, logger
+from photonpano.api.cli.verbosity import is_logged, is_quiet, is_verbose, log_shown
 from photonpano.execution.context import Progress, Quiet
-from photonpano.text import columns, count, duration, share
+from photonpano.text import count, duration
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -25,7 +24,6 @@ INTERVAL_S = 10.0  # time between two lines of progress
 _LEAST_S = 1.0  # minimum age of a stage that is printed
 _TOLD_FROM = 0.05  # share of a stage that is done before the time left is told
 _IN_NOTEBOOK = "JPY_PARENT_PID"  # set in notebooks, whose terminal prints control characters
-OTHER, WHOLE = "other", "whole"
 
 
 def progress_for_stderr(*, notes: bool = False) -> Progress:
@@ -57,7 +55,14 @@ class Bars:
         """Draw the bar of a stage of `total` units."""
         with _bar(self._console, unit) as bar:
             task = bar.add_task(title, total=total)
-            yield lambda done: bar.advance(task, done)
+
+            def advance(done: int) -> None:
+                bar.advance(task, done)
+                if bar.finished:  # what is left to do with the units has no bar
+                    bar.update(task, description=f"{title}, to be finished")
+
+            yield advance
+            bar.update(task, description=title)
 
     def note(self, message: str) -> None:
         """Print a line."""
@@ -100,18 +105,17 @@ class Lines:
 
 
 class Logged:
-    """Writes stages and notes to the log, and shows them; adds up what the stages take."""
+    """Writes stages and notes to the log, and shows them."""
 
     def __init__(self, shown: Progress) -> None:
         self._shown = shown
-        self._times = StageTimes()
 
     @contextmanager
     def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
         """Write when the stage begins, and when it is done."""
         state = _Stage(title, total, unit)
         log_shown(logging.INFO, f"{title}: begins")
-        with self._times(title), self._shown.stage(title, total, unit) as advance:
+        with self._shown.stage(title, total, unit) as advance:
             yield advance
         log_shown(logging.INFO, state.finished())
 
@@ -119,11 +123,6 @@ class Logged:
         """Write a line."""
         log_shown(logging.INFO, message)
         self._shown.note(message)
-
-    def log_times(self) -> None:
-        """Log a table of what the stages took so far."""
-        for line in self._times.table().splitlines():
-            logger.info("%s", line)
 
 
 class _Stage:
@@ -143,6 +142,7 @@ class _Stage:
         # The first units take longer than the others: loops are compiled.
         is_known = _TOLD_FROM * self._total <= done < self._total
         left = f", about {duration(seconds * (self._total - done) / done)} left" if is_known else ""
+        left = ", to be finished" if done >= self._total else left
         return f"{self._title}: {count(done)} of {count(self._total)} {self._unit} after {duration(seconds)}{left}"
 
     def finished(self) -> str:
@@ -174,32 +174,3 @@ def _bar(console: Console, unit: str) -> RichProgress:
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         console=console,
     )
-
-
-class StageTimes:
-    """Adds up the seconds of stages by their titles."""
-
-    def __init__(self) -> None:
-        self._seconds: defaultdict[str, float] = defaultdict(float)
-        self._times: Counter[str] = Counter()
-
-    @contextmanager
-    def __call__(self, title: str) -> Iterator[None]:
-        """Add the time of the block to a stage."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._seconds[title] += time.perf_counter() - start
-            self._times[title] += 1
-
-    def table(self) -> str:
-        """Return a table of the stages; empty for a single one, whose line says all."""
-        if len(self._times) < 2:
-            return ""
-        whole = time.perf_counter() - STARTED_S
-        rows = [["stage", "seconds", "share"]]
-        for title, seconds in {**self._seconds, OTHER: whole - sum(self._seconds.values()), WHOLE: whole}.items():
-            times = f" ({count(self._times[title])} times)" if self._times[title] > 1 else ""
-            rows.append([f"{title}{times}", f"{seconds:7.2f}", f"{share(seconds / whole):>5}"])
-        return columns(rows)

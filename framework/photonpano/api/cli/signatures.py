@@ -146,14 +146,10 @@ def _callback(declared: Command) -> Callable[..., None]:
     printing = [name for name, each in inspect.signature(declared.prints).parameters.items() if each.kind is each.KEYWORD_ONLY]
 
     def callback(**given: Any) -> None:
-        from photonpano.api.cli.progress import Logged
-
         with _arguments(declared, given) as arguments:
             result = (declared.calls or declared.function)(**arguments)
         for line in declared.prints(result, **{name: given[name] for name in printing}):
             typer.echo(line)
-        if isinstance(progress := arguments.get("progress"), Logged):
-            progress.log_times()
 
     parameters = [
         *(_parameter(name, *how) for name, how in PLANS[declared.plan].items()),

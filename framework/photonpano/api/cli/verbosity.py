@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +16,6 @@ import typer
 
 from photonpano import __version__
 
-STARTED_S = time.perf_counter()  # when the program began: this module is among the first that are imported
 logger = logging.getLogger("photonpano")
 SHOWN = f"{__name__}.shown"  # logger of messages that are on the screen already, for the log file alone
 _VERBOSE, _QUIET, _LOG = "verbose", "quiet", "log"

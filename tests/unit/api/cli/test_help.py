@@ -104,24 +104,14 @@ def nothing_stays() -> Any:
     assert (logger.handlers, logger.level) == ([], logging.NOTSET)
 
 
-TIMES = re.compile(r"^(.*?) +([\d.]+) +.*%$")  # a row: title, seconds
-
-
 def test_verbose_prints_decisions_of_run(folder: Path, invoke: Callable[..., Any], finished: Path) -> None:
     text = (finished / "run.yaml").read_text().replace("cube.npy", str(finished / "cube.npy"))
     (folder / "run.yaml").write_text(text.replace("{with: {group_size: 50}}", "{with: {group_size: auto}}"))
     result = invoke("run", "run.yaml", "-v", "--log", "run.log")
     assert re.search(r"^group_size \d+: at ", result.stderr, re.MULTILINE)
     assert re.search(r"^took [\d.]+ m?s", result.stderr, re.MULTILINE)
-    header, *rows = result.stderr.partition("\nstage ")[2].splitlines()
-    assert header.split("  ")[-1] == "share"
-    found = [TIMES.findall(row)[0] for row in rows]
-    times = {title.split(" (")[0]: float(seconds) for title, seconds in found}
-    assert next(iter(times)) == "level 1: merge and locate"
-    assert list(times)[-2:] == ["other", "whole"]
-    assert {"panorama", "residuals"} <= set(times)
-    *parts, whole = times.values()
-    assert sum(parts) == pytest.approx(whole, abs=0.01 * len(parts)), "parts do not add up to the whole"
+    for stage in ("level 1: merge and locate", "panorama", "residuals", "halves"):
+        assert re.search(rf"^{stage}: [\d,]+ \w+ in [\d.]+ m?s$", result.stderr, re.MULTILINE), stage
     log = (folder / "run.log").read_text()
     assert all(line in log for line in result.stderr.splitlines() if not re.search(r" in [\d.]+ m?s$", line))
 

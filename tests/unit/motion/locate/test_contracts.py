@@ -79,8 +79,8 @@ def informed(along_px: float, across_px: float) -> Located:
     [
         (informed(0.1, 100.0), None),
         (informed(0.1, 590.0), None),
-        (informed(0.1, 1e4), "1e+04"),
-        (Located(translation(3, 1), residual_px=5e6), "5e+06"),
+        (informed(0.1, 1e4), "10,000"),
+        (Located(translation(3, 1), residual_px=5e6), "5,000,000"),
         (Located(translation(3, 1)), None),
     ],
     ids=["100 px", "590 px", "10,000 px", "residual", "nothing known"],
@@ -101,8 +101,8 @@ def test_pair_that_stripes_leave_undetermined_is_not_located(run: Callable, make
         run(make_level(answer=along_stripes))
     assert str(caught.value).startswith(
         "level 1: none of the 30 pairs of exposures could be located\n"
-        "  frames 10 to 19 onto frames 0 to 9: the images do not determine the motion: its expected error is 1e+07 px at a "
-        "corner\n"
+        "  frames 10 to 19 onto frames 0 to 9: the images do not determine the motion: its expected error is 10,000,000 px "
+        "at a corner\n"
     )
 
 
