@@ -54,6 +54,7 @@ def viewer_data(
     background = capture_of(source).background
     return {
         "size": [panorama.canvas.width, panorama.canvas.height],
+        "angles": angles_of(panorama.canvas),
         "linear": linear_data(balanced(panorama.thumbnail.flux, balance), white),
         "picture": None if (render.get("tone") or "srgb") == "srgb" else jpeg_uri(shrunk(panorama.picture, VIEW_PIXELS)),
         "maps": [*panorama_maps(panorama), *_chi2_map(explained, panorama.canvas)],
@@ -64,6 +65,15 @@ def viewer_data(
         "instant": instant,
         "views": views_of_instant(instant, motion, panorama, with_background(source, None), levels),
     }
+
+
+def angles_of(canvas: Canvas) -> dict[str, Any] | None:
+    """Return the borders of a canvas on a sphere, or of a full turn, as coordinates of its projection, or None."""
+    if canvas.projection != "spherical" and not canvas.is_full_turn:
+        return None
+    borders = (_corners(canvas.shape)[::2] - canvas.transform[:2, 2]) / np.diag(canvas.transform)[:2]
+    across, down = borders.T.tolist()
+    return {"projection": canvas.projection, "across": across, "down": down}
 
 
 def linear_data(flux: FluxImage, white: float) -> dict[str, Any]:

@@ -1,4 +1,6 @@
 import base64
+import json
+import re
 import zlib
 from dataclasses import replace
 from types import SimpleNamespace
@@ -10,7 +12,10 @@ import pytest
 
 from photonpano import Group, VirtualExposure
 from photonpano.capture import with_background
-from photonpano.report import OpenCapture, viewer
+from photonpano.geometry import Canvas, canvas_around, translation
+from photonpano.geometry.camera import Camera
+from photonpano.geometry.canvas import PROJECTIONS, Covered
+from photonpano.report import OpenCapture, render_report, viewer
 from photonpano.testing import MemorySource
 from photonpano.values import CELL_PX, Background
 
@@ -101,3 +106,39 @@ def test_panoramas_wider_than_opencv_takes_show_what_a_frame_sees(motion, panora
     ]
     assert shown[0] == shown[1]
     assert decoded_picture(shown[0]).std() > 10
+
+
+TURN, SECTOR = (-np.pi, np.pi), (0.4, 1.1)
+
+
+@pytest.mark.parametrize(("projection", "across"), [("spherical", TURN), ("spherical", SECTOR), ("mercator", TURN)])
+def test_angles_are_those_of_the_directions_of_pixels(projection, across):
+    camera = Camera(np.array([[90.0, 0, 80], [0, 90, 60], [0, 0, 1]]))
+    canvas = canvas_around(Covered(across, (-0.6, 0.3)), camera, 1.0, projection)
+    found = viewer.angles_of(canvas)
+    assert found is not None
+    assert found["projection"] == projection
+    places = np.array([[0.0, 0.0], [canvas.width - 1.0, 3.0], [17.0, canvas.height - 1.0]])
+    shares = (places + 0.5) / [canvas.width, canvas.height]
+    low, high = np.transpose([found["across"], found["down"]])
+    directions = canvas.on_plane(places) @ canvas.plane_to_rays.T
+    np.testing.assert_allclose(low + shares * (high - low), PROJECTIONS[projection].points(directions), atol=1e-9)
+
+
+def test_page_looks_around_on_a_sphere_only(record, explained, panorama):
+    height, width = panorama.canvas.shape
+    matrix = np.array([[300.0, 0, 247.5], [0, 300, 126.5], [0, 0, 1]])
+    transform = translation((width - 1) / 2, (height - 1) / 2) @ np.diag([300.0, 300, 1])
+    around = Canvas(height, width, transform, "spherical", matrix)
+    capture = capture_of_a_person(0)
+    pages = [
+        render_report(record, explained, replace(panorama, canvas=canvas), capture=capture)
+        for canvas in (panorama.canvas, around, replace(around, projection="cylindrical"))
+    ]
+    assert ["function sphereViewer" in page for page in pages] == [False, True, False]
+    assert ['"angles": null' in page for page in pages] == [True, False, True]
+    data = json.loads(re.findall(r'id="viewer-data">(.*?)</script>', pages[1], re.DOTALL)[0])
+    side = width / 600
+    assert data["angles"]["across"] == pytest.approx([-side, side])
+    assert data["angles"]["down"] == pytest.approx([-height / 600, height / 600])
+    assert pages[1].count("data:image/") <= pages[0].count("data:image/")  # it shows the picture that is there

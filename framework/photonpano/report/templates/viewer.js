@@ -63,15 +63,50 @@
 
   // ---- the panorama: pan, zoom, and what is drawn over it ----
 
+  // Move and zoom a canvas with the mouse, with fingers, and with keys.
+  function gestures(canvas, { zoom, move, fit }) {
+    const pointers = new Map();
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
+    });
+    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => pointers.delete(event.pointerId));
+    canvas.addEventListener("pointermove", (event) => {
+      const before = pointers.get(event.pointerId), now = [event.offsetX, event.offsetY];
+      if (!before) return;
+      pointers.set(event.pointerId, now);
+      const other = [...pointers].find(([id]) => id !== event.pointerId);
+      if (other) {
+        const [x, y] = other[1];
+        zoom(Math.hypot(now[0] - x, now[1] - y) / Math.max(1, Math.hypot(before[0] - x, before[1] - y)), x, y);
+      } else move(now[0] - before[0], now[1] - before[1]);
+    });
+    canvas.addEventListener("wheel", (event) => {
+      if (document.activeElement !== canvas && !event.ctrlKey) return; // the wheel scrolls the page until the panorama is clicked
+      event.preventDefault();
+      zoom(Math.pow(1.002, -event.deltaY), event.offsetX, event.offsetY);
+    }, { passive: false });
+    canvas.addEventListener("dblclick", (event) => zoom(2, event.offsetX, event.offsetY));
+    const keys = {
+      "+": () => zoom(1.5), "-": () => zoom(1 / 1.5), 0: fit,
+      ArrowLeft: () => move(60, 0), ArrowRight: () => move(-60, 0), ArrowUp: () => move(0, 60), ArrowDown: () => move(0, -60),
+    };
+    canvas.addEventListener("keydown", (event) => {
+      if (!(event.key in keys) || event.ctrlKey || event.metaKey) return;
+      event.preventDefault();
+      keys[event.key]();
+    });
+  }
+
   function panoramaViewer(codes, picture) {
     const canvas = element("canvas", { tabindex: 0, role: "application", "aria-label": "The panorama: drag to move, + and - to zoom" });
     const context = canvas.getContext("2d");
-    const developed = element("canvas", { width: data.linear.width, height: data.linear.height });
-    const state = { scale: 1, x: 0, y: 0, map: null, instant: 0, path: true, fitted: true, shown: picture || developed };
+    const flat = element("canvas"), developed = element("canvas", { width: data.linear.width, height: data.linear.height });
+    const state = { scale: 1, x: 0, y: 0, map: null, instant: 0, path: true, fitted: true, around: null, shown: picture || developed };
     const style = getComputedStyle(document.documentElement);
     let waiting = false;
 
-    function line(points) {
+    function line(context, points, pixel) {
       context.beginPath();
       points.forEach(([x, y], k) => {
         const jumps = data.path.wide && k > 0 && Math.abs(x - points[k - 1][0]) > width / 2; // over the seam of a full turn
@@ -80,18 +115,13 @@
       });
       for (const [colour, thickness] of [["#000", 3.5], [style.getPropertyValue("--path").trim(), 1.8]]) {
         context.strokeStyle = colour;
-        context.lineWidth = thickness / state.scale;
+        context.lineWidth = thickness * pixel;
         context.stroke();
       }
     }
 
-    function draw() {
-      waiting = false;
-      const ratio = canvas.width / canvas.clientWidth, scale = ratio * state.scale;
-      context.setTransform(1, 0, 0, 1, 0, 0);
-      context.clearRect(0, 0, canvas.width, canvas.height);
-      context.setTransform(scale, 0, 0, scale, ratio * state.x, ratio * state.y);
-      context.imageSmoothingEnabled = scale * width / state.shown.width < 3;
+    // Draw all that is shown; `pixel` is a pixel of the page, in those of the panorama.
+    function paint(context, pixel) {
       context.drawImage(state.shown, 0, 0, width, height);
       if (state.map) {
         const [left, top, right, bottom] = state.map.box;
@@ -101,9 +131,31 @@
         context.globalAlpha = 1;
       }
       if (state.path) {
-        line(data.path.centres);
-        line(data.path.outlines[state.instant]);
+        line(context, data.path.centres, pixel);
+        line(context, data.path.outlines[state.instant], pixel);
       }
+    }
+
+    // What is shown, as a picture to look around in.
+    function painted(longest) {
+      const { width: columns, height: rows } = state.shown, scale = Math.min(1, longest / columns, longest / rows);
+      flat.width = Math.round(columns * scale); // which clears it
+      flat.height = Math.round(rows * scale);
+      const context = flat.getContext("2d");
+      context.scale(flat.width / width, flat.height / height);
+      paint(context, 0.5 * width / flat.width); // it will be enlarged, and its lines with it
+      return flat;
+    }
+
+    function draw() {
+      waiting = false;
+      if (state.around) return state.around.show(painted(state.around.longest));
+      const ratio = canvas.width / canvas.clientWidth, scale = ratio * state.scale;
+      context.setTransform(1, 0, 0, 1, 0, 0);
+      context.clearRect(0, 0, canvas.width, canvas.height);
+      context.setTransform(scale, 0, 0, scale, ratio * state.x, ratio * state.y);
+      context.imageSmoothingEnabled = scale * width / state.shown.width < 3;
+      paint(context, 1 / state.scale);
     }
 
     function redraw() {
@@ -147,6 +199,7 @@
     }
 
     function resize() {
+      if (state.around) return state.around.resize();
       const ratio = window.devicePixelRatio || 1;
       canvas.style.height = `${Math.min(640, Math.max(200, canvas.clientWidth * height / width))}px`;
       canvas.width = Math.round(canvas.clientWidth * ratio);
@@ -156,37 +209,7 @@
       draw(); // at once: a canvas of another size is empty
     }
 
-    const pointers = new Map();
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
-    });
-    for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => pointers.delete(event.pointerId));
-    canvas.addEventListener("pointermove", (event) => {
-      const before = pointers.get(event.pointerId), now = [event.offsetX, event.offsetY];
-      if (!before) return;
-      pointers.set(event.pointerId, now);
-      const other = [...pointers].find(([id]) => id !== event.pointerId);
-      if (other) {
-        const [x, y] = other[1];
-        zoom(Math.hypot(now[0] - x, now[1] - y) / Math.max(1, Math.hypot(before[0] - x, before[1] - y)), x, y);
-      } else move(now[0] - before[0], now[1] - before[1]);
-    });
-    canvas.addEventListener("wheel", (event) => {
-      if (document.activeElement !== canvas && !event.ctrlKey) return; // the wheel scrolls the page until the panorama is clicked
-      event.preventDefault();
-      zoom(Math.pow(1.002, -event.deltaY), event.offsetX, event.offsetY);
-    }, { passive: false });
-    canvas.addEventListener("dblclick", (event) => zoom(2, event.offsetX, event.offsetY));
-    const keys = {
-      "+": () => zoom(1.5), "-": () => zoom(1 / 1.5), 0: fit,
-      ArrowLeft: () => move(60, 0), ArrowRight: () => move(-60, 0), ArrowUp: () => move(0, 60), ArrowDown: () => move(0, -60),
-    };
-    canvas.addEventListener("keydown", (event) => {
-      if (!(event.key in keys) || event.ctrlKey || event.metaKey) return;
-      event.preventDefault();
-      keys[event.key]();
-    });
+    gestures(canvas, { zoom, move, fit });
 
     function fluxAt(event) {
       const x = Math.floor((event.offsetX - state.x) / state.scale), y = Math.floor((event.offsetY - state.y) / state.scale);
@@ -253,14 +276,44 @@
     };
     const path = element("input", { type: "checkbox", checked: "" });
     path.addEventListener("change", () => { viewer.state.path = path.checked; viewer.redraw(); });
+    const now = () => viewer.state.around || viewer;
+    const pixels = button("1:1", "One pixel of the panorama to one of the screen", () => viewer.zoom(1 / viewer.state.scale));
     return element("div", { class: "controls" },
       element("div", { class: "row" },
-        button("+", "Zoom in", () => viewer.zoom(1.5)), button("\u2212", "Zoom out", () => viewer.zoom(1 / 1.5)),
-        button("Fit", "Show all of the panorama", viewer.fit),
-        button("1:1", "One pixel of the panorama to one of the screen", () => viewer.zoom(1 / viewer.state.scale)),
+        button("+", "Zoom in", () => now().zoom(1.5)), button("\u2212", "Zoom out", () => now().zoom(1 / 1.5)),
+        button("Fit", "Show all of the panorama, or look ahead", () => now().fit()), pixels,
+        ...(data.angles ? lookAround(viewer, pixels) : []),
         choice("Map over the panorama", ["No map", ...data.maps.map((map) => map.name)], showMap), key,
         element("label", {}, path, " path")),
       exposure.row, scrubber(viewer), element("p", { class: "muted" }, readout));
+  }
+
+  // A button that turns the flat panorama into a view from its middle, and back; and what it says where that is impossible.
+  function lookAround(viewer, pixels) {
+    const canvas = element("canvas", { tabindex: 0, role: "application", "aria-label": "A view into the panorama: drag to look around, + and - to zoom" });
+    const note = element("span");
+    let sphere;
+    const around = button("Look around", "See the panorama from where the camera was, with straight lines", () => {
+      if (sphere === undefined) {
+        sphere = sphereViewer(canvas, data.angles);
+        if (sphere === null) {
+          around.disabled = true;
+          note.textContent = "This browser has no WebGL 2, which looking around needs.";
+          return;
+        }
+        gestures(canvas, sphere);
+        canvas.style.touchAction = "none";
+      }
+      const back = viewer.state.around !== null, [from, to] = back ? [canvas, viewer.canvas] : [viewer.canvas, canvas];
+      viewer.state.around = back ? null : sphere;
+      from.replaceWith(to);
+      around.setAttribute("aria-pressed", !back);
+      pixels.disabled = !back;
+      viewer.resize();
+      viewer.redraw();
+      to.focus({ preventScroll: true });
+    });
+    return [around, note];
   }
 
   // A slider over frames: where the frame lies on the panorama, when, and what the camera saw.
