@@ -231,7 +231,7 @@ def _rows(runs: Sequence[ComparedRun]) -> list[tuple[str, list[str]]]:
 
 def _size(run: ComparedRun) -> str | None:
     panorama = run.record["panorama"]
-    return None if panorama is None else f"{panorama['width']} \N{MULTIPLICATION SIGN} {panorama['height']}"
+    return None if panorama is None else f"{panorama['width']} x {panorama['height']}"
 
 
 def _differing(specs: Sequence[Mapping[str, Any]]) -> tuple[list[tuple[str, list[str]]], int]:

@@ -81,7 +81,7 @@ def test_page_shows_facts_warnings_and_failures(text, panorama):
     height, width = panorama.canvas.shape
     for sentence in (
         "photonpano 0.1.0 done doubtful corridor-pan",
-        "10,000 binary frames of 496 × 254 px (width × height) at 96.8 kHz, 103 ms. 14 March 2026, 15:09 UTC",
+        "10,000 binary frames of 496 x 254 px (width x height) at 96.8 kHz, 103 ms. 14 March 2026, 15:09 UTC",
         "Do not rely on this panorama yet: The light changes over time (most at frames 0 to 15) . "
         "The figure is 0.25; up to 0.03 is trusted. What to do: keep the light steady.",
         "scatter of short spans 1.01",
