@@ -91,7 +91,7 @@ def test_page_shows_facts_warnings_and_failures(text, panorama):
         "other found nothing to correct.",
         "The shifts of parts of the frame are not larger than their noise.",
         "level 2: 1 of 79 groups was not located (frames 9,125 to 9,374); the motion is interpolated across it",
-        f"The panorama, {height}x{width} px at scale 1; 99 % of it was seen; white is 1.83 photons per pixel per frame.",
+        f"The panorama, {width} x {height} px at scale 1; 99 % of it was seen; white is 1.83 photons per pixel per frame.",
         "located, last level 157 of 157 groups",
         "change in the last level 0.063 px",
         "time 1 min 23 s",
