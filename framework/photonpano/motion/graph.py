@@ -48,6 +48,7 @@ _HELD = 3.0  # expected errors by which k1 may differ from what is given, to be 
 _FEWEST_NODES = 12  # of which pairs tell what is the background over time
 _TRIED = 2  # steps towards a lens that show whether it is likelier: its numbers grow with the focal length
 _CLEAR = 6.0  # deviance by which one model is likelier than another beyond doubt, a ratio of likelihoods of 20
+_BY_CHANCE = 0.05  # share of drawn errors that roll as much as a path whose roll may be noise
 _LEARNT = 3  # times that the variances of the prior are estimated, each along the motion by those before
 
 
@@ -128,9 +129,9 @@ class GraphSolution:
     without_roll: Callable[[], GraphSolution] | None = None
 
     def rolls_by_chance(self, errors_px: FloatArray, frame_shape: tuple[int, int]) -> bool:
-        """Return whether homographies roll no more, as a whole and from each to the next, than one of the drawn errors does.
+        """Return whether noise rolls homographies as much, from each to the next, and from means of 2, 4, ... to the next ones.
 
-        `errors_px` (L, 8, S) are those of the assessment. Then noise is all that is told of the roll.
+        `errors_px` (L, 8, S) are those of the assessment: at each of these scales, one in twenty of them must roll as much.
         """
         frame = corners(frame_shape)
         away = frame - frame.mean(axis=0)
@@ -138,8 +139,12 @@ class GraphSolution:
         homographies = self.homographies[self.located]
         found = np.unwrap(np.arctan2(homographies[:, 1, 0], homographies[:, 0, 0]))
         rolls = np.column_stack([found, np.einsum("c,ncs->ns", across, errors_px)])
-        sizes = np.array([rolls.var(axis=0), np.diff(rolls, axis=0).var(axis=0)])
-        return bool((sizes[:, 0] <= sizes[:, 1:].max(axis=1)).all())
+        while len(rolls) > 2:
+            sizes = (np.diff(rolls, axis=0) ** 2).mean(axis=0)
+            if np.mean(sizes[1:] >= sizes[0]) < _BY_CHANCE:
+                return False
+            rolls = rolls[: len(rolls) // 2 * 2].reshape(-1, 2, rolls.shape[1]).mean(axis=1)
+        return True
 
 
 def components(n_nodes: int, edges: Sequence[Edge]) -> NDArray[np.integer]:
