@@ -76,11 +76,13 @@ def motion_of_frames(levels: Sequence[LevelResult], stream: StreamInfo, referenc
         located &= timeline.shown
     std_px, remaining_px = np.where(located, last.uncertainty.at(frames), np.inf), last.uncertainty.remaining_at(frames)
     homographies = np.concatenate([last.trajectory.at(block) for block in np.split(frames, frames[BLOCK_FRAMES::BLOCK_FRAMES])])
+    camera = camera_of_motion(last.trajectory)
     if not located[reference]:
         reference = int(frames[located][np.abs(frames[located] - reference).argmin()])
-        homographies = normalised(np.linalg.inv(homographies[reference]) @ homographies)
+        homographies = np.linalg.inv(homographies[reference]) @ homographies
+        if camera is None:
+            homographies = normalised(homographies)
     trajectory = FrameTrajectory(homographies)
-    camera = camera_of_motion(last.trajectory)
     return FrameMotion(
         trajectory=trajectory,
         span=span,

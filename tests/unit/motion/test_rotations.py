@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,10 +22,11 @@ from photonpano.geometry import (
     transform_points,
 )
 from photonpano.locating import fit_homography
+from photonpano.motion.frame_motion import motion_of_frames
 from photonpano.motion.graph import GraphSolution, solve
 from photonpano.motion.models import ModelName, MotionModel
 from photonpano.motion.rotations import Rotations, RotationTrajectory, fit_rotations
-from photonpano.values import Edge, FloatArray, Located, NotLocated, Patches
+from photonpano.values import Edge, FloatArray, FrameSpan, Located, NotLocated, Patches, StreamInfo
 from photonpano_core.configs import InterpolatorConfig
 from photonpano_core.interpolators import GeodesicInterpolator, LucasKanadeInterpolator, SmoothingSplineInterpolator
 
@@ -319,3 +321,16 @@ def test_locators_may_shift_and_roll_the_image_where_no_model_denies_it(make_lev
     """Where little light leaves eight numbers of a pair uncertain, its shift and roll are those of a camera far away."""
     found = make_level(motion=None, locator=_Turning()).turning(MotionModel(kind=kind).turning_camera((128, 160)))
     assert found.locators[0].component.matrix[0, 0] > 1000 * 160
+
+
+def test_reference_that_is_not_located_is_the_next_frame_that_is_also_of_a_camera_that_turns_away() -> None:
+    """From frame 20 on, frames are located; those at the end look back, where no homography has h33 = 1."""
+    camera, rotations = Camera.of(FOCAL_PX, SHAPE), turn(100, 250)
+    covered = SimpleNamespace(covered=FrameSpan(20, 100))
+    known = SimpleNamespace(at=lambda frames: camera.homographies(rotations[np.asarray(frames, int)]), camera=camera)
+    sure = SimpleNamespace(at=lambda frames: np.zeros(len(frames)), remaining_at=lambda frames: np.zeros(len(frames)))
+    level = SimpleNamespace(located=covered, exposures=SimpleNamespace(timeline=None), uncertainty=sure, trajectory=known)
+    motion = motion_of_frames([level], StreamInfo(100, *SHAPE, None), 0)
+    assert motion.reference == 20
+    np.testing.assert_allclose(np.linalg.det(motion.homographies), 1)
+    np.testing.assert_allclose(motion.rotations, rotations[20].T @ rotations, atol=1e-9)

@@ -23,8 +23,8 @@ def panned(n_frames: int, height: int = 24, width: int = 32) -> np.ndarray:
 BITS = panned(300)
 
 
-def npz(path: Path, arrays: dict[str, np.ndarray]) -> Path:
-    np.savez_compressed(path.with_suffix(".npz"), **arrays)  # type: ignore[arg-type]
+def npz(path: Path, arrays: dict[str, Any]) -> Path:
+    np.savez_compressed(path.with_suffix(".npz"), **arrays)
     return path.with_suffix(".npz")
 
 
