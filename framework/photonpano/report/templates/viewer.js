@@ -15,7 +15,7 @@
   }
 
   function number(value) {
-    return Number(value.toPrecision(3)).toLocaleString("en");
+    return value.toLocaleString("en", { maximumSignificantDigits: 3 });
   }
 
   function picture(uri) {
@@ -331,7 +331,7 @@
         tint.src = nearest.tint;
         share.textContent = `${Math.round(100 * nearest.hidden)} % of this picture hides the background; left out of the motion`;
       }
-      const time = data.rate ? `, ${number(1000 * now / data.rate)} ms` : "";
+      const seconds = now / data.rate, time = data.rate ? `, ${seconds < 1 ? `${number(1000 * seconds)} ms` : `${number(seconds)} s`}` : "";
       const error = std[index] === null ? "not located" : `expected error ${number(std[index])} px`;
       return `${now.toLocaleString("en")}${time}: ${error}`;
     });
