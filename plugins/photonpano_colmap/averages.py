@@ -98,7 +98,7 @@ class AveragesEstimator:
                 f"median) {texture[1]:.0f} match another average; {_ANOTHER_SIZE}"
             )
         if not found.pieces or len(found.pieces[0].images) < MIN_AVERAGES:
-            if found.free_focal is not None and found.free_focal.n_images >= MIN_AVERAGES:
+            if found.free_focal is not None and len(found.free_focal.images) >= MIN_AVERAGES:
                 raise LocationError(
                     f"COLMAP finds no poses with the focal length that is given, camera.focal_px = {focal_px:g}, and does with "
                     f"{found.free_focal}: correct it, or leave it out"
@@ -162,6 +162,10 @@ class _Assembly:
             frames, instants, noise.std_rotation, apart=angles, located=located, of_halves=piece.halves.std_rotation
         )
         std_rotation = np.hypot(std_rotation, tilt(piece.poses, np.maximum(noise.std_position, piece.halves.std_position)))
+        if self.guess.focal_px is not None and self.found.free_focal is not None:
+            missed = self.found.free_focal.missed(piece.images, piece.poses, self.guess.focal_px)
+            shifts, angles = (np.interp(frames, instants, each) for each in missed)
+            std_position, std_rotation = np.hypot(std_position, shifts), np.hypot(std_rotation, angles)
         views = tuple(self._view(place) for place in range(len(piece.images)))
         return PoseEstimate(
             camera_matrix=camera.matrix,
@@ -240,7 +244,7 @@ class _Assembly:
     def _doubts(self) -> list[Reason]:
         doubts = [] if self.piece.readings.doubt is None else [self.piece.readings.doubt]
         given, free = self.guess.focal_px, self.found.free_focal
-        if given is not None and free is not None and (doubt := free.doubt_of(given)) is not None:
+        if given is not None and free is not None and (doubt := free.doubt_of(given, "averages")) is not None:
             doubts.insert(0, doubt)
         extents = np.linalg.svd(self.piece.points - np.median(self.piece.points, axis=0), compute_uv=False)
         if self.guess.focal_px is None and extents[2] < _PLANE * extents[0]:

@@ -30,8 +30,9 @@ from scipy.spatial.transform import Rotation
 from photonpano import FloatArray, Homography, Located, NotLocated, OutputError, Reason, VirtualExposure
 from photonpano.geometry import Camera, camera_matrix, normalised, positions_of
 from photonpano.locating import Matches, PointLocator, blur_against_noise, motion_from_points, stabilised_8_bit, too_few_matches
+from photonpano_colmap.exposures import moves, posed
 from photonpano_colmap.hooks import FIRST_CENTRE, SEEDS, ColmapAveragesConfig, PycolmapTwoViewConfig
-from photonpano_poses import CameraGuess
+from photonpano_poses import CameraGuess, align_positions
 
 MAX_TRIALS = 10_000  # of RANSAC, which finds a homography with 20 % inliers in half as many
 _SIFT = pycolmap.FeatureExtractorType.SIFT
@@ -163,25 +164,43 @@ class Piece:
     halves: Halves  # what half of the points tell
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class FreeFocal:
     """The focal length that images have if it is not given."""
 
     focal_px: float
     std_px: float  # its expected error
-    n_images: int = 0  # images with a pose
+    images: NDArray[np.intp]  # (N,) indices of the images with a pose, increasing
+    poses: FloatArray  # (N, 3, 4) of these with this focal length
 
     def __str__(self) -> str:
         return f"{self.focal_px:.4g} ± {self.std_px:.2g} px"
 
-    def doubt_of(self, given_px: float) -> Reason | None:
-        """Doubt a focal length that is given; None if the averages do not contradict it."""
+    def missed(self, images: NDArray[np.intp], poses: FloatArray, given_px: float) -> tuple[FloatArray, FloatArray]:
+        """Return how far (M, 3, 4) poses are expected to be off since the given focal length is: shifts, and angles in radians.
+
+        Poses with the free one differ from them, after the best alignment, by the errors of both: what is beyond the share of
+        the free one's counts. Poses of images that the free ones lack are interpolated: (M,) each.
+        """
+        common, here, there = np.intersect1d(images, self.images, return_indices=True)
+        excess = max(0.0, 1 - (self.std_px / max(abs(self.focal_px - given_px), 1e-9)) ** 2)
+        if not excess or len(common) < _FEWEST:
+            return np.zeros(len(images)), np.zeros(len(images))
+        places = positions_of(self.poses[there])
+        scale, turn, shift = align_positions(places, positions_of(poses[here]))
+        aligned = posed(self.poses[there, :, :3] @ turn.T, scale * places @ turn.T + shift)
+        changes = np.linalg.norm(moves(poses[here], aligned).reshape(-1, 2, 3), axis=2) * math.sqrt(excess)
+        angles, shifts = (np.interp(images, common, of_common) for of_common in changes.T)
+        return shifts, angles
+
+    def doubt_of(self, given_px: float, images: str) -> Reason | None:
+        """Doubt a focal length that is given; None if the images, such as `averages`, do not contradict it."""
         off = abs(self.focal_px - given_px) / self.std_px
         if off <= _FOCAL_SIGMAS:
             return None
         where = f"{self} fits, {given_px:.4g} px is given; in expected errors"
         todo = "calibrate the camera, and correct camera.focal_px, or leave it out"
-        return Reason("the averages contradict the focal length", off, _FOCAL_SIGMAS, where, todo)
+        return Reason(f"the {images} contradict the focal length", off, _FOCAL_SIGMAS, where, todo)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -342,7 +361,7 @@ def _free_focal(database: Path, folder: Path, guess: CameraGuess, config: Colmap
     centre = camera.principal_point_x - FIRST_CENTRE, camera.principal_point_y - FIRST_CENTRE
     lens = Camera(camera_matrix(camera.params[0], centre), np.array(guess.distortion))
     noise = pose_noise(poses, points, [(indices, lens.ideal(xy)) for indices, xy in observed], lens.matrix, True)
-    return FreeFocal(lens.focal_px, math.hypot(noise.std_focal_px, _FREE_BIAS * lens.focal_px), len(images))
+    return FreeFocal(lens.focal_px, math.hypot(noise.std_focal_px, _FREE_BIAS * lens.focal_px), images, poses)
 
 
 _Arrays = tuple[NDArray[np.intp], FloatArray, FloatArray, tuple[tuple[NDArray[np.intp], FloatArray], ...]]

@@ -63,16 +63,31 @@ def test_wrong_focal_length_is_doubted_and_the_right_one_is_not() -> None:
     assert doubt.what == "the averages contradict the focal length"
     assert "px fits, 18.75 px is given" in doubt.where
     level = estimate.levels[0]
-    free = FreeFocal(level["free_focal_px"], level["std_free_focal_px"])
-    assert free.doubt_of(FOCAL_PX) is None
+    free = FreeFocal(level["free_focal_px"], level["std_free_focal_px"], np.arange(0), np.zeros((0, 3, 4)))
+    assert free.doubt_of(FOCAL_PX, "averages") is None
     assert abs(free.focal_px / FOCAL_PX - 1) < 0.06
 
 
 def test_focal_length_without_poses_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = Reconstruction((), np.full(16, 300), np.full(16, 100), FreeFocal(150.0, 6.0, 16))
+    found = Reconstruction((), np.full(16, 300), np.full(16, 100), FreeFocal(150.0, 6.0, np.arange(16), true_poses()[:16]))
     monkeypatch.setattr("photonpano_colmap.averages.reconstruct", lambda *_: found)
     with pytest.raises(LocationError, match=r"camera.focal_px = 5000, and does with 150 ± 6 px: correct it, or leave it out"):
         estimated(MemorySource(np.zeros((N_POSES, *POSES_SHAPE))), CameraGuess(5000.0))
+
+
+def test_poses_are_expected_to_be_off_by_what_a_given_focal_length_moves_them() -> None:
+    # Poses with the free focal length lie in another world, and every second one is 0.02 off.
+    given, images, off = true_poses()[::SIZE], np.arange(16), np.zeros((16, 3))
+    off[::2, 1] = 0.02
+    free = given.copy()
+    free[:, :, 3] = 2 * (given[:, :, 3] - np.einsum("nij,nj->ni", given[:, :, :3], off))
+    shifts, angles = FreeFocal(150.0, 3.0, images, free).missed(images, given, 155.0)
+    np.testing.assert_allclose(shifts, 0.01 * 0.8, rtol=0.2)  # beyond 3 of the 5 px
+    assert angles.max() < 0.01
+    for within in (148.0, 150.0):
+        np.testing.assert_array_equal(FreeFocal(150.0, 3.0, images, free).missed(images, given, within), 0)
+    half = FreeFocal(150.0, 3.0, images[:9], free[:9]).missed(images, given, 155.0)
+    assert half[0].shape == (16,)
 
 
 def test_full_disk_ends_the_run_before_colmap_reads_half_of_a_picture() -> None:

@@ -25,6 +25,7 @@ from photonpano_colmap.exposures import (
 )
 from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Observations, adjust
+from photonpano_colmap.reconstruction import FreeFocal
 from photonpano_colmap.stratified import Merged, Scene, StratifiedEstimator, interpolate, locate, merge, resample
 
 CAMERA = Camera.of(FOCAL_PX, POSES_SHAPE)
@@ -189,6 +190,20 @@ def test_lens_is_seen_through_and_a_wrong_one_is_doubted(given: tuple[float, flo
         [doubt] = estimate.doubts
         assert doubt.what == "the exposures contradict the lens"
         assert doubt.where.startswith("a k1 of about -0.")
+
+
+def test_poses_expect_the_error_of_a_wrong_focal_length() -> None:
+    poses, points, observations = observed_through(CAMERA)
+    wrong, images = Camera.of(1.06 * FOCAL_PX, POSES_SHAPE), np.arange(len(poses))
+    given = adjust(poses, points, observations, wrong, finds_focal=False)
+    free = adjust(given.poses, given.points, observations, wrong, finds_focal=True)
+    known = FreeFocal(free.focal_px, max(free.std_focal_px, 0.01 * FOCAL_PX), images, free.poses)
+    doubt = known.doubt_of(wrong.focal_px, "exposures")
+    assert doubt is not None
+    assert doubt.what == "the exposures contradict the focal length"
+    expected, _ = known.missed(images, given.poses, wrong.focal_px)
+    errors = _after_similarity(positions_of(given.poses), positions_of(poses))
+    assert np.sqrt(np.mean(errors**2) / np.mean(expected**2)) == pytest.approx(1, abs=0.3)
 
 
 def _seen_points() -> np.ndarray:
