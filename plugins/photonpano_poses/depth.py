@@ -179,41 +179,52 @@ def _sweep(  # noqa: PLR0913, PLR0917
     counts, as both would.
     """
     height, width, number = cost.shape
-    sums = np.empty((2, 4, number))
+    sums = np.empty((number, 8))  # of either side: number, and sums of w, w s and w s^2
     for y in range(height):
         for x in range(width):
             sums[:] = 0
             px, py = lens.ideal[y, x, 0], lens.ideal[y, x, 1]
             for v in range(len(images)):
                 turn, shift, weight, image = turns[v], shifts[v], weights[v], images[v]
-                side = sums[0] if before[v] else sums[1]
+                side = 0 if before[v] else 4
                 a = turn[0, 0] * px + turn[0, 1] * py + turn[0, 2]
                 b = turn[1, 0] * px + turn[1, 1] * py + turn[1, 2]
                 c = turn[2, 0] * px + turn[2, 1] * py + turn[2, 2]
+                along_x, along_y, along_z = shift[0], shift[1], shift[2]
                 for d in range(number):
-                    depth = c + steps[d] * shift[2]
+                    q = steps[d]
+                    depth = c + q * along_z
                     if not depth > 0:
                         continue
-                    u, w = imaged(lens, (a + steps[d] * shift[0]) / depth, (b + steps[d] * shift[1]) / depth)
-                    value = sampled(image, u, w)
+                    u, w = (a + q * along_x) / depth, (b + q * along_y) / depth
+                    if lens.distorts:
+                        u, w = imaged(lens, u, w)
+                    if not (0 <= u < width - 1 and 0 <= w < height - 1):
+                        continue
+                    # As `sampled` does, whose call takes as long again.
+                    i, j = int(u), int(w)
+                    e, f = np.float32(u - i), np.float32(w - j)
+                    upper = image[j, i] + e * (image[j, i + 1] - image[j, i])
+                    lower = image[j + 1, i] + e * (image[j + 1, i + 1] - image[j + 1, i])
+                    value = upper + f * (lower - upper)
                     if value == value:
-                        side[0, d] += 1
-                        side[1, d] += weight
-                        side[2, d] += weight * value
-                        side[3, d] += weight * value * value
+                        sums[d, side] += 1
+                        sums[d, side + 1] += weight
+                        sums[d, side + 2] += weight * value
+                        sums[d, side + 3] += weight * value * value
             for d in range(number):
-                first, second = sums[0, :, d], sums[1, :, d]
-                seen = first[0] + second[0]
+                seen = sums[d, 0] + sums[d, 4]
                 if seen < _LEAST_SEEN:
                     cost[y, x, d] = np.nan
                     continue
-                sum_w, sum_s, sum_q = first[1] + second[1], first[2] + second[2], first[3] + second[3]
+                sum_w, sum_s, sum_q = sums[d, 1] + sums[d, 5], sums[d, 2] + sums[d, 6], sums[d, 3] + sums[d, 7]
                 best = (sum_q - sum_s * sum_s / sum_w) / (seen - 1)
-                for side in (first, second):
-                    if side[0] >= _LEAST_SEEN:
-                        alone = (side[3] - side[2] * side[2] / side[1]) / (side[0] - 1)
+                for side in (0, 4):
+                    if sums[d, side] >= _LEAST_SEEN:
+                        alone = sums[d, side + 3] - sums[d, side + 2] * sums[d, side + 2] / sums[d, side + 1]
                         # The smaller of two is smaller by chance.
-                        best = min(best, alone + noise_left * np.sqrt(2.0 / (side[0] - 1)))
+                        freedom = sums[d, side] - 1
+                        best = min(best, alone / freedom + noise_left * np.sqrt(2.0 / freedom))
                 cost[y, x, d] = best * (len(images) - 1)
 
 
@@ -300,17 +311,25 @@ def _predict(  # noqa: PLR0917
 ) -> None:
     """Write the mean flux that other exposures see at the depth of each pixel, (H, W)."""
     height, width = inverse_depth.shape
-    for y in range(height):
-        for x in range(width):
-            px, py, q = lens.ideal[y, x, 0], lens.ideal[y, x, 1], inverse_depth[y, x]
-            total, weight = 0.0, 0.0
-            for v in range(len(images)):
-                u, w, _ = seen_at(lens, turns[v], shifts[v], px, py, q)
-                value = sampled(images[v], u, w)
+    predicted[:] = 0
+    total, ideal = np.zeros_like(predicted), lens.ideal
+    for v in range(len(images)):
+        image, turn, shift, weight = images[v], turns[v], shifts[v], weights[v]
+        for y in range(height):
+            for x in range(width):
+                px, py, q = ideal[y, x, 0], ideal[y, x, 1], inverse_depth[y, x]
+                depth = turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] + q * shift[2]
+                if not depth > 0:
+                    continue
+                u = (turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] + q * shift[0]) / depth
+                w = (turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] + q * shift[1]) / depth
+                if lens.distorts:
+                    u, w = imaged(lens, u, w)
+                value = sampled(image, u, w)
                 if value == value:
-                    total += weights[v] * value
-                    weight += weights[v]
-            predicted[y, x] = total / weight if weight > 0 else np.nan
+                    predicted[y, x] += weight * value
+                    total[y, x] += weight
+    predicted /= total  # NaN where none sees it
 
 
 def _checked(depth: DepthMap, maps: Sequence[DepthMap], views: Sequence[PosedView], camera: Camera) -> DepthMap:
