@@ -32,7 +32,7 @@ from photonpano_colmap.exposures import (
 from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Adjusted, Found, Observations, adjust, find_patches, patches_of, stabilised
 from photonpano_colmap.reconstruction import FOCAL_BIAS, FreeFocal
-from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints, between, with_depth
+from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints, between, see_depth, with_depth
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
 _CONTRADICTION, _CONTRADICTION_PX = 5.0, 0.5
@@ -58,7 +58,7 @@ class StratifiedEstimator:
         path = Path(spline.at(_frames(source)))
         scene, levels, lost = Scene(path, first.located, first.points.positions), list(first.levels), list(first.lost)
         with ThreadPoolExecutor(self._context.threads) as pool:
-            for number in range(2, self._config.levels + 1):
+            for number in range(2, self._config.levels + 1 + self._config.depth):
                 before = scene.path.poses
                 with progress.stage(f"level {number}: merge, locate, adjust", 1, "level") as advance:
                     level = _refine(
@@ -79,6 +79,9 @@ class StratifiedEstimator:
                         "std_position": relative_std(level.adjusted.std_position, level.adjusted.poses),
                     }
                 )
+                if self._config.depth and number == self._config.levels:
+                    so_far = _Assembly(source, camera, first, level, level.adjusted, before).estimate()
+                    scene = replace(scene, dense=with_depth(source, so_far, self._context.threads, progress))
         first = replace(first, levels=tuple(levels), lost=tuple(sorted(lost, key=lambda each: each.span.start)))
         found = level.adjusted
         if guess.focal_px is not None:  # which the exposures bear out, or not
@@ -205,6 +208,7 @@ class Scene:
     path: Path
     located: BoolArray  # (T,) frames whose pose is known
     points: FloatArray  # (N, 3) of the world
+    dense: PoseEstimate | None = None  # with the depth of some exposures; None if it is not known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,6 +277,8 @@ def merge(source: Source, groups: Sequence[Group], scene: Scene, camera: Camera,
         if depth is None:  # a view of no use will have no observations
             seen = scene.points @ pose[2, :3] + pose[2, 3]
             depth = np.full(shape, 1 / np.median(seen[seen > 0]) if (seen > 0).any() else 0, np.float32)
+        if scene.dense is not None:
+            see_depth(scene.dense, group.reference, pose, depth)
         return depth
 
     def along(path: Path) -> list[PosedExposure]:

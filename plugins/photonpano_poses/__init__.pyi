@@ -7,6 +7,7 @@ from .contract import PoseEstimator as PoseEstimator
 from .contract import PoseEstimatorContribution as PoseEstimatorContribution
 from .contract import ScenePoints as ScenePoints
 from .contract import require_poses as require_poses
+from .depth import see_depth as see_depth
 from .depth import with_depth as with_depth
 from .exporting import ExportedPoses as ExportedPoses
 from .exporting import export as export

@@ -381,6 +381,37 @@ def _confirm(  # noqa: PLR0917
             confirmed[y, x] = abs(other[j, i] - q / depth) < _AGREE * error
 
 
+def see_depth(estimate: PoseEstimate, instant: float, pose: FloatArray, inverse_depth: Image) -> None:
+    """Correct the inverse depth of a view, (H, W), by the depth map of an estimate that is nearest to its instant.
+
+    Pixels whose depth that map does not know stay as they are.
+    """
+    if not estimate.depth:
+        return
+    nearest = min(estimate.depth, key=lambda each: abs(estimate.views[each.view].instant - instant))
+    camera = Camera(estimate.camera_matrix, estimate.distortion)
+    turn, shift = between(pose, estimate.views[nearest.view].camera_from_world, camera.matrix)
+    _see_depth(nearest.inverse_depth, lens_of(camera, inverse_depth.shape), turn, shift, inverse_depth)
+
+
+_STEPS = 3  # of the search for the pixel of a depth map that shows what a pixel of another view does
+
+
+@compiled
+def _see_depth(known: Image, lens: Lens, turn: FloatArray, shift: FloatArray, inverse_depth: Image) -> None:
+    """Correct (H, W) inverse depths by those of another view at the pixels that they lead to."""
+    height, width = inverse_depth.shape
+    for y in range(height):
+        for x in range(width):
+            for _ in range(_STEPS):
+                u, v, depth = seen_at(lens, turn, shift, lens.ideal[y, x, 0], lens.ideal[y, x, 1], inverse_depth[y, x])
+                if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+                    break
+                q = known[int(v + 0.5), int(u + 0.5)]
+                if q == q:
+                    inverse_depth[y, x] = q * depth
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
     """Surface elements of the scene: one for each pixel of a key that no earlier key has."""

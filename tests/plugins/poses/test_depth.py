@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from photonpano import FrameSpan
 from photonpano.execution.context import Quiet
 from photonpano.geometry import Camera
-from photonpano_poses import PosedView, PoseEstimate, ScenePoints, with_depth
+from photonpano_poses import PosedView, PoseEstimate, ScenePoints, see_depth, with_depth
 from photonpano_poses import depth as depth_module
 from photonpano_poses.depth import fused
 from photonpano_poses.files import splats_ply
@@ -79,6 +79,19 @@ def test_depth_is_that_of_the_planes_within_its_error(found: PoseEstimate) -> No
     errors, sigmas = np.concatenate(errors), np.concatenate(sigmas)
     assert np.median(errors) < 0.02
     assert (sigmas < 2).mean() > 0.9, [(sigmas < k).mean() for k in (1, 2, 3)]
+
+
+def test_depth_of_a_view_between_two_keys_is_that_of_the_nearest(found: PoseEstimate) -> None:
+    instant = 57.0  # of no exposure
+    pose = true_poses()[int(instant)]
+    true = true_depth(pose)
+    inverse_depth = np.full(POSES_SHAPE, 1 / 4.5, np.float32)
+    see_depth(found, instant, pose, inverse_depth)
+    known = (true > 0) & (inverse_depth != np.float32(1 / 4.5))
+    assert known.mean() > 0.6
+    assert np.median(np.abs(inverse_depth * true - 1)[known]) < 0.03
+    see_depth(replace(found, depth=()), instant, pose, before := inverse_depth.copy())
+    np.testing.assert_array_equal(before, inverse_depth)
 
 
 def test_record_judges_by_photons_that_were_left_out(found: PoseEstimate) -> None:
