@@ -101,7 +101,7 @@ class StratifiedPoseConfig(ColmapAveragesConfig):
         ge=2,
         le=8,
         description="number of levels, that of the averages included; each further one merges the groups anew, along the path "
-        "and through the depth that the level before found",
+        "and through the depth that the level before found; with depth, there is one more",
     )
 
 

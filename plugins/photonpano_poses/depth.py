@@ -405,7 +405,7 @@ def _see_depth(known: Image, lens: Lens, turn: FloatArray, shift: FloatArray, in
         for x in range(width):
             for _ in range(_STEPS):
                 u, v, depth = seen_at(lens, turn, shift, lens.ideal[y, x, 0], lens.ideal[y, x, 1], inverse_depth[y, x])
-                if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+                if not (-0.5 < u < width - 0.5 and -0.5 < v < height - 0.5):
                     break
                 q = known[int(v + 0.5), int(u + 0.5)]
                 if q == q:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,17 @@ import pytest
 from photonpano import FrameSpan, Group, StageContext
 from photonpano.execution.context import Quiet
 from photonpano.geometry import Camera, positions_of, rotation_matrices
-from photonpano_poses import CameraGuess, between, imaged, lens_of, pose_errors
+from photonpano_poses import (
+    CameraGuess,
+    DepthMap,
+    PosedView,
+    PoseEstimate,
+    ScenePoints,
+    between,
+    imaged,
+    lens_of,
+    pose_errors,
+)
 from photonpano_poses.testing import FOCAL_PX, N_POSES, POSES_SHAPE, capture, true_poses
 
 pytest.importorskip("pycolmap")
@@ -80,6 +91,23 @@ def test_tremor_within_a_group_is_found() -> None:
     left, before = (np.sqrt(np.mean(moves(each.poses, true_poses())[:, :3] ** 2, axis=0)) for each in (merged.path, path))
     np.testing.assert_allclose(before, np.sqrt(np.mean(tremor**2, axis=0)), rtol=0.02)
     assert (left < 0.3 * before).all(), left / before
+
+
+def test_groups_are_merged_through_dense_depth_where_it_is_known() -> None:
+    [pose], depth = TRUE.at([79.5]), np.full(POSES_SHAPE, 0.25, np.float32)
+    depth[:, :80] = np.nan
+    view = PosedView(FrameSpan(0, 160), 79.5, pose, np.zeros(0, np.intp), np.zeros((0, 2)), lambda: depth)
+    std, points = np.full(N_POSES, 1e-3), ScenePoints(_seen_points(), np.ones(450, np.float32))
+    dense = PoseEstimate(MATRIX, np.zeros(4), 0.0, TRUE.poses, EVERYWHERE, std, std, points, (view,))
+    dense = replace(dense, depth=(DepthMap(0, *5 * (depth,)),))
+    sparse = Scene(TRUE, EVERYWHERE, _seen_points())
+    with ThreadPoolExecutor(2) as pool:
+        merged = [
+            merge(capture(), resample(EVERYWHERE, 160), scene, CAMERA, pool) for scene in (sparse, replace(sparse, dense=dense))
+        ]
+    [before, after] = (each.exposures[0].inverse_depth for each in merged)
+    np.testing.assert_allclose(after[:, 80:], 0.25)
+    np.testing.assert_array_equal(after[:, :80], before[:, :80])
 
 
 def test_noise_of_located_groups_does_not_move_the_path() -> None:
