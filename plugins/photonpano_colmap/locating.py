@@ -202,6 +202,7 @@ _PRIOR_POINT = 100.0  # the same for points, whose depth may be undetermined, in
 _OUTLIER = 3.0  # standard deviations within which an observation confirms its point
 # Prior standard deviation of what is given of the camera, in focal lengths and as it is; a wide one of what is found.
 _HELD, _FREE = 1e-6, 0.5
+_SHORTEST = 0.1  # of a focal length that is found, over that before: a scene that has none may lead below 0
 _SEEN_BY = 3  # fewest exposures that confirm a point
 _MOST_STEPS = 30
 _REWEIGHTINGS = 3  # solutions; after each, observations are weighted by the residuals of their point
@@ -259,7 +260,8 @@ def adjust(poses: FloatArray, points: FloatArray, observations: Observations, ca
         )
         values = gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
         if finds_focal:
-            camera = Camera(camera_matrix(values.atCal3Bundler(CAMERA(0)).fx(), camera.centre_px))
+            focal_px = max(values.atCal3Bundler(CAMERA(0)).fx(), _SHORTEST * camera.focal_px)
+            camera = Camera(camera_matrix(focal_px, camera.centre_px))
         found = [values.atPose3(POSE(view)) for view in range(len(poses))]
         poses = posed(
             np.array([each.rotation().matrix().T for each in found]), np.array([each.translation() for each in found])

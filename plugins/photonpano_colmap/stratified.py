@@ -84,7 +84,7 @@ class StratifiedEstimator:
                     scene = replace(scene, dense=with_depth(source, so_far, self._context.threads, progress))
         first = replace(first, levels=tuple(levels), lost=tuple(sorted(lost, key=lambda each: each.span.start)))
         found = level.adjusted
-        if guess.focal_px is not None:  # which the exposures bear out, or not
+        if guess.focal_px is not None and not first.doubts:  # from far off, the exposures lead nowhere
             found = adjust(found.poses, found.points, level.observations, camera, finds_focal=True)
         estimate = with_focal_judged(_Assembly(source, camera, first, level, found, before).estimate(), self._context)
         return with_depth(source, estimate, self._context.threads, progress) if self._config.depth else estimate
@@ -98,7 +98,7 @@ class _Assembly:
     camera: Camera
     first: PoseEstimate  # of the averages; with the records of all levels, and the frames that any of them lost
     level: _PosedLevel
-    free: Adjusted  # the exposures of the level with a focal length that is not given
+    free: Adjusted  # the exposures of the level with a focal length that is not given, unless the averages are doubtful
     before: FloatArray  # (T, 3, 4), poses of all frames by the level before
 
     def estimate(self) -> PoseEstimate:
@@ -109,6 +109,11 @@ class _Assembly:
         stds[1] = np.hypot(stds[1], tilt(level.adjusted.poses, level.adjusted.std_position))
         of_focal = self._free_focal.missed(self._free_focal.images, level.adjusted.poses, self.camera.focal_px)
         stds = [np.hypot(std, np.interp(frames, instants, each)) for std, each in zip(stds, of_focal, strict=True)]
+        if self.first.doubts:  # such as of the focal length, whose error is in those of the averages
+            stds = [
+                np.fmax(*each)
+                for each in zip(stds, (self.first.std_position, np.deg2rad(self.first.std_rotation_deg)), strict=True)
+            ]
         if level.tremor is not None:
             stds = [np.hypot(stds[0], level.tremor.shift), np.hypot(stds[1], level.tremor.std)]
         moved = _left(positions_of(poses) - positions_of(self.before), frames, instants)
