@@ -281,8 +281,8 @@ class PlanarAdjustment(Adjustment[Plane]):
     def widened(self, state: Plane, weights: FloatArray) -> PlanarAdjustment:
         """Return the problem with walks as wide at all time scales as in the octave of these in which they are widest.
 
-        Most cameras move more smoothly than a walk: one that is as wide as all scales are in the mean holds the slow ones, which
-        hold most of the motion, and bends a long path. Expected squares of the steps (Dempster et al. 1977).
+        Most cameras move more smoothly than a walk: one that is as wide as all scales are in the mean holds the slow ones, in
+        which most of the motion is, and bends a long path. Expected squares of the steps (Dempster et al. 1977).
         """
         if not self._n_walks or len(self._times) < _FEWEST_STEPS:
             return self
