@@ -39,30 +39,13 @@ def load_spec(
         SpecError: the file cannot be read, or the spec is wrong; carries all problems, each with line and column.
     """
     path, catalog = Path(path), discover() if catalog is None else catalog
+    given = {"directory": path.parent, "name": path.stem, "overrides": overrides, "output": output, "arriving": arriving}
     try:
-        return parse_spec(
-            read_spec(path),
-            directory=path.parent,
-            name=path.stem,
-            overrides=overrides,
-            output=output,
-            catalog=catalog,
-            file=path,
-            arriving=arriving,
-        )
+        return parse_spec(read_spec(path), catalog=catalog, file=path, **given)
     except SpecError:
         if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not _is_capture(catalog, path):
             raise
-    source = {"use": "auto", "with": {"path": path.name}}
-    return parse_spec(
-        {"version": 1, "source": source},
-        directory=path.parent,
-        name=path.stem,
-        overrides=overrides,
-        output=output,
-        catalog=catalog,
-        arriving=arriving,
-    )
+    return parse_spec({"version": 1, "source": {"use": "auto", "with": {"path": path.name}}}, catalog=catalog, **given)
 
 
 def _is_capture(catalog: Catalog, path: Path) -> bool:
