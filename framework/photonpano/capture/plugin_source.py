@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.contracts.attribution import attributing
-from photonpano.contracts.protocols import (
-    ColouredSource,
-    KnowsSharpViews,
-    KnowsTruth,
-    PackedSource,
-    Source,
-)
+from photonpano.contracts.protocols import ColouredSource, KnowsSharpViews, KnowsTruth, PackedSource, Source
 from photonpano.contracts.requirements import (
     require_info,
     require_mask,

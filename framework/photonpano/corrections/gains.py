@@ -214,19 +214,14 @@ def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: 
     unseen = np.bincount(seen.cells, minlength=seen.n_cells) == 0
     image = np.where(unseen, np.nan, brightness).reshape(seen.canvas.shape)
     gradient = np.stack([np.nan_to_num(each).ravel() for each in gradient_of(image)])[:, seen.cells]
+    # Least-squares equations of each span: both shifts, beside a change of the light.
+    sums = partial(np.bincount, seen.times, minlength=len(seen.spans))
     columns = np.concatenate([gradient, np.ones((1, len(left)))])
-    normal, right = _equations_of_groups(seen.times, len(seen.spans), columns, weight, left)
-    shift = np.linalg.solve(normal + np.eye(3), right[..., None])[:, :2, 0]
+    weighted = weight * columns
+    normal = np.array([[sums(one * other) for other in columns] for one in weighted])
+    right = np.array([sums(one * left) for one in weighted])
+    shift = np.linalg.solve(np.moveaxis(normal, -1, 0) + np.eye(3), right.T[..., None])[:, :2, 0]
     return np.asarray((shift[seen.times].T * gradient).sum(axis=0))
-
-
-def _equations_of_groups(
-    groups: NDArray[np.intp], number: int, columns: FloatArray, weight: FloatArray, target: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the least-squares equations of each group of observations, for K columns (K, N): (G, K, K) and (G, K)."""
-    normal = np.array([[np.bincount(groups, weight * one * other, number) for other in columns] for one in columns])
-    right = np.array([np.bincount(groups, weight * one * target, number) for one in columns])
-    return np.moveaxis(normal, -1, 0), right.T
 
 
 def _step(seen: SeenCells, weight: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -26,17 +26,7 @@ from photonpano.record.contents import contents_of
 from photonpano.record.schema import FileContent
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, Scene, read_only, recorded, rolled
 from photonpano.testing.conformance import Answer, AnswerConformance, StageConformance, copied, fingerprint, in_threads, passing
-from photonpano.values import (
-    BoolArray,
-    Counts,
-    FloatArray,
-    FluxImage,
-    FrameSpan,
-    Group,
-    Homography,
-    Panorama,
-    VirtualExposure,
-)
+from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, FrameSpan, Group, Homography, Panorama, VirtualExposure
 
 SHAPE = (40, 56)
 N_FRAMES = 240
