@@ -90,9 +90,6 @@ def bin_source(
 ) -> SourceContribution:
     """Return the contribution of a source of .bin files; `footer_bytes` may follow the frames of a file."""
 
-    def opened(config: BinConfig) -> PackedFileSource:
-        return PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz)
-
     def arrived(config: BinConfig) -> Arrived:
         """Open the frames that are there of a capture that is still being written: files appear, and the last one grows."""
         path = config.path
@@ -107,7 +104,7 @@ def bin_source(
         name=name,
         summary=summary,
         config=config,
-        build=lambda config, _: opened(config),
+        build=lambda config, _: PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz),
         check=lambda config: objections(frame_files, config.path, layout, footer_bytes),
         recognise=recognise,
         arrived=arrived,

@@ -167,14 +167,8 @@ class Capture(Closing):
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
         """Correct a sum of frames, so that on average it is the sum of frames of the flux alone.
 
-        The correction is linear, so that the average is right; the result may be negative.
-
-        Args:
-            counts: (H, W), from `counts` or `chunk`.
-            n_frames: number of frames in the sum.
-
-        Returns:
-            (H, W) float32; `counts` itself if there is nothing to correct.
+        The sum is (H, W), from `counts` or `chunk`. The correction is linear, so that the average is right; the result, (H, W)
+        float32, may be negative. It is `counts` itself if there is nothing to correct.
         """
         summed: Any = np.asarray(counts, np.uint32) if self.steps else counts
         for step in self.steps:
@@ -258,10 +252,9 @@ class Capture(Closing):
         return self.gather is None and self.colour is None and self.source.offers("sharp_view")
 
     def sharp_view(self, frame: int) -> FluxImage:
-        """Return the flux of a frame of a simulated capture without noise, see `photonpano.KnowsSharpViews`.
+        """Return the flux of a frame of a simulated capture without noise; `InputError` if there is no such frame.
 
-        Raises:
-            InputError: there is no such frame.
+        See `photonpano.KnowsSharpViews`.
         """
         return self.source.sharp_view(self._read(FrameSpan(frame, frame + 1)).start)
 

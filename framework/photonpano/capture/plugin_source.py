@@ -56,8 +56,7 @@ class PluginSource:
     def __init__(self, source: Source, origin: str | None) -> None:
         """Take the source, and who provides it; None for a source that is neither checked nor named.
 
-        Raises:
-            PluginError: `info`, `valid` or `response` is not what it should be.
+        Raises a `PluginError` if `info`, `valid` or `response` is not what it should be.
         """
         self.given: Any = source
         self._origin = origin

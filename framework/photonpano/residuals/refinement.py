@@ -220,8 +220,7 @@ class MotionFit:
         compared = partial(halves_of, self._source, self.motion, self.canvas, self._context)
         once, of_motion = self._context.checkpoints.once, (self.motion.homographies, self.motion.span)
         halves = once("halves", compared, *of_motion)
-        lasting = partial(lasting_of, residuals, self.predictions, self._context)
-        lasting = once("lasting", lasting, *of_motion) if noise_hides_shifts(residuals) else None
+        lasting = once("lasting", self._lasting, *of_motion) if noise_hides_shifts(residuals) else None
         # Two frames know no more of each other than the weakest cut between them lets through.
         motion = replace(self.motion, std_px=np.maximum(std_px, halves.tied_px(located)))
         return Explained(
@@ -252,6 +251,9 @@ class MotionFit:
         # What else is not explained, such as a tremor, moves blocks by more than photon noise.
         misfit = max(1.0, float(self.residuals.reduced_chi2.mean())) ** 0.5
         return None if found is None or found.sigmas <= 5 * misfit else found
+
+    def _lasting(self) -> Lasting:
+        return lasting_of(self.residuals, self.predictions, self._context)
 
     def _measured(self) -> Residuals:
         return measure(self.motion.span, self.predictions, self._context)

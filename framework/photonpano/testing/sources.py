@@ -37,9 +37,7 @@ class SourceConformance(Conformance):
     def write(self, frames: NDArray[np.generic], folder: Path) -> Mapping[str, Any]:
         """Write frames as a capture and return the keys that open it; override this for a source that reads files.
 
-        Args:
-            frames: (n_frames, *frame_shape), uint8, or uint16 for a bit depth of more than 8.
-            folder: an empty folder for the files.
+        They are (n_frames, *frame_shape), uint8, or uint16 for a bit depth of more than 8; the folder is empty.
         """
         del frames, folder
         return {}
