@@ -34,11 +34,9 @@ def gradient_of(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def exceeding_noise(steps: FloatArray, variances: FloatArray) -> Filtered:
-    """Denoise a series of steps with an empirical Wiener filter, window by window.
+    """Denoise a series of steps, (S,) in px, with an empirical Wiener filter, window by window.
 
-    Args:
-        steps: (S,) in px.
-        variances: (S,) of their photon noise; infinite where a step is unknown.
+    The `variances` of their photon noise, (S,), are infinite where a step is unknown.
     """
     size = min(WINDOW, 2 ** int(np.log2(len(steps))))
     known = np.isfinite(variances)
@@ -78,10 +76,8 @@ def exceeding_noise(steps: FloatArray, variances: FloatArray) -> Filtered:
 def smooth_share(path: FloatArray) -> float:
     """Return how far accelerations predict an evenly sampled path: 1 if it is smooth, 0 if it trembles as fast as samples.
 
-    It is the share of the squares of second differences that third differences do not have. Noise has none.
-
-    Args:
-        path: (N, K) values, at least 4.
+    It is the share of the squares of second differences that third differences do not have. Noise has none. The path has (N, K)
+    values, at least 4.
     """
     second, third = (float((np.diff(path, order, axis=0) ** 2).mean()) for order in (2, 3))
     return float(np.clip(1 - third / max(second, np.finfo(float).tiny), 0, 1))

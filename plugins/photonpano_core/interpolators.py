@@ -194,8 +194,7 @@ class GeodesicTrajectory(HeldTrajectory):
 def group_steps(instants: FloatArray, knots: FloatArray) -> FloatArray:
     """Return the logarithms of the motion from each of N unimodular knots to the next, (N - 1, 3, 3).
 
-    Raises:
-        LocationError: a step has no real logarithm.
+    Raises a `LocationError` if a step has no real logarithm.
     """
     steps = logarithm(np.linalg.inv(knots[:-1]) @ knots[1:])
     for missing in np.flatnonzero(np.isnan(steps[:, 0, 0])):

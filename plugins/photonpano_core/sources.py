@@ -251,8 +251,7 @@ def _unpacked(config: _AnyConfig) -> dict[str, Any]:
 def _open_npy(config: _AnyConfig) -> _AnySource:
     """Open a capture; raises an `InputError`, also where a file cannot be unpacked."""
     config = config.model_copy(update=_unpacked(config))
-    header = _whole_header(config)
-    return _npy_source(config, config.path, header)
+    return _npy_source(config, _whole_header(config))
 
 
 def _arrived_npy(config: _AnyConfig) -> Arrived:
@@ -266,10 +265,11 @@ def _arrived_npy(config: _AnyConfig) -> Arrived:
     header = _header(config)
     promised, *frame_shape = header.shape
     arrived = header._replace(shape=(n_frames, *frame_shape))
-    return Arrived(_npy_source(config, config.path, arrived) if n_frames else None, promised)
+    return Arrived(_npy_source(config, arrived) if n_frames else None, promised)
 
 
-def _npy_source(config: _AnyConfig, path: Location, header: NpyHeader) -> _AnySource:
+def _npy_source(config: _AnyConfig, header: NpyHeader) -> _AnySource:
+    path = config.path
     if isinstance(config, NpyConfig) and config.frames_per_sum is not None:
         return _NpySums(_Values(path, header, config.frame_axis == "last"), config.frames_per_sum, config.frame_rate_hz)
 

@@ -69,7 +69,11 @@ class _Scan:
 
     def near(self, canvas: Canvas) -> list[Chunk]:
         """Return the chunks whose frames may reach into a canvas."""
-        return _visible(self.chunks, canvas, self.source.info.frame_shape)
+        to_canvas = canvas.transform @ np.array([chunk.homography for chunk in self.chunks])
+        outlines = transform_points(to_canvas, corners(self.source.info.frame_shape))
+        low, high = outlines.min(axis=1) - 1, outlines.max(axis=1) + 1
+        inside = (high >= 0).all(axis=1) & (low <= [canvas.width - 1, canvas.height - 1]).all(axis=1)
+        return [chunk for chunk, flag in zip(self.chunks, inside, strict=True) if flag]
 
 
 class SuperResolutionRenderer:
@@ -317,16 +321,6 @@ class PhotonSums:
         return PhotonSums(lit, seen, None if self.light is None else self.light.part(box))
 
 
-def _visible(chunks: Sequence[Chunk], canvas: Canvas, frame_shape: tuple[int, int]) -> list[Chunk]:
-    """Return the chunks whose frames may reach into a canvas."""
-    if not chunks:
-        return []
-    outlines = transform_points(canvas.transform @ np.array([chunk.homography for chunk in chunks]), corners(frame_shape))
-    low, high = outlines.min(axis=1) - 1, outlines.max(axis=1) + 1
-    inside = (high >= 0).all(axis=1) & (low <= [canvas.width - 1, canvas.height - 1]).all(axis=1)
-    return [chunk for chunk, flag in zip(chunks, inside, strict=True) if flag]
-
-
 def sums_on(
     source: Source, chunks: Sequence[Chunk], canvas: Canvas, advance: Callable[[int], None], pool: Executor
 ) -> PhotonSums:
@@ -357,13 +351,7 @@ def _summed(capture: Capture, terms: LightTerms | None, chunk: Chunk) -> _Summed
     return np.ascontiguousarray(capture.corrected_counts(chunk.span), np.float32), amounts, usable
 
 
-def _add(
-    summed: Sequence[_Summed],
-    to_grid: Sequence[Homography],
-    lit: FluxImage,
-    seen: FluxImage,
-    rows: range,
-) -> None:
+def _add(summed: Sequence[_Summed], to_grid: Sequence[Homography], lit: FluxImage, seen: FluxImage, rows: range) -> None:
     part = slice(rows.start, rows.stop)
     for (counts, amounts, usable), homography in zip(summed, to_grid, strict=True):
         add_observations(counts, usable, amounts, homography, rows.start, lit[part], seen[:, part])

@@ -279,8 +279,10 @@ class DirectLocator:
             initial = next(iter(self.hypotheses(moving, fixed)), np.eye(3))
         start = np.array(initial, dtype=np.float64)
         outcome = _Alignment(self._config, None).aligned(moving, fixed, start, searches)
-        if self._camera_matrix is None or _determined(outcome):
+        if self._camera_matrix is None:
             return outcome
+        if isinstance(outcome, Located) and outcome.residual_px is not None and outcome.residual_px <= _DETERMINED_PX:
+            return outcome  # the pair determines all eight parameters of a homography
         turned = _Alignment(self._config, self._camera_matrix).aligned(moving, fixed, start, searches)
         return outcome if isinstance(turned, NotLocated) or _contradicts(turned, outcome) else turned
 
@@ -291,11 +293,6 @@ def _contradicts(turned: Located, outcome: Located | NotLocated) -> bool:
         return False
     away = parameters(turned.homography) - parameters(outcome.homography)
     return float(away @ outcome.information @ away) > _CONTRADICTION * len(away)
-
-
-def _determined(outcome: Located | NotLocated) -> bool:
-    """Return whether a pair determines all eight parameters of a homography."""
-    return isinstance(outcome, Located) and outcome.residual_px is not None and outcome.residual_px <= _DETERMINED_PX
 
 
 class _Alignment:

@@ -29,6 +29,7 @@ from photonpano.reading import (
     BinarySource,
     FrameFile,
     FrameLayout,
+    OpenFiles,
     PackedFileSource,
     as_written,
     files_in,
@@ -89,9 +90,6 @@ def bin_source(
 ) -> SourceContribution:
     """Return the contribution of a source of .bin files; `footer_bytes` may follow the frames of a file."""
 
-    def opened(config: BinConfig) -> PackedFileSource:
-        return PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz)
-
     def arrived(config: BinConfig) -> Arrived:
         """Open the frames that are there of a capture that is still being written: files appear, and the last one grows."""
         path = config.path
@@ -106,7 +104,7 @@ def bin_source(
         name=name,
         summary=summary,
         config=config,
-        build=lambda config, _: opened(config),
+        build=lambda config, _: PackedFileSource(frame_files(config.path, layout, footer_bytes), layout, config.frame_rate_hz),
         check=lambda config: objections(frame_files, config.path, layout, footer_bytes),
         recognise=recognise,
         arrived=arrived,
@@ -380,7 +378,7 @@ class Spad512SparseSource(BinarySource):
     """Little-endian uint32 addresses, 512 y + x, of lit pixels; 512 x 512 ends a frame."""
 
     def __init__(self, config: Spad512SparseConfig) -> None:
-        self._paths = _files(config.path)
+        self._paths, self._read = _files(config.path), OpenFiles()
         self._ends = [_frame_ends(path) for path in self._paths]
         self._starts = list(accumulate(map(len, self._ends), initial=0))
         super().__init__(self._starts[-1], FrameLayout((_SIZE, _SIZE), (_SIZE, _SIZE // 8)), config.frame_rate_hz)
@@ -407,9 +405,13 @@ class Spad512SparseSource(BinarySource):
                 stop = min(first + _MOST_FRAMES, len(ends), span.stop - offset)
                 begin = ends[first - 1] if first else 0
                 words = np.empty(int(ends[stop - 1] - begin), _WORD)
-                self.files.read(path, int(begin) * _WORD.itemsize, words.view(np.uint8))
+                self._read.read(path, int(begin) * _WORD.itemsize, words.view(np.uint8))
                 at = slice(offset + first - span.start, offset + stop - span.start)
                 yield at, _places(words)
+
+    def close(self) -> None:
+        """Close the files."""
+        self._read.close()
 
 
 def _places(words: NDArray[np.uint32]) -> NDArray[np.int64]:

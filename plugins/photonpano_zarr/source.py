@@ -340,7 +340,6 @@ class _Chunks(BinarySource):
             raise InputError(f"{path} is damaged: it cannot be decompressed to a chunk of {shape}; copy it again") from error
 
     def close(self) -> None:
-        super().close()
         self._pieces.close()
 
 

@@ -73,4 +73,4 @@ def test_quick_figures_show_what_the_paper_says(make_paper, tmp_path, without_re
         assert min(image.shape[:2]) > 100
     page = (tmp_path / "README.md").read_text()
     assert f"mean corner error {numbers['fig5']['constant']['mean_px']:g} px" in page
-    assert re.search(r"fig5: begin -->\nEach capture has 600 frames at 100,000 Hz\.\n\n\| The paper", page)
+    assert re.search(r"fig5: begin -->\nEach capture has 400 frames at 100,000 Hz\.\n\n\| The paper", page)

@@ -16,7 +16,8 @@ pytestmark = pytest.mark.usefixtures("without_report")
 
 PAN: dict[str, Any] = {"kind": "pan", "length_px": 60, "angle_deg": 17}
 TURN = {"kind": "turn", "degrees": 40, "pitch_wobble_deg": 5}
-LONG_GROUPS = {"resample": {"with": {"group_size": 100}}, "refine": []}
+SHIFTS = {"motion": {"model": "translation"}, "resample": {"with": {"group_size": 40}}}
+LONG_GROUPS = SHIFTS | {"resample": {"with": {"group_size": 100}}, "refine": []}
 # What the simulator is told; the spec; what is doubtful; the advice; and the spec that follows it.
 ADVICE: dict[str, tuple[dict[str, Any], dict[str, Any], str, str, dict[str, Any]]] = {
     "refiner": (
@@ -28,10 +29,10 @@ ADVICE: dict[str, tuple[dict[str, Any], dict[str, Any], str, str, dict[str, Any]
     ),
     "light": (
         {"path": PAN, "lamps": [{"frequency_hz": 600, "depth": 0.6}]},
-        {"light": "steady"},
+        {"light": "steady"} | SHIFTS,
         "the light changes over time",
         "write light: auto",
-        {"light": "auto"},
+        {"light": "auto"} | SHIFTS,
     ),
     "lens": (
         {"path": TURN, "focal_length_px": 200, "distortion": {"k1": -0.3}, "frame_shape": [96, 144], "n_frames": 400},

@@ -71,7 +71,7 @@ def test_pan_past_a_wall_with_one_line_is_not_trusted(tmp_path: Path, outcome_of
     true[:, 0, 2], true[:, 1, 2] = 10 + np.linspace(0, 280, 500), 15 + 6 * np.sin(np.linspace(0, 2 * np.pi, 500))
     scene = textured((140, 450), FLUX, seed=2).astype(np.float32)
     scene[:, 110:250], scene[62:64, 110:250] = FLUX, 0.6 * FLUX
-    outcome = outcome_of(parse_spec(spec_of(true, scene, SHAPE, tmp_path)))
+    outcome = outcome_of(parse_spec(spec_of(true, scene, SHAPE, tmp_path) | {"levels": 2}))
     found = load_run_trajectory(outcome.directory)
     [reason] = outcome.record["verdict"]["reasons"]
     assert "along one direction" in reason["what"]
@@ -89,7 +89,7 @@ def test_error_of_the_reference_frame_is_that_of_all(tmp_path: Path, outcome_of:
     true[:, 0, 2] = 20 + 0.6 * np.minimum(np.arange(N_FRAMES), N_FRAMES - 1 - np.arange(N_FRAMES))
     true[:, 1, 2] = 40 + 3 * np.sin(np.arange(N_FRAMES) / 60)
     scene = textured((150, 360), FLUX, seed=4).astype(np.float32)
-    found = load_run_trajectory(outcome_of(parse_spec(spec_of(true, scene, SHAPE, tmp_path))).directory)
+    found = load_run_trajectory(outcome_of(parse_spec(spec_of(true, scene, SHAPE, tmp_path) | {"levels": 2})).directory)
     to_reference = np.linalg.inv(true[N_FRAMES // 2]) @ true
     errors_px = corner_displacements(np.linalg.inv(to_reference) @ found.homographies, np.eye(3), SHAPE).mean(axis=-1)
     assert errors_px.mean() > 0.2

@@ -16,11 +16,11 @@ from typing import Any
 
 from photonpano.errors import InputError, Problem, SpecError
 from photonpano.files.paths import Location, Url, as_written, given_path, location, refusal
-from photonpano.plugins.contributions import SourceContribution
 from photonpano.plugins.registry import Catalog
 from photonpano.record.batch_row import BatchRow, written
 from photonpano.record.contents import RECORD
 from photonpano.specs import Plan, parse_spec
+from photonpano.specs.builtin import known_endings
 from photonpano.specs.yaml_reader import Place, read_yaml
 
 _TRUTH = ".truth.npz"
@@ -52,8 +52,7 @@ def find_captures(
     """
     found: dict[Location, Location] = {}
     problems: list[str] = []
-    sources = [each.contribution for each in catalog.rows if isinstance(each.contribution, SourceContribution)]
-    endings = {suffix for source in sources for suffix in source.suffixes}
+    endings = known_endings(catalog)
     nothing_given = True
     for text, folder, where in _texts(given, lists, problems):
         nothing_given = False
@@ -119,7 +118,7 @@ def _lines(path: Path) -> tuple[Sequence[str], Path]:
         raise InputError(f"{path}: the list of captures cannot be read: {error.strerror}") from error
 
 
-def _captures_at(text: str, folder: Path, endings: set[str], is_capture: Callable[[Path], bool]) -> Sequence[Location]:
+def _captures_at(text: str, folder: Path, endings: Sequence[str], is_capture: Callable[[Path], bool]) -> Sequence[Location]:
     """Return the captures that a path, a URL, or a pattern stands for; `InputError` if there are none."""
     if isinstance(url := location(text), Url):
         if "*" in str(url):
@@ -140,7 +139,7 @@ def _captures_at(text: str, folder: Path, endings: set[str], is_capture: Callabl
     return captures
 
 
-def _captures_in(folder: Path, endings: set[str], is_capture: Callable[[Path], bool]) -> list[Path]:
+def _captures_in(folder: Path, endings: Sequence[str], is_capture: Callable[[Path], bool]) -> list[Path]:
     """Return a folder that is a capture, or else the captures in it, and files that end as captures do."""
     if is_capture(folder):
         return [folder]

@@ -18,10 +18,7 @@ from photonpano.capture import capture_of
 from photonpano.capture.writing import truth_path
 from photonpano.contracts.protocols import Score, Trajectory
 from photonpano.errors import InputError, OutputError
-from photonpano.evaluation import (
-    Evaluation,
-    load_run_trajectory,
-)
+from photonpano.evaluation import Evaluation, load_run_trajectory
 from photonpano.evaluation import evaluate as evaluate_folder
 from photonpano.evaluation.inputs import RunTrajectory, kind_of_run, load_truth
 from photonpano.evaluation.run_scores import motion_difference, on_canvas, reduced

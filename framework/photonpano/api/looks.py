@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import typer
 
@@ -29,9 +29,6 @@ from photonpano.report.preview import Style, pictures, preview_spans, white_flux
 from photonpano.specs import Plan, parse_spec
 from photonpano.text import columns, counted, duration
 from photonpano.values import CaptureSummary, StreamInfo
-
-if TYPE_CHECKING:
-    pass  # imports numba, which only a forecast needs
 
 HOT_SHARE = 0.001  # fraction of hot pixels above which a mask is recommended
 STANDING_SHARE = 0.5  # if more of the frame is static than this, `corrections: auto` masks nothing

@@ -50,7 +50,7 @@ class Gather:
         part = slice(top, top + index.shape[0]), slice(left, left + index.shape[1])
         self._slices = part if np.array_equal(numbered(frame_shape)[part], index) else None
 
-    def __call__(self, frames: Any) -> Any:
+    def __call__(self, frames: NDArray[Any]) -> NDArray[Any]:
         """Gather the pixels of (..., h, w) frames: (..., H, W), 0 where the sensor has none."""
         if self._slices is not None:
             return np.ascontiguousarray(frames[..., self._slices[0], self._slices[1]])
@@ -141,16 +141,14 @@ class Capture(Closing):
 
     def counts(self, span: FrameSpan) -> Counts:
         """Sum the frames of a span: (H, W) uint32."""
-        counts: Counts = self._gathered(self.source.counts(self._read(span)))
-        return counts
+        return self._gathered(self.source.counts(self._read(span)))
 
     def chunk(self, span: FrameSpan) -> Counts:
         """Sum the frames of a span: (H, W) uint32, or uint8 if it is cheaper and holds the sum."""
         if not self.is_packed or len(span) > MAX_FRAMES:
             return self.counts(span)
         packed, width = self.source.packed(self._read(span)), self.source.info.width
-        counts: Counts = self._gathered(packed_counts(packed, width, small=True))
-        return counts
+        return self._gathered(packed_counts(packed, width, small=True))
 
     def chunks(self, spans: Iterable[FrameSpan]) -> Iterator[Counts]:
         """Yield the sum of the frames of each span, see `chunk`. Reads a span when its sum is asked for."""
@@ -158,8 +156,7 @@ class Capture(Closing):
 
     def frames(self, span: FrameSpan) -> Frames:
         """Return the frames of a span one by one: (n, H, W)."""
-        frames: Frames = self._gathered(self.source.frames(self._read(span)))
-        return frames
+        return self._gathered(self.source.frames(self._read(span)))
 
     def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
         """Return the binary frames of a span, eight pixels to a byte, as `numpy.packbits` does: (n, H, ceil(W / 8))."""
@@ -170,14 +167,8 @@ class Capture(Closing):
     def corrected(self, counts: Counts, n_frames: int) -> FluxImage:
         """Correct a sum of frames, so that on average it is the sum of frames of the flux alone.
 
-        The correction is linear, so that the average is right; the result may be negative.
-
-        Args:
-            counts: (H, W), from `counts` or `chunk`.
-            n_frames: number of frames in the sum.
-
-        Returns:
-            (H, W) float32; `counts` itself if there is nothing to correct.
+        The sum is (H, W), from `counts` or `chunk`. The correction is linear, so that the average is right; the result, (H, W)
+        float32, may be negative. It is `counts` itself if there is nothing to correct.
         """
         summed: Any = np.asarray(counts, np.uint32) if self.steps else counts
         for step in self.steps:
@@ -261,10 +252,9 @@ class Capture(Closing):
         return self.gather is None and self.colour is None and self.source.offers("sharp_view")
 
     def sharp_view(self, frame: int) -> FluxImage:
-        """Return the flux of a frame of a simulated capture without noise, see `photonpano.KnowsSharpViews`.
+        """Return the flux of a frame of a simulated capture without noise; `InputError` if there is no such frame.
 
-        Raises:
-            InputError: there is no such frame.
+        See `photonpano.KnowsSharpViews`.
         """
         return self.source.sharp_view(self._read(FrameSpan(frame, frame + 1)).start)
 
@@ -282,7 +272,7 @@ class Capture(Closing):
         self.info.require(span)
         return FrameSpan(self.first + span.start, self.first + span.stop)
 
-    def _gathered(self, frames: Any) -> Any:
+    def _gathered(self, frames: NDArray[Any]) -> NDArray[Any]:
         return frames if self.gather is None else self.gather(frames)
 
 

@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonpano.contracts.attribution import attributing
-from photonpano.contracts.protocols import (
-    ColouredSource,
-    KnowsSharpViews,
-    KnowsTruth,
-    PackedSource,
-    Source,
-)
+from photonpano.contracts.protocols import ColouredSource, KnowsSharpViews, KnowsTruth, PackedSource, Source
 from photonpano.contracts.requirements import (
     require_info,
     require_mask,
@@ -62,8 +56,7 @@ class PluginSource:
     def __init__(self, source: Source, origin: str | None) -> None:
         """Take the source, and who provides it; None for a source that is neither checked nor named.
 
-        Raises:
-            PluginError: `info`, `valid` or `response` is not what it should be.
+        Raises a `PluginError` if `info`, `valid` or `response` is not what it should be.
         """
         self.given: Any = source
         self._origin = origin
@@ -89,19 +82,16 @@ class PluginSource:
 
     def counts(self, span: FrameSpan) -> Counts:
         """Sum the frames of a span: (H, W) uint32."""
-        counts: Counts = self._read("counts", span, self.info.frame_shape, len(span) * self._highest)
-        return counts
+        return self._read("counts", span, self.info.frame_shape, len(span) * self._highest)
 
     def frames(self, span: FrameSpan) -> Frames:
         """Return the frames of a span one by one: (n, H, W)."""
-        frames: Frames = self._read("frames", span, (len(span), *self.info.frame_shape), self._highest)
-        return frames
+        return self._read("frames", span, (len(span), *self.info.frame_shape), self._highest)
 
     def packed(self, span: FrameSpan) -> NDArray[np.uint8]:
         """Return the frames of a span, eight pixels to a byte: see `photonpano.PackedSource`."""
         height, width = self.info.frame_shape
-        packed: NDArray[np.uint8] = self._read("packed", span, (len(span), height, -(-width // 8)), 255)
-        return packed
+        return self._read("packed", span, (len(span), height, -(-width // 8)), 255)
 
     def colours(self) -> Mapping[str, PluginSource]:
         """Return a source for each colour: see `photonpano.ColouredSource`."""
@@ -158,9 +148,9 @@ class PluginSource:
     def _attributing(self, where: str) -> AbstractContextManager[None]:
         return nullcontext() if self._origin is None else attributing(self._origin, where)
 
-    def _read(self, what: str, span: FrameSpan, shape: tuple[int, ...], highest: int) -> Any:
+    def _read(self, what: str, span: FrameSpan, shape: tuple[int, ...], highest: int) -> NDArray[Any]:
         """Read a span with a method of the source, and check the array."""
-        method: Callable[[FrameSpan], Any] = getattr(self.given, what)
+        method: Callable[[FrameSpan], NDArray[Any]] = getattr(self.given, what)
         if self._origin is None:
             return method(span)
         with self._attributing(str(span)):

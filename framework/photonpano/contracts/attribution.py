@@ -16,13 +16,10 @@ _MAKERS = ("fit", "fit_turns", "turning")  # methods that return another compone
 
 @contextmanager
 def attributing(label: str, where: str) -> Iterator[None]:
-    """Raise a `PluginError` that names a component for errors of the block.
+    """Raise a `PluginError` that names a component for errors of the block. Errors that are written for users pass unchanged.
 
-    Errors that are written for users pass unchanged.
-
-    Args:
-        label: who provides the component, such as "merger 'photon-mle' of photonpano 0.1.0".
-        where: what it works on, such as "level 2" or "frames 0 to 15".
+    The `label` says who provides it, such as "merger 'photon-mle' of photonpano 0.1.0", `where` what it works on, such as
+    "level 2" or "frames 0 to 15".
     """
     try:
         yield

@@ -64,7 +64,7 @@ def shown(value: object) -> str:
 
 def require_info(info: Any) -> StreamInfo:
     """Return the `info` of a source."""
-    require_instance(info, StreamInfo)
+    checked: StreamInfo = require_instance(info, StreamInfo)
     for name in ("n_frames", "height", "width", "bit_depth"):
         size: Any = getattr(info, name)
         if not (isinstance(size, int | np.integer) and size >= 1):
@@ -76,15 +76,12 @@ def require_info(info: Any) -> StreamInfo:
     rate: Any = info.frame_rate_hz
     if rate is not None and not (isinstance(rate, int | float | np.number) and 0 < rate < np.inf):
         raise BrokenContract(f"info.frame_rate_hz is a finite number above 0, or None if it is not known; got {rate!r:.60}")
-    checked: StreamInfo = info
     return checked
 
 
 def require_mask(valid: Any, frame_shape: tuple[int, int]) -> BoolArray:
     """Return the mask `valid` of a source."""
-    require_array("valid", valid, frame_shape, "bool", "b")
-    mask: BoolArray = valid
-    return mask
+    return require_array("valid", valid, frame_shape, "bool", "b")
 
 
 def require_response(response: Any) -> Response:
@@ -122,17 +119,15 @@ def require_range(found: NDArray[Any], method: str, highest: int) -> None:
 
 def require_sharp_view(found: Any, shape: tuple[int, int]) -> NDArray[Any]:
     """Return the frame without noise that a simulator returned."""
-    require_array("the result of sharp_view()", found, shape, "float32", "f")
-    if bad := found.size - int(np.count_nonzero(np.isfinite(found))):
-        raise BrokenContract(f"sharp_view() returns finite numbers; {bad} of {found.size} pixels are NaN or infinite")
-    image: NDArray[Any] = found
+    image = require_array("the result of sharp_view()", found, shape, "float32", "f")
+    if bad := image.size - int(np.count_nonzero(np.isfinite(image))):
+        raise BrokenContract(f"sharp_view() returns finite numbers; {bad} of {image.size} pixels are NaN or infinite")
     return image
 
 
 def require_truth(found: Any) -> Mapping[str, NDArray[np.generic]]:
     """Return the ground truth of a simulator."""
-    require_instance(found, Mapping)
-    truth: Mapping[str, NDArray[np.generic]] = found
+    truth: Mapping[str, NDArray[np.generic]] = require_instance(found, Mapping)
     return truth
 
 
@@ -155,7 +150,7 @@ def require_groups(found: Any, n_frames: int, *_: Any) -> tuple[Group, ...]:
 
 def require_exposure(found: Any, source: Source, group: Group, _: Any, scale: float) -> VirtualExposure:
     """Return the exposure of a merger."""
-    require_instance(found, VirtualExposure)
+    exposure: VirtualExposure = require_instance(found, VirtualExposure)
     if found.scale != scale:
         raise BrokenContract(f"expected an exposure of scale {scale:g}, got {found.scale:g}")
     if found.group != group:
@@ -166,7 +161,6 @@ def require_exposure(found: Any, source: Source, group: Group, _: Any, scale: fl
         raise BrokenContract(f"response is that of the source, got {shown(found.response)}")
     height, width = (max(1, round(side * scale)) for side in source.info.frame_shape)
     _require_images(found, (height, width))
-    exposure: VirtualExposure = found
     return exposure
 
 
@@ -288,7 +282,7 @@ def require_refined(found: Any, _source: Any, _trajectory: Any, std_px: FloatArr
     """Return the motion of a refiner, whose expected errors were (T,) `std_px`; None if it found nothing."""
     if found is None:
         return None
-    require_instance(found, Refined)
+    refined: Refined = require_instance(found, Refined)
     n_frames = len(std_px)
     require_array("homographies", found.homographies, (n_frames, 3, 3), "float64", "fiu")
     require_array("std_px", found.std_px, (n_frames,), "float64", "fiu")
@@ -311,7 +305,6 @@ def require_refined(found: Any, _source: Any, _trajectory: Any, std_px: FloatArr
             f"std_px is infinite exactly where it was before; that of frame {first} was {std_px[first]:g}, and is "
             f"{found.std_px[first]:g}"
         )
-    refined: Refined = found
     return refined
 
 
@@ -337,10 +330,11 @@ def require_files(written: Collection[str], path: Path) -> None:
 # For several kinds
 
 
-def require_instance(found: object, *kinds: type) -> None:
-    """Refuse what is of none of these types."""
+def require_instance(found: Any, *kinds: type) -> Any:
+    """Return a value, or refuse what is of none of these types."""
     if not isinstance(found, kinds):
         raise BrokenContract(f"expected {' or '.join(kind.__name__ for kind in kinds)}, got {shown(found)}")
+    return found
 
 
 def _require_methods(*names: str) -> Callable[..., Any]:
@@ -354,10 +348,11 @@ def _require_methods(*names: str) -> Callable[..., Any]:
     return require
 
 
-def require_array(name: str, array: object, shape: tuple[int, ...], dtype: str, kinds: str = "f") -> None:
-    """Refuse what is not an array of a shape; `kinds` are those of numbers that can become the `dtype`."""
+def require_array(name: str, array: object, shape: tuple[int, ...], dtype: str, kinds: str = "f") -> NDArray[Any]:
+    """Return an array of a shape, or refuse anything else; `kinds` are those of numbers that can become the `dtype`."""
     if not (isinstance(array, np.ndarray) and array.shape == shape and array.dtype.kind in kinds):
         raise BrokenContract(f"{name} must be {shape} of {dtype}, got {shown(array)}")
+    return array
 
 
 def require_finite(name: str, array: Any, shape: tuple[int, ...]) -> None:

@@ -270,19 +270,16 @@ class Mask(Correction):
 
 
 def _read_mask(path: Path) -> BoolArray:
+    """Return the bad pixels: (H, W), those of a picture of 8 or 16 bits that are not black."""
     expected = "a mask of bad pixels"
     if path.suffix.lower() == ".png":
-        return _read_picture(path, f"is not {expected}: it is no picture that can be read")
+        import cv2
+
+        otherwise = f"is not {expected}: it is no picture that can be read"
+        return np.asarray(read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH).any(axis=-1))
     mask = read_array(path, expected)
     if mask.dtype != np.bool_:
         raise InputError(
             f"{path} holds {mask.dtype} values; a mask is a .npy file of bool, true for pixels that must not be used"
         )
     return mask
-
-
-def _read_picture(path: Path, otherwise: str) -> BoolArray:
-    """Return which pixels of a picture of 8 or 16 bits are not black: (H, W)."""
-    import cv2
-
-    return np.asarray(read_picture(path, otherwise, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH).any(axis=-1))

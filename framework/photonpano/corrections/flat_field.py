@@ -117,8 +117,7 @@ def write_vignette(folder: Path, vignette: Vignette) -> None:
 def read_vignette(folder: Path, source: Source) -> Vignette | None:
     """Read the vignette of a run folder; None if there is none.
 
-    Raises:
-        InputError: the file is damaged, or of frames of another size.
+    Raises an `InputError` if the file is damaged, or of frames of another size.
     """
     path = folder / VIGNETTE_FILE
     if not path.exists():

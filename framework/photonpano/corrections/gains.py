@@ -214,19 +214,14 @@ def _shifted(seen: SeenCells, brightness: FloatArray, weight: FloatArray, left: 
     unseen = np.bincount(seen.cells, minlength=seen.n_cells) == 0
     image = np.where(unseen, np.nan, brightness).reshape(seen.canvas.shape)
     gradient = np.stack([np.nan_to_num(each).ravel() for each in gradient_of(image)])[:, seen.cells]
+    # Least-squares equations of each span: both shifts, beside a change of the light.
+    sums = partial(np.bincount, seen.times, minlength=len(seen.spans))
     columns = np.concatenate([gradient, np.ones((1, len(left)))])
-    normal, right = _equations_of_groups(seen.times, len(seen.spans), columns, weight, left)
-    shift = np.linalg.solve(normal + np.eye(3), right[..., None])[:, :2, 0]
+    weighted = weight * columns
+    normal = np.array([[sums(one * other) for other in columns] for one in weighted])
+    right = np.array([sums(one * left) for one in weighted])
+    shift = np.linalg.solve(np.moveaxis(normal, -1, 0) + np.eye(3), right.T[..., None])[:, :2, 0]
     return np.asarray((shift[seen.times].T * gradient).sum(axis=0))
-
-
-def _equations_of_groups(
-    groups: NDArray[np.intp], number: int, columns: FloatArray, weight: FloatArray, target: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the least-squares equations of each group of observations, for K columns (K, N): (G, K, K) and (G, K)."""
-    normal = np.array([[np.bincount(groups, weight * one * other, number) for other in columns] for one in columns])
-    right = np.array([np.bincount(groups, weight * one * target, number) for one in columns])
-    return np.moveaxis(normal, -1, 0), right.T
 
 
 def _step(seen: SeenCells, weight: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -252,6 +247,7 @@ def _step(seen: SeenCells, weight: FloatArray, step: FloatArray) -> tuple[FloatA
 
 _PERIODS = 1.2  # periods for which a place must be in view
 _FINER = 3  # oversampling of frequency: steps per 1/T, where a place is in view for T
+_AT_ONCE = 32  # frequencies whose waves are compared with the photons at once: some megabytes each for a long motion
 _STANDS_OUT = 3.0  # what a flicker explains at least, relative to the median over frequencies
 _BETTER = 0.7  # of what one gain for all of the scene leaves, what a flicker of places leaves at most
 _ACCURACY = 1e-3  # of the frequency, relative to it
@@ -298,7 +294,8 @@ def local_flicker(gains: Gains) -> LocalFlicker | None:
         return None
     ratio, weight = _relative(gains)
     series, weights = _of_neighbours(seen, weight * ratio), _of_neighbours(seen, weight)
-    found = [_explained(series, weights, instants, each) for each in frequencies]
+    parts = np.array_split(frequencies, -(-len(frequencies) // _AT_ONCE))
+    found = np.concatenate([_explained(series, weights, instants, each) for each in parts])
     peak = int(np.argmax(found))
     # Of a wave of amplitude a, this is a^2 / 2.
     smallest = max(_STANDS_OUT * float(np.median(found)), _SMALLEST**2)
@@ -316,20 +313,19 @@ def local_flicker(gains: Gains) -> LocalFlicker | None:
     return flicker if is_local else None
 
 
-def _explained(series: FloatArray, weights: FloatArray, instants: FloatArray, frequency: float) -> float:
-    """Return the mean square that waves of a frequency explain in (C, S) weighted series, each with a mean of its own."""
-    turns = 2 * np.pi * frequency * instants
-    columns = np.stack([np.ones(len(turns)), np.cos(turns), np.sin(turns)])
-    light, of_cosine, of_sine = (series @ columns.T).T
-    total, cosine, sine, squares, product = (weights @ np.concatenate([columns, columns[1] * columns[1:]]).T).T
-    total = np.maximum(total, 1e-12)
+def _explained(series: FloatArray, weights: FloatArray, instants: FloatArray, frequencies: FloatArray) -> FloatArray:
+    """Return the mean square, (F,), that waves of each frequency explain in (C, S) weighted series with means of their own."""
+    turns = 2 * np.pi * np.outer(instants, frequencies)
+    cosines, sines = np.cos(turns), np.sin(turns)
+    light, total = series.sum(axis=1, keepdims=True), np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
+    cosine, sine = weights @ cosines, weights @ sines
     # Normal equations of cosine and sine, beside the mean: least squares by Cramer's rule.
-    of_cosine, of_sine = of_cosine - light * cosine / total, of_sine - light * sine / total
-    least, rest = _LEAST_INFORMATION * total + 1e-12, total - squares
-    squares, rest = squares - cosine**2 / total + least, rest - sine**2 / total + least
-    product = product - cosine * sine / total
+    of_cosine, of_sine = series @ cosines - light * cosine / total, series @ sines - light * sine / total
+    squares, least = weights @ cosines**2, _LEAST_INFORMATION * total + 1e-12
+    squares, rest = squares - cosine**2 / total + least, total - squares - sine**2 / total + least
+    product = weights @ (cosines * sines) - cosine * sine / total
     gained = rest * of_cosine**2 - 2 * product * of_cosine * of_sine + squares * of_sine**2
-    return float((gained / (squares * rest - product**2)).sum() / total.sum())
+    return np.asarray((gained / (squares * rest - product**2)).sum(axis=0) / total.sum())
 
 
 def _of_neighbours(seen: SeenCells, values: FloatArray) -> FloatArray:

@@ -126,11 +126,7 @@ class Rearrangement(Correction):
 
     @abstractmethod
     def moved(self, pixels: Index) -> Index:
-        """Move the numbers of pixels, (H, W): -1 stands for a pixel that the sensor lacks.
-
-        Raises:
-            InputError: the frame is too small.
-        """
+        """Move the numbers of pixels, (H, W), -1 for one that the sensor lacks; `InputError` if the frame is too small."""
 
 
 class Crop(Rearrangement):

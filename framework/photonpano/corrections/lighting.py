@@ -284,8 +284,7 @@ def write_light(folder: Path, light: Light) -> None:
 def in_light_of(source: Source, folder: Path) -> Source:
     """Return a capture in the light that a run folder holds; as it is, if the run found steady light.
 
-    Raises:
-        InputError: light.npz is damaged, or of a capture with another number of frames.
+    Raises an `InputError` if light.npz is damaged, or of a capture with another number of frames.
     """
     path = folder / LIGHT_FILE
     if not path.exists():

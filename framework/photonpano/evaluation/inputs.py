@@ -148,14 +148,10 @@ def load_run_trajectory(folder: Path) -> RunTrajectory:
                 f"{folder} is a run with `{kind.section}`: it has {kind.name}, and neither homographies nor a panorama"
             )
         raise InputError(f"{folder} has no trajectory.npz, so no run has finished in it; give the folder of a finished run")
-    required, of_camera = (
-        ("homographies", "canvas", "frame_shape", "located", "std_px"),
-        ("camera_matrix", "distortion", "horizon"),
-    )
-    arrays = read_numbers(path, "the trajectory of a run", required, of_camera)
+    required = ("homographies", "canvas", "frame_shape", "located", "std_px")
+    arrays = read_numbers(path, "the trajectory of a run", required, ("camera_matrix", "distortion", "horizon"))
     homographies = _homographies(path, arrays)
-    canvas, located = arrays["canvas"], arrays["located"]
-    std_px = arrays["std_px"]
+    canvas, located, std_px = (arrays[name] for name in ("canvas", "located", "std_px"))
     if canvas.shape != (3, 3):
         raise InputError(f"{path}: canvas must have the shape (3, 3), got {canvas.shape}")
     if not np.isfinite(canvas).all() or not np.linalg.det(canvas):
@@ -182,8 +178,7 @@ def load_run_trajectory(folder: Path) -> RunTrajectory:
 def load_panorama(folder: Path) -> tuple[FluxImage, FluxImage]:
     """Read flux and weight, (H, W) or (H, W, 3) each, of the panorama of a run folder.
 
-    Raises:
-        InputError: a file is missing or damaged, or the two differ in size.
+    Raises an `InputError` if a file is missing or damaged, or the two differ in size.
     """
     flux, weight = (read_tiff(folder / name) for name in ("panorama.tiff", "coverage.tiff"))
     if flux.ndim < 2 or flux.shape[2:] not in ((), (3,)) or flux.shape != weight.shape:

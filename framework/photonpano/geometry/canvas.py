@@ -209,10 +209,8 @@ class Canvas:
 def depths(homographies: FloatArray, frame_shape: tuple[int, int], outline: FloatArray | None = None) -> FloatArray:
     """Return how far points of frames lie before the reference plane, relative to its own frame: (N, P), 0 at its horizon.
 
-    Args:
-        homographies: (N, 3, 3), frame pixels to reference pixels.
-        frame_shape: (height, width) of a frame.
-        outline: (P, 2) points of a frame; by default its corners.
+    The homographies, (N, 3, 3), map pixels of a frame of (height, width) to reference pixels; the outline has (P, 2) points of
+    a frame, by default its corners.
     """
     points = corners(frame_shape) if outline is None else outline
     return np.asarray(homographies[:, 2, :2] @ points.T + homographies[:, 2:, 2])
@@ -248,12 +246,7 @@ def canvas_of(
 
 
 def canvas_of_box(box: Box, scale: float) -> Canvas:
-    """Return the canvas of a box of the reference plane.
-
-    Args:
-        box: in pixels of the reference frame.
-        scale: pixels of the canvas per pixel of the reference frame.
-    """
+    """Return the canvas of a box in pixels of the reference frame; `scale` is pixels of the canvas per pixel of that frame."""
     x0, y0, x1, y1 = box
     width, height = (int(np.ceil(side * scale - 1e-6)) for side in (x1 - x0, y1 - y0))
     return Canvas(height, width, rescaling(scale) @ translation(-x0, -y0))
@@ -287,11 +280,9 @@ class Covered:
 
 
 def outline_of(frame_shape: tuple[int, int], margin_px: float = 0.0) -> FloatArray:
-    """Return points along the border of a frame, clockwise: (P, 2).
+    """Return points along the border of a frame of (height, width), clockwise: (P, 2).
 
-    Args:
-        frame_shape: (height, width).
-        margin_px: distance of the border from the centres of the outer pixels.
+    The border is `margin_px` away from the centres of the outer pixels.
     """
     left, top = -margin_px, -margin_px
     right, bottom = frame_shape[1] - 1 + margin_px, frame_shape[0] - 1 + margin_px
@@ -303,12 +294,9 @@ def outline_of(frame_shape: tuple[int, int], margin_px: float = 0.0) -> FloatArr
 
 
 def covered_by(rotations: FloatArray, camera: Camera, frame_shape: tuple[int, int]) -> Covered:
-    """Return what the frames of a camera that turns cover.
+    """Return what frames of (height, width) cover, of a camera that turns.
 
-    Args:
-        rotations: (N, 3, 3), directions of each frame's camera to those of the canvas.
-        camera: of all frames.
-        frame_shape: (height, width) of a frame.
+    The rotations, (N, 3, 3), map directions of each frame's camera to those of the canvas.
     """
     directions = camera.directions(outline_of(frame_shape))
     ahead = camera.directions(np.array([(frame_shape[1] - 1) / 2, (frame_shape[0] - 1) / 2]))
@@ -359,10 +347,8 @@ def level_horizon(rotations: FloatArray) -> FloatArray:
     """Return the rotation of the reference camera after which the horizon is level.
 
     Who turns a camera hardly rolls it, so that the rows of all frames are level: what is down is the direction that is most
-    nearly at right angles to them (Brown and Lowe 2007). The reference camera still looks at a = 0.
-
-    Args:
-        rotations: (N, 3, 3), directions of each frame's camera to those of the reference camera.
+    nearly at right angles to them (Brown and Lowe 2007). The reference camera still looks at a = 0. The rotations, (N, 3, 3),
+    map directions of each frame's camera to those of the reference camera.
     """
     along, down = rotations[:, :, 0], rotations[:, :, 1].mean(axis=0)
     # Of a camera that hardly turns, what is down on average decides.

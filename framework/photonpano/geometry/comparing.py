@@ -12,10 +12,8 @@ from photonpano.values import FloatArray, Homography
 def why_implausible(homography: Homography, shape: tuple[int, int], min_overlap: float = 0.1) -> str | None:
     """Return why a map between two images of one camera is implausible; None if it is plausible.
 
-    Args:
-        homography: (3, 3), pixels of the moving image to pixels of the fixed one.
-        shape: (height, width) of both images.
-        min_overlap: share of the fixed image that the moving one must cover at least.
+    It maps pixels of the moving image to those of the fixed one, both of (height, width), of which the moving one must cover at
+    least the share `min_overlap`.
     """
     import cv2
 

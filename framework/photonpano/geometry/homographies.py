@@ -20,11 +20,7 @@ _PARAMETERS = ((0, 0), (1, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1))  
 
 
 def normalised(matrices: ArrayLike) -> Homography:
-    """Scale (..., 3, 3) matrices so that h33 = 1.
-
-    Raises:
-        ValueError: an h33 is zero or not finite, so that the matrix cannot be scaled.
-    """
+    """Scale (..., 3, 3) matrices so that h33 = 1; `ValueError` if one of these is zero or not finite."""
     matrices = np.asarray(matrices, dtype=np.float64)
     h33 = matrices[..., 2, 2]
     if not (np.isfinite(matrices).all() and h33.all()):
@@ -35,8 +31,7 @@ def normalised(matrices: ArrayLike) -> Homography:
 def scaled_ahead(matrices: ArrayLike) -> Homography:
     """Scale (..., 3, 3) matrices so that h33 = 1 where it is positive; others keep their sign: it is negative behind a camera.
 
-    Raises:
-        ValueError: a matrix is not finite.
+    Raises a `ValueError` if a matrix is not finite.
     """
     return _scaled_ahead(np.array(matrices, dtype=np.float64))
 
@@ -61,11 +56,10 @@ def translation(x: float, y: float) -> Homography:
 
 
 def step_motions(steps: ArrayLike, shape: tuple[int, int]) -> Homography:
-    """Return the maps of small motions of a frame: (..., 4) to (..., 3, 3).
+    """Return the maps of small motions of a frame of (height, width): (..., 4) to (..., 3, 3).
 
-    Args:
-        steps: shift along x and along y, in pixels; roll from x towards y, in radians; zoom, as a fraction.
-        shape: (height, width) of the frame, about whose centre it rolls and zooms.
+    The steps are shifts along x and along y, in pixels; roll about the centre, from x towards y, in radians; zoom, as a
+    fraction.
     """
     x, y, roll, zoom = np.moveaxis(np.asarray(steps, dtype=np.float64), -1, 0)
     centre = translation((shape[1] - 1) / 2, (shape[0] - 1) / 2)
@@ -103,14 +97,9 @@ def rescaled(homographies: Homography, scale: float) -> Homography:
 
 
 def transform_points(homographies: Homography, points: ArrayLike) -> FloatArray:
-    """Map points.
+    """Map (N, 2) points, or (..., N, 2) with one set for each of (..., 3, 3) homographies, to (..., N, 2).
 
-    Args:
-        homographies: (..., 3, 3).
-        points: (N, 2), or (..., N, 2) with one set of points for each homography.
-
-    Returns:
-        (..., N, 2) mapped points; infinite or NaN where a point goes to infinity.
+    They are infinite or NaN where a point goes to infinity.
     """
     points = np.asarray(points, dtype=np.float64)
     mapped = points @ np.swapaxes(homographies[..., :2, :2], -1, -2) + homographies[..., None, :2, 2]
@@ -123,12 +112,7 @@ apply = transform_points  # deprecated: use `transform_points`
 
 
 def jacobian(homography: Homography, points: ArrayLike) -> FloatArray:
-    """Return the derivatives of the mapped points with respect to p1..p8 of `parameters`: (N, 2, 8).
-
-    Args:
-        homography: (3, 3).
-        points: (N, 2).
-    """
+    """Return the derivatives of (N, 2) mapped points with respect to p1..p8 of `parameters`: (N, 2, 8)."""
     points = np.asarray(points, dtype=np.float64)
     depth = points @ homography[2, :2] + homography[2, 2]
     x, y = points.T / depth
@@ -165,12 +149,7 @@ def corner_displacements(first: Homography, second: Homography, shape: tuple[int
 
 
 def steps_px(homographies: Homography, shape: tuple[int, int]) -> FloatArray:
-    """Return the distances, in pixels, that the four corners of an image move from each map to the next: (N - 1, 4).
-
-    Args:
-        homographies: (N, 3, 3), such as those of all frames of a capture.
-        shape: (height, width) of the image.
-    """
+    """Return how far, in px, the corners of an image of (height, width) move from each map to the next: (N - 1, 4)."""
     moved = np.empty((max(len(homographies) - 1, 0), 4))
     for start in range(0, len(moved), BLOCK_FRAMES):
         block = homographies[start : start + BLOCK_FRAMES + 1]
@@ -221,9 +200,7 @@ def generators(shape: tuple[int, int]) -> FloatArray:
 def slopes(mapped: FloatArray, changes: FloatArray) -> FloatArray:
     """Return the derivatives of mapped points by eight parameters: (..., 2 N, 8), x and y of a point in adjacent rows.
 
-    Args:
-        mapped: (..., 3, N) points in homogeneous coordinates.
-        changes: (..., 8, 3, N) their derivatives with respect to eight parameters.
+    The mapped points, (..., 3, N), are in homogeneous coordinates, `changes`, (..., 8, 3, N), their derivatives.
     """
     depth = mapped[..., None, 2:, :]
     points = mapped[..., None, :2, :] / depth
@@ -232,11 +209,9 @@ def slopes(mapped: FloatArray, changes: FloatArray) -> FloatArray:
 
 
 def moving_corners(displacements: FloatArray, shape: tuple[int, int]) -> Homography:
-    """Return the homographies that move the corners of an image by small displacements, to first order.
+    """Return the homographies that move the corners of an image of (height, width) by small displacements, to first order.
 
-    Args:
-        displacements: (N, 8), x and y of each corner, in pixels.
-        shape: (height, width) of the image.
+    The displacements are (N, 8), x and y of each corner, in pixels.
     """
     here = np.concatenate([corners(shape), np.ones((4, 1))], axis=1).T
     of_corners = slopes(here, generators(shape) @ here)

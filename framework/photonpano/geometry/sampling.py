@@ -45,16 +45,10 @@ class Run(NamedTuple):
 def visible_columns(  # noqa: PLR0917
     to_image: Homography, y: int, left: float, right: float, top: float, bottom: float, width: int
 ) -> tuple[int, int]:
-    """Return the half-open range of pixels of a grid row that map into a rectangle of the image, border included.
+    """Return the half-open range of pixels of row y of a grid that map into a rectangle of the image, border included.
 
-    Args:
-        to_image: (3, 3), pixels of the grid to pixels of the image.
-        y: the row.
-        left: least x of the rectangle.
-        right: largest x.
-        top: least y.
-        bottom: largest y.
-        width: columns of the grid.
+    `to_image` maps pixels of the grid, of `width` columns, to those of the image, where the rectangle reaches from x `left` to
+    `right` and from y `top` to `bottom`.
     """
     depth, along = to_image[2, 1] * y + to_image[2, 2], to_image[2, 0]
     u, du = to_image[0, 1] * y + to_image[0, 2], to_image[0, 0]
@@ -81,15 +75,10 @@ def visible_columns(  # noqa: PLR0917
 
 @compiled
 def run_from(to_image: Homography, x: int, y: int, most: int, height: int, width: int) -> Run:  # noqa: PLR0917
-    """Return the run of pixels of a grid row that starts at (x, y).
+    """Return the run of pixels of a grid row that starts at (x, y), of at most `most`.
 
-    Args:
-        to_image: (3, 3), pixels of the grid to pixels of the image.
-        x: the first pixel. It and the following ones must map into the image, border included: see `visible_columns`.
-        y: the row.
-        most: largest size of the run.
-        height: rows of the image.
-        width: columns of the image.
+    `to_image` maps pixels of the grid to those of the image, of `height` rows and `width` columns. The first pixel and the
+    following ones must map into the image, border included: see `visible_columns`.
     """
     per_depth = 1 / (to_image[2, 0] * x + to_image[2, 1] * y + to_image[2, 2])
     u = (to_image[0, 0] * x + to_image[0, 1] * y + to_image[0, 2]) * per_depth
@@ -120,13 +109,7 @@ def run_from(to_image: Homography, x: int, y: int, most: int, height: int, width
 
 @compiled
 def sample_run(image: Pixels, run: Run, into: NDArray[np.float32]) -> None:
-    """Interpolate an image linearly along a run.
-
-    Args:
-        image: (h, w) float32 or uint32.
-        run: from `run_from`.
-        into: (run.size,) output.
-    """
+    """Interpolate an image, (h, w) float32 or uint32, linearly along a run, into (run.size,) values."""
     pixels, width = image.reshape(-1), image.shape[1]
     above, below = run.top * width + run.left, (run.top + 1) * width + run.left
     size = len(into)

@@ -18,10 +18,7 @@ PLAUSIBLE, INFINITE, BEHIND, FOLDED, AREA, SIDES = range(6)
 def violation(homography: Homography, height: int, width: int) -> tuple[int, float]:
     """Return why a homography between two images of one camera is impossible, and the number that decides; `PLAUSIBLE` if not.
 
-    Args:
-        homography: (3, 3), pixels of the moving image to pixels of the fixed one.
-        height: rows of both images.
-        width: columns of both.
+    It maps pixels of the moving image to those of the fixed one, both of `height` rows and `width` columns.
     """
     for row in range(3):
         for column in range(3):

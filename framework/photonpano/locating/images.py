@@ -86,11 +86,7 @@ class View:
         return View(image, np.where(whole == 1, 4 * weight, np.float32(0)), self.blur_px, 2 * self.pixel)
 
     def seen_from(self, homography: Homography) -> View:
-        """Return this image on the grid of another one, interpolated linearly.
-
-        Args:
-            homography: (3, 3), pixels of the other image to pixels of this one.
-        """
+        """Return this image on the grid of another one, interpolated linearly; the homography maps pixels of that one to it."""
         height, width = self.shape
         image, weight, whole = (
             np.asarray(
@@ -106,11 +102,8 @@ def view_of(exposure: VirtualExposure, blur_px: float) -> View:
     """Return an exposure as an image for alignment.
 
     Single masked pixels are interpolated. Pixels nearer to a masked area or a border than three times the blur are masked: the
-    blur is one-sided there, which biases the alignment.
-
-    Args:
-        exposure: flux and weight.
-        blur_px: standard deviation of the Gaussian blur against photon noise, in px of the exposure.
+    blur is one-sided there, which biases the alignment. `blur_px` is the standard deviation of the Gaussian blur against photon
+    noise, in px of the exposure.
     """
     known = exposure.weight > 0
     std = exposure.response.stabilised_std(np.where(known, exposure.weight, np.float32(1)))
@@ -126,13 +119,9 @@ def view_of(exposure: VirtualExposure, blur_px: float) -> View:
 
 
 def view_pyramid(exposure: VirtualExposure, blur_px: float, levels: int, smallest_side: int) -> tuple[View, ...]:
-    """Return the image pyramid of an exposure, finest first.
+    """Return the image pyramid of an exposure, finest first, with at most `levels` views. For `blur_px`, see `view_of`.
 
-    Args:
-        exposure: flux and weight.
-        blur_px: standard deviation of the Gaussian blur against photon noise, in px of the exposure.
-        levels: largest number of views.
-        smallest_side: the pyramid ends before a side gets shorter than this, in px of a view.
+    It ends before a side gets shorter than `smallest_side`, in px of a view.
     """
     views = [view_of(exposure, blur_px)]
     while len(views) < levels and min(views[-1].shape) >= 2 * smallest_side:
@@ -156,9 +145,7 @@ def stabilised_8_bit(exposure: VirtualExposure, blur_px: float) -> tuple[NDArray
     """Return an exposure on the scale on which its noise is uniform, blurred against noise, stretched to 8 bits.
 
     With uniform noise, keypoints are found in dark and bright parts alike; a linear or sRGB scale would favour one of them.
-
-    Returns:
-        The image, (H, W) uint8, and the mask of pixels that were seen, (H, W) uint8, 0 or 255.
+    Returns the image, and the mask of pixels that were seen, 0 or 255: (H, W) uint8 each.
     """
     known = exposure.weight > 0
     # Masked pixels have no weight; all others have the same, since weights by numbers of frames would shift structures.
@@ -183,23 +170,18 @@ def _blurred(*images: NDArray[np.float32], blur_px: float) -> tuple[NDArray[np.f
 def noise_of(noise_ratio: float) -> float:
     """Return the variance of the noise of two aligned images, relative to what is expected of photons, from their residuals.
 
-    It is below 1 in the dark, where pixels hold less than a photon and no scale makes noise uniform, and for sensors whose
-    counts scatter less than those of photons. Interpolation alone makes residuals smaller, but not the noise.
-
-    Args:
-        noise_ratio: mean squared residual relative to the expected variance.
+    `noise_ratio` is the mean squared residual relative to the expected variance. The noise is below 1 in the dark, where pixels
+    hold less than a photon and no scale makes noise uniform, and for sensors whose counts scatter less than those of photons.
+    Interpolation alone makes residuals smaller, but not the noise.
     """
     return max(noise_ratio, min(1.0, noise_ratio / _INTERPOLATED), 1e-6)
 
 
 def free_parameters(depth: int, layers: int) -> tuple[int, ...]:
-    """Return which of p1..p8 to estimate on a layer of a pyramid.
+    """Return which of p1..p8 to estimate on a layer of a pyramid, by its depth, 0 for the finest of the `layers`.
 
-    Few pixels determine few parameters: a translation on the coarsest layer, an affine map on the next, then all eight.
-
-    Args:
-        depth: number of the layer, 0 for the finest. The finest layer always estimates all eight.
-        layers: number of layers of the pyramid.
+    Few pixels determine few parameters: a translation on the coarsest layer, an affine map on the next, then all eight, as
+    always on the finest.
     """
     from_coarsest = layers - 1 - depth
     return (TRANSLATION, _AFFINE)[from_coarsest] if depth > 0 and from_coarsest < 2 else ALL_PARAMETERS
@@ -425,9 +407,7 @@ class Follows(NamedTuple):
     def more_than(self, other: Follows, trust: float = 1.0) -> bool:
         """Whether the part that clearly follows this motion is larger, and spreads further, than that of another motion.
 
-        Args:
-            other: what follows the other motion.
-            trust: factor on the extent of this part, for a motion that is known from elsewhere.
+        `trust` is a factor on the extent of this part, for a motion that is known from elsewhere.
         """
         return trust * self.extent_beyond(other) > other.extent_beyond(self)
 
@@ -474,12 +454,9 @@ _TAPER = 0.25  # the window falls to 0 at masked pixels, over this fraction of t
 
 
 def shift_between(moving: View, fixed: View, peak_px: float = 1.5) -> FloatArray | None:
-    """Return the shift (x, y) in px that maps `moving` to `fixed`; None without overlap or without texture.
+    """Return the shift (x, y) in px that maps `moving` to `fixed`, on one grid; None without overlap or without texture.
 
-    Args:
-        moving: one image.
-        fixed: the other one, on the same grid.
-        peak_px: see `shift_of_spectra`.
+    For `peak_px`, see `shift_of_spectra`.
     """
     both = moving.seen & fixed.seen
     if not both.any():
@@ -515,11 +492,9 @@ def shift_of_spectra(
 def correlation_surface(cross: NDArray[np.complexfloating], shape: tuple[int, ...], peak_px: float) -> FloatArray | None:
     """Return the phase correlation of two images at each cyclic shift, (H, W), row by row from 0; None without texture.
 
-    Args:
-        cross: (H, W // 2 + 1) spectrum of the fixed image times the conjugate spectrum of the moving one. Spectra of several
-            pairs with one shift may be summed.
-        shape: (height, width) of the images.
-        peak_px: standard deviation of the peak, in px.
+    `cross`, (H, W // 2 + 1), is the spectrum of the fixed image times the conjugate spectrum of the moving one. Spectra of
+    several pairs with one shift may be summed. The shape is (height, width) of the images, `peak_px` the standard deviation of
+    the peak.
     """
     amplitude = np.abs(cross)
     if not amplitude.max() > 0:
@@ -528,12 +503,9 @@ def correlation_surface(cross: NDArray[np.complexfloating], shape: tuple[int, ..
 
 
 def correlation_peaks(surface: FloatArray, least: float, most: int = 8) -> tuple[FloatArray, FloatArray]:
-    """Return the shifts (x, y) of the highest local maxima of a phase correlation, (P, 2) in px, and their heights, (P,).
+    """Return the shifts (x, y) of the highest local maxima of a `correlation_surface`, (P, 2) in px, and their heights, (P,).
 
-    Args:
-        surface: (H, W), from `correlation_surface`.
-        least: height of the lowest peak, as a share of the highest.
-        most: largest number of peaks, the highest first.
+    The lowest has the share `least` of the height of the highest. There are `most` at most, the highest first.
     """
     padded = np.pad(surface.astype(np.float32), 1, mode="wrap")
     highest_near = cv2.dilate(padded, np.ones((3, 3), np.uint8))[1:-1, 1:-1]

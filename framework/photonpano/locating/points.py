@@ -51,9 +51,7 @@ class TurnInformation(NamedTuple):
 def turn_slopes(homography: Homography, camera_matrix: FloatArray) -> FloatArray:
     """Return the derivatives of p1..p8 of a homography by a rotation vector of the camera whose pixels it maps: (8, 3).
 
-    Args:
-        homography: (3, 3) with h33 = 1.
-        camera_matrix: (3, 3) K; a small rotation R before the homography makes it H K R K^-1.
+    The homography H has h33 = 1. With the camera matrix K, a small rotation R before it makes it H K R K^-1.
     """
     changes = homography @ camera_matrix @ ROTATION_AXES @ np.linalg.inv(camera_matrix)
     return np.asarray(parameters(changes - changes[:, 2:, 2:] * homography + np.eye(3)).T)
@@ -546,8 +544,7 @@ class PointLocator(ABC):
     def turning(self, camera_matrix: FloatArray) -> Self:
         """Return this locator for a camera that only turns.
 
-        Args:
-            camera_matrix: (3, 3), in px of the exposures; the lens does not distort.
+        The camera matrix, (3, 3), is in px of the exposures; the lens does not distort.
         """
         turning = copy(self)
         turning._camera_matrix = camera_matrix

@@ -65,14 +65,9 @@ def chunks_of(
 
 
 def clipped(chunks: Sequence[Chunk], span: FrameSpan, trajectory: Trajectory) -> tuple[Chunk, ...]:
-    """Return the parts of chunks that lie in a span.
+    """Return the parts of chunks that lie in a span; the chunks are in order, as `chunks_of` returns them for the trajectory.
 
     Chunks inside the span are returned as they are, so that overlapping spans share their sums: see `CountsCache`.
-
-    Args:
-        chunks: in order, as `chunks_of` returns them.
-        span: the frames to keep.
-        trajectory: the motion along which they are summed.
     """
     first = bisect_right(chunks, span.start, key=lambda chunk: chunk.span.stop)
     last = bisect_left(chunks, span.stop, key=lambda chunk: chunk.span.start)
@@ -266,10 +261,9 @@ class PhotonSum:
     lit: LitFrames | None = None  # frames and gains by the class of their light; None in steady light
 
     def estimate(self, response: Response) -> tuple[FluxImage, FluxImage]:
-        """Return the maximum-likelihood flux of each pixel (paper, equation 3) and its weight.
+        """Return the maximum-likelihood flux of each pixel (paper, equation 3) and its weight: (H, W) float32 each.
 
-        Returns:
-            Flux, (H, W) float32, NaN where the weight is below one frame; weight, (H, W) float32, 0 there.
+        Where the weight is below one frame, it is 0, and the flux NaN.
         """
         unknown = self.weight < _MIN_WEIGHT
         if self.lit is not None:

@@ -94,15 +94,10 @@ class Averaging:
         )
 
     def over(self, shape: tuple[int, int], top: int = 0, left: int = 0) -> Averages:
-        """Average over the frames that show each pixel of a part of the canvas.
+        """Average over the frames that show each pixel of a part of the canvas, of (h, w) from row `top` and column `left` on.
 
         A pixel that lies between four of a frame gets the weights w of them, with a sum of 1, and so the variance of a pixel
         times `sum w^2`.
-
-        Args:
-            shape: (h, w) of the part.
-            top: its first row.
-            left: its first column.
         """
         part = self.canvas.part(left, top, *shape)
         grid = Grid.zeros(part, 3)

@@ -328,12 +328,8 @@ class Grid(NamedTuple):
 def add_warped(counts: Texture, seen: Texture | None, amounts: FloatArray, footprint: Footprint, grid: Grid) -> None:
     """Add an image to a grid, and its share of each pixel to coverages, both interpolated bilinearly.
 
-    Args:
-        counts: the image.
-        seen: share of each of its pixels; None if it is 1.
-        amounts: (P,) factors of the share.
-        footprint: of the frame on the grid.
-        grid: added to.
+    `seen` is the share of each pixel, None if it is 1, and `amounts`, (P,), are factors of it. The footprint is that of the
+    frame on the grid.
     """
     for part in grid.parts(footprint):
         to_image = np.ascontiguousarray(footprint.to_image)
@@ -344,15 +340,10 @@ def add_warped(counts: Texture, seen: Texture | None, amounts: FloatArray, footp
 def image_row(  # noqa: PLR0917
     matrix: NDArray[np.float64], lens: Lens, grid: Grid, row: int, u: NDArray[np.float32], v: NDArray[np.float32]
 ) -> None:
-    """Map a row of a grid to pixels of an image, to about 1e-6 of its size.
+    """Map a row of the box of a grid, of W columns, to pixels of an image, to about 1e-6 of its size.
 
-    Args:
-        matrix: (3, 3), rays to homogeneous ideal coordinates.
-        lens: from these to pixels.
-        grid: its box has W columns.
-        row: of the box.
-        u: (W,) output, x; -9 behind the camera and beyond the lens.
-        v: (W,) output, y.
+    `matrix`, (3, 3), maps rays to homogeneous ideal coordinates, and the lens these to pixels. Writes x to `u`, (W,), and y to
+    `v`, (W,); x is -9 behind the camera and beyond the lens.
     """
     p, s, q, r, p0, s0 = grid.p, grid.s, grid.q[row], grid.r[row], grid.p0, grid.r[row] * grid.s0 + grid.t[row]
     x0, y0, z0 = np.float32(matrix[0, 0] * r), np.float32(matrix[1, 0] * r), np.float32(matrix[2, 0] * r)

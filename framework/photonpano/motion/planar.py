@@ -2,7 +2,8 @@
 
 A homography has eight numbers; most cameras move by fewer. From each exposure to the next one in time, the image shifts and
 rolls by any amount. Its zoom, two shears and two perspectives are normally distributed, with variances that grow with the time
-between both exposures, and that are estimated from the pairs. Where nothing zooms, the variance of the zoom goes to zero, and
+between both exposures, and that are estimated from the pairs: those of both shears are equal, and those of both perspectives,
+since no direction of the image is another one than the rest. Where nothing zooms, the variance of the zoom goes to zero, and
 with it the zoom. A camera that turns changes perspective in proportion to the shift, by -1 / f^2: this coupling is estimated,
 too, and the walk is what perspective does beyond it.
 """
@@ -14,6 +15,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.fft import dct
 from scipy.sparse.linalg import SuperLU
 
 from photonpano.geometry import corners, generators, inverse, parameters, scaled_ahead, transform_points, unit_coordinates
@@ -34,8 +36,8 @@ _MOVED: dict[PlanarName, tuple[dict[int, float], ...]] = {
 }
 PLANAR_NAMES: tuple[PlanarName, ...] = tuple(_MOVED)
 _FREE = 3  # the first of these motions have no prior
-_WALKS = ("zoom", "shear of the axes", "shear of the diagonals", "perspective along x", "perspective along y")
-_PERSPECTIVE = slice(3, 5)  # of the walks
+# The walks, by which of the other motions they change. Each model but translations has one more of them than that before.
+_WALKS = {"zoom": slice(0, 1), "shear": slice(1, 3), "perspective": slice(3, 5)}
 _TERMS = 12  # of the exponential and the logarithmic series
 _HALVINGS = 2  # of a logarithm, by square roots, before its series
 _ROOTS = 8  # Newton steps of a square root
@@ -140,6 +142,12 @@ class _Around(NamedTuple):
         """Factorise the normal equations."""
         return factorised(self.normal + sum(square / each for square, each in zip(self.squares, variances, strict=True)))
 
+    def given(self, variances: FloatArray) -> FloatArray:
+        """Return the right sides of these equations: (n, 1 + D)."""
+        scales = np.ones((len(variances), self.right.shape[1])) / np.sqrt(variances)[:, None]
+        scales[:, 0] **= 2
+        return np.asarray(self.right + sum(side * scale for side, scale in zip(self.sides, scales, strict=True)))
+
     def deviance(self, variances: FloatArray) -> float:
         """Return that of the solution: see `Adjustment`."""
         factors = self.factors(variances)
@@ -163,7 +171,8 @@ class PlanarAdjustment(Adjustment[Plane]):
     def __init__(self, problem: Problem, model: PlanarName, *, bends: bool = False) -> None:
         """Set up the problem; `bends` has a model without perspective share the coupling, too."""
         self._problem, self._model, self._basis = problem, model, basis_of(model)
-        self._n_walks = max(self._basis.shape[1] - _FREE, 0)
+        self._walks = [columns for columns in _WALKS.values() if columns.stop <= self._basis.shape[1] - _FREE]
+        self._n_walks = len(self._walks)
         self._bends = bends
         super().__init__(problem, n_shared=int(model == "homography" or bends))
         # Nodes are in order of time; those of one instant make no step.
@@ -223,7 +232,7 @@ class PlanarAdjustment(Adjustment[Plane]):
         stds = np.repeat(np.sqrt(self.variances), [len(part.residuals) for part in parts])
         residuals = np.concatenate([part.residuals for part in parts]) / stds
         rows = sparse.csr_array(sparse.diags_array(1 / stds) @ sparse.vstack([part.slopes for part in parts]))
-        times = self._n_walks * float(np.log(self._times).sum())
+        times = max(self._n_node - _FREE, 0) * float(np.log(self._times).sum())
         return Prior(residuals, rows, float(2 * np.log(stds).sum()) + times)
 
     def learn(self, state: Plane, weights: FloatArray) -> bool:
@@ -245,10 +254,8 @@ class PlanarAdjustment(Adjustment[Plane]):
         alone = np.zeros((problem.right.shape[0], 1))
         alone[-1], last = self._n_shared, np.zeros(len(before))
         for _ in range(_ROUNDS):
-            scales = np.ones((len(before), _DRAWS + 1)) / np.sqrt(self.variances)[:, None]
-            scales[:, 0] **= 2
-            given = problem.right + sum(side * scale for side, scale in zip(problem.sides, scales, strict=True))
-            changes = problem.factors(self.variances).solve(np.column_stack([given, alone]))
+            given = np.column_stack([problem.given(self.variances), alone])
+            changes = problem.factors(self.variances).solve(given)
             found = np.empty(len(before))
             for index, (part, variance) in enumerate(zip(problem.parts, self.variances, strict=True)):
                 moves, number = part.slopes @ changes, len(part.residuals)
@@ -270,6 +277,27 @@ class PlanarAdjustment(Adjustment[Plane]):
             if without[index] < self.variances[index] and (other := problem.deviance(without)) < least + _WORTH:
                 self.variances, least = without, other
         return bool(np.abs(np.log(self.variances / before)).max() > _SETTLED)
+
+    def widened(self, state: Plane, weights: FloatArray) -> PlanarAdjustment:
+        """Return the problem with walks as wide at all time scales as in the octave of these in which they are widest.
+
+        Most cameras move more smoothly than a walk: one that is as wide as all scales are in the mean holds the slow ones, in
+        which most of the motion is, and bends a long path. Expected squares of the steps (Dempster et al. 1977).
+        """
+        if not self._n_walks or len(self._times) < _FEWEST_STEPS:
+            return self
+        problem, found = self._around(state, weights), self.of(self._problem)
+        changes = problem.factors(self.variances).solve(problem.given(self.variances))
+        octaves = np.array([0, *(2 ** np.arange((len(self._times) - 1).bit_length()))])
+        found.variances, found._of_coupling = self.variances.copy(), self._of_coupling
+        for index, part in enumerate(problem.parts[: self._n_walks]):
+            steps = -(part.slopes @ changes)
+            steps[:, 0] += part.residuals
+            squares = dct(steps.reshape(len(self._times), -1, steps.shape[1]), axis=0, norm="ortho") ** 2
+            expected = (squares[..., 0] + squares[..., 1:].mean(axis=-1)).mean(axis=-1)
+            of_octaves = np.add.reduceat(expected, octaves) / np.diff(octaves, append=len(expected))
+            found.variances[index] = max(float(of_octaves.max()), self.variances[index])
+        return found
 
     def _around(self, state: Plane, weights: FloatArray) -> _Around:
         free, rng = self._free(state), np.random.default_rng(0)
@@ -329,8 +357,7 @@ class PlanarAdjustment(Adjustment[Plane]):
     def narrowed(self, state: Plane) -> tuple[PlanarAdjustment, Plane]:
         """Return the problem without walks that are none, and the nearest state that it holds."""
         there = self.variances > _NONE**2 / self._durations
-        most = int(np.flatnonzero(there).max(initial=-1)) + 1
-        model = next(name for name in PLANAR_NAMES[1:] if len(_MOVED[name]) - _FREE >= min(most, len(_WALKS)))
+        model = PLANAR_NAMES[1 + min(int(np.flatnonzero(there).max(initial=-1)) + 1, len(_WALKS))]
         if len(_MOVED[model]) >= self._n_node:
             return self, state
         return self.of(self._problem, model), Plane(nearest(model, state.homographies, self._frame_shape))
@@ -347,7 +374,8 @@ class PlanarAdjustment(Adjustment[Plane]):
     @remembered
     def _components(self, state: Plane) -> list[Prior]:
         """Return the steps of each walk beyond the coupling, over the roots of their times; and the coupling."""
-        n_steps, k, w = len(self._times), self._n_node, self._n_walks
+        n_steps, k = len(self._times), self._n_node
+        w = max(k - _FREE, 0)
         if not w and not self._n_shared:
             return []
         perspective = self._model == "homography"
@@ -360,20 +388,21 @@ class PlanarAdjustment(Adjustment[Plane]):
         steps, roots = motions @ back.T, 1 / np.sqrt(self._times)
         by_coupling = np.zeros((n_steps, w))
         if perspective:
-            by_coupling[:, _PERSPECTIVE] = -motions[:, 4:6]
+            by_coupling[:, _WALKS["perspective"]] = -motions[:, 4:6]
             steps += state.coupling * by_coupling
             shifts = np.eye(8)[4:6]
             of_shift = np.stack([-shifts @ np.swapaxes(earlier, 1, 2), np.broadcast_to(shifts, (n_steps, 2, 8))], axis=2)
-            by_nodes[:, _PERSPECTIVE] -= state.coupling * (of_shift @ self._basis)
-        rows = np.repeat(np.arange(n_steps), 2 * k)
-        columns = (k * np.arange(n_steps)[:, None] + np.arange(2 * k)).ravel()
+            by_nodes[:, _WALKS["perspective"]] -= state.coupling * (of_shift @ self._basis)
         parts = []
-        for walk in range(w):
-            entries = (by_nodes[:, walk].reshape(n_steps, 2 * k) * roots[:, None]).ravel()
-            slopes = sparse.csr_array((entries, (rows, columns)), shape=(n_steps, k * self._n_nodes))
+        for walk in self._walks:
+            changes = by_nodes[:, walk].reshape(n_steps, -1, 2 * k) * roots[:, None, None]
+            rows = np.repeat(np.arange(changes[..., 0].size), 2 * k)
+            columns = np.broadcast_to(k * np.arange(n_steps)[:, None, None] + np.arange(2 * k), changes.shape)
+            slopes = sparse.csr_array((changes.ravel(), (rows, columns.ravel())), shape=(rows[-1] + 1, k * self._n_nodes))
             if self._n_shared:
-                slopes = sparse.csr_array(sparse.hstack([slopes, sparse.csr_array(by_coupling[:, [walk]] * roots[:, None])]))
-            parts.append(Prior(steps[:, walk] * roots, slopes))
+                beside = (by_coupling[:, walk] * roots[:, None]).reshape(-1, 1)
+                slopes = sparse.csr_array(sparse.hstack([slopes, sparse.csr_array(beside)]))
+            parts.append(Prior((steps[:, walk] * roots[:, None]).ravel(), slopes))
         if self._n_shared:
             parts.append(Prior(np.array([state.coupling]), self._of_shared(np.ones((1, 1)))))
         return parts

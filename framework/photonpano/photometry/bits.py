@@ -20,13 +20,10 @@ _STAGES = 3  # stages, which count ones, eights and sixty-fours
 
 @compiled
 def sum_bits(packed: NDArray[np.uint8], n_frames: int, little: bool, counts: NDArray[np.uint8]) -> None:
-    """Count in how many packed frames each pixel is lit.
+    """Count in how many packed frames each pixel is lit, at most 255, so that a count fits into a byte.
 
-    Args:
-        packed: (n B,) bytes of n frames, one after the other.
-        n_frames: n, at most 255, so that a count fits into a byte.
-        little: whether the first pixel of a byte is its lowest bit, and not its highest.
-        counts: (8 B,) output.
+    `packed`, (n B,), are the bytes of n frames, one after the other; the counts, (8 B,), are output. `little` says whether the
+    first pixel of a byte is its lowest bit, and not its highest.
     """
     frame_bytes = len(packed) // n_frames
     stages = np.empty((_STAGES, _ROWS * _WORDS), np.uint64)

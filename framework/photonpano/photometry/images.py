@@ -49,9 +49,8 @@ def linear_to_srgb(linear: NDArray[np.floating]) -> NDArray[np.float32]:
 def balanced(flux: NDArray[np.float32], white_balance: WhiteBalance) -> NDArray[np.float32]:
     """Multiply the colours of an image by the factors of a white balance; a grey image stays as it is.
 
-    Args:
-        flux: (H, W), or (H, W, 3) of red, green and blue; NaN where unknown.
-        white_balance: "grey-world" makes the means of the colours equal, and keeps that of green.
+    Flux is (H, W), or (H, W, 3) of red, green and blue; NaN where unknown. "grey-world" makes the means of the colours equal,
+    and keeps that of green.
     """
     if flux.ndim == 2 or white_balance == "none":
         return flux
@@ -67,12 +66,10 @@ def grey_world(flux: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def tone_mapped(flux: NDArray[np.float32], white: float, *, srgb: bool = True) -> NDArray[np.uint8]:
-    """Return a picture of 8 bits: `white` photons per pixel per frame become 255, unknown pixels are black.
+    """Return a picture of 8 bits: `white` photons per pixel per frame and more become 255, unknown pixels are black.
 
-    Args:
-        flux: photons per pixel per frame, NaN where unknown; of any shape.
-        white: flux that becomes white, as does any higher one.
-        srgb: whether levels follow the sRGB curve, for screens, or are proportional to the flux.
+    Flux is of any shape, photons per pixel per frame, NaN where unknown. Levels follow the sRGB curve, for screens, or are
+    proportional to it.
     """
     level = linear_to_srgb(flux / white) if srgb else np.clip(flux / white, 0, 1)
     return np.asarray(np.nan_to_num(level) * 255 + 0.5).astype(np.uint8)
@@ -184,11 +181,7 @@ class Similarity(NamedTuple):
         return {"similarity": self.correlation, "structures": self.structures}
 
     def why_different(self, min_correlation: float) -> str | None:
-        """Return why the images are not accepted as views of one place; None if they are.
-
-        Args:
-            min_correlation: the value of the option `min_agreement`.
-        """
+        """Return why the images are not accepted as views of one place, by the option `min_agreement`; None if they are."""
         if self.score < _MIN_SCORE and not self.correlation:
             return "where the images overlap after alignment, nothing stands out from photon noise"
         # A few structures may be certain where, all over the image, the scene varies by no more than its noise.
@@ -206,16 +199,10 @@ class Similarity(NamedTuple):
 
 
 def without_local_mean(image: NDArray[np.float32], seen: BoolArray) -> NDArray[np.float32]:
-    """Subtract from each pixel the mean of the 13 px square around it.
+    """Subtract from each pixel, (H, W) float32, the mean of the 13 px square around it; 0 where not seen.
 
-    Large shadows and gradients look alike in any two images; what remains is what distinguishes one place from another.
-
-    Args:
-        image: (H, W) float32.
-        seen: (H, W) False for pixels that count in no mean.
-
-    Returns:
-        (H, W) float32, 0 where not seen.
+    Large shadows and gradients look alike in any two images; what remains is what distinguishes one place from another. Pixels
+    where `seen` is False count in no mean.
     """
     import cv2
 
@@ -228,16 +215,11 @@ def without_local_mean(image: NDArray[np.float32], seen: BoolArray) -> NDArray[n
 
 
 def noise_free_correlation(covariance: FloatArray, noise: tuple[float, float], independent: float) -> float:
-    """Return the correlation that two images would have without their noise.
+    """Return the correlation that two images would have without their noise, by the (2, 2) covariance of their pixels.
 
-    Args:
-        covariance: (2, 2) covariance of the pixels of both images.
-        noise: variance of the noise of a pixel of each image.
-        independent: number of pixels with independent noise; less than the number of pixels where images are blurred.
-
-    Returns:
-        1 for the same scene and around 0 for different ones; 0 where there are fewer than 50 independent pixels, or where the
-        scene does not stand out from the noise.
+    It is 1 for the same scene and around 0 for different ones; 0 where there are fewer than 50 independent pixels, or where the
+    scene does not stand out from the noise. `noise` is the variance of the noise of a pixel of each image; `independent`, the
+    number of pixels with independent noise, is less than that of pixels where images are blurred.
     """
     if independent < _MIN_INDEPENDENT:
         return 0.0
@@ -251,11 +233,8 @@ def noise_free_correlation(covariance: FloatArray, noise: tuple[float, float], i
 def autocorrelation(image: NDArray[np.float32]) -> FloatArray:
     """Return the autocorrelation of an image at lags of up to a quarter of its sides: 1 at lag 0, all 0 for a flat image.
 
-    Args:
-        image: (H, W), of mean 0; 0 where nothing was seen.
-
-    Returns:
-        (2 H // 4 + 1, W // 4 + 1): lags along y from the most negative to the largest, lags along x from 0.
+    The image, (H, W), has the mean 0, and is 0 where nothing was seen. The result is (2 H // 4 + 1, W // 4 + 1): lags along y
+    from the most negative to the largest, lags along x from 0.
     """
     down, across = (side // _LAGS for side in image.shape)
     # Padded against wrap-around, to a length whose transform is fast.

@@ -183,10 +183,8 @@ class Debiases(Protocol):
 def debiased(flux: FluxImage, weight: FluxImage, response: Response) -> FluxImage:
     """Remove the bias of maximum-likelihood flux, which binary frames have near saturation.
 
-    Args:
-        flux: any shape, photons per pixel per frame, from `Response.flux`; NaN stays NaN.
-        weight: the same shape, number of frames that each pixel was seen in.
-        response: the response of the camera. Of one that knows no bias, the flux is returned as it is.
+    Flux is of any shape, photons per pixel per frame, from `Response.flux`, where NaN stays NaN; the weight is the number of
+    frames that each pixel was seen in. For a response that knows no bias, the flux is returned as it is.
     """
     return response.debiased(flux, weight) if isinstance(response, Debiases) else flux
 
@@ -236,10 +234,8 @@ def frame_variance(
 def saturated(flux: FluxImage, weight: FluxImage, response: Response) -> BoolArray:
     """Find the pixels that had the highest count in every frame, such as a photon in each binary one: flux is a lower bound.
 
-    Args:
-        flux: any shape, photons per pixel per frame; NaN counts as not saturated.
-        weight: the same shape, number of frames that each pixel was seen in.
-        response: the response of the camera.
+    Flux is of any shape, photons per pixel per frame, where NaN counts as not saturated; the weight is the number of frames
+    that each pixel was seen in.
     """
     frames = np.maximum(weight, 1)
     highest = response.mean_count(np.array([np.inf], np.float32))
@@ -265,17 +261,8 @@ def measurable_range(
 ) -> FluxRange | None:
     """Return the range of flux that a number of frames measures with a signal-to-noise ratio of 1 or more.
 
-    It ends at the flux of a pixel that is lit in all frames, since more cannot be measured.
-
-    Args:
-        frames: number of frames.
-        response: the response of the camera.
-        slope: see `flux_std`.
-        offset: see `flux_std`.
-        n_levels: fluxes that are tried.
-
-    Returns:
-        None if no flux is measured as well.
+    None if no flux is measured as well. It ends at the flux of a pixel that is lit in all frames, since more cannot be
+    measured. For slope and offset, see `flux_std`; `n_levels` fluxes are tried.
     """
     many = np.full(n_levels, _MANY_FRAMES, np.float32)  # of which the noise is that of the bound
     highest = float(response.flux(response.mean_count(np.array([np.inf], np.float32)), frames)[0])

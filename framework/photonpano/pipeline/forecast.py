@@ -55,8 +55,7 @@ class Forecast:
 def forecast(plan: Plan, source: Source, progress: Progress) -> Forecast:
     """Run all of the pipeline on a part of the capture, and extrapolate: time is proportional to the number of frames.
 
-    Raises:
-        PhotonpanoError: the trial failed, as the run would.
+    Raises the `PhotonpanoError` of a trial that failed, as the run would.
     """
     threads, n_frames = thread_count(plan.run.threads), source.info.n_frames
     context = Context(threads=threads, progress=progress)

@@ -17,13 +17,7 @@ from photonpano.capture import capture_of, in_light, leaving_out, with_backgroun
 from photonpano.contracts.attribution import label_of
 from photonpano.contracts.protocols import Source, Trajectory, camera_of, camera_of_motion, light_of
 from photonpano.corrections import FlatField, Vignette, divided_by, estimate_vignette
-from photonpano.corrections.lighting import (
-    corrected_light,
-    decision_of,
-    find_light,
-    measure_light,
-    measure_pixel_gain,
-)
+from photonpano.corrections.lighting import corrected_light, decision_of, find_light, measure_light, measure_pixel_gain
 from photonpano.corrections.movers import find_background, without_layers
 from photonpano.errors import CanvasTooLargeError, LocationError
 from photonpano.geometry import (

@@ -104,16 +104,14 @@ def _rendered(
     lit = lit_picture[np.isfinite(lit_picture)]
     white_flux = (float(np.quantile(lit, settings.white_quantile)) if lit.size else 0.0) or 1.0
     picture = picture_of(lit_picture, white_flux, settings.tone, settings.exposure_stops)
-    seconds = time.perf_counter() - start
-    share, white_flux = gathered.coverage_share, white_flux / 2**settings.exposure_stops
     return RenderedPanorama(
         canvas=canvas,
         thumbnail=thumbnail,
         reduction=reduction,
         picture=picture,
-        white_flux=white_flux,
-        coverage_share=share,
-        seconds=seconds,
+        white_flux=white_flux / 2**settings.exposure_stops,
+        coverage_share=gathered.coverage_share,
+        seconds=time.perf_counter() - start,
         std=gathered.std,
         seen_frames=np.concatenate(seen, axis=2 if canvas.width > canvas.height else 1),
         dynamic_range=dynamic_range,

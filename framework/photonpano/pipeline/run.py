@@ -304,11 +304,6 @@ def _require_opencv() -> None:
         raise InputError(f"OpenCV {cv2.__version__}{of} is imported instead of {name} {version(name)}: run {remove}")
 
 
-def failure_path(directory: Path) -> Path:
-    """Return where the report of a failed run lies: `runs/scan.failed.html` for `runs/scan`."""
-    return directory.with_name(f"{directory.name}.failed.html")
-
-
 def _work(run: BegunRun, how: Continuation) -> AbstractContextManager[Work | None]:
     """Open the work folder of a run; one that finds something else than a panorama does it in one step, and keeps nothing."""
     plan = run.plan
@@ -322,8 +317,11 @@ def _work(run: BegunRun, how: Continuation) -> AbstractContextManager[Work | Non
 
 @contextmanager
 def _reporting_failure(run: BegunRun) -> Iterator[None]:
-    """Write a report if the block raises; its path is the `report` of the error. That of the run before is removed first."""
-    path = failure_path(run.folder.directory)
+    """Write a report if the block raises; its path is the `report` of the error. That of the run before is removed first.
+
+    It is `runs/scan.failed.html` for the run folder `runs/scan`.
+    """
+    path = run.folder.directory.with_name(f"{run.folder.directory.name}.failed.html")
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
@@ -337,11 +335,7 @@ def _reporting_failure(run: BegunRun) -> Iterator[None]:
     except (LocationError, CanvasTooLargeError, PluginError) as error:
         run.require_unchanged()
         levels = {result.level.number: level_record(result) for result in run.levels}
-        record: RunRecord = {
-            **run.started_record(),
-            "status": "failed",
-            "levels": [levels[number] for number in sorted(levels)],
-        }
+        record = run.started_record() | {"status": "failed", "levels": [levels[number] for number in sorted(levels)]}
         error.report = _written_failure(path, record, error)
         raise
 

@@ -94,16 +94,6 @@ def expectation(schema: Schema, root: Schema) -> str:
     return listed((_with_bounds(noun, bounds) for noun, bounds in _options(schema, root)), "or")
 
 
-def type_words(schema: Schema, root: Schema) -> str:
-    """Return the type alone, as in "integer" or "first, last or number"."""
-    return listed((noun for noun, _ in _options(schema, root)), "or")
-
-
-def bounds_words(schema: Schema, root: Schema) -> str:
-    """Return the bounds alone, as in "at least 1"; empty if there are none."""
-    return listed((bounds for _, bounds in _options(schema, root) if bounds), "or")
-
-
 def _with_bounds(noun: str, bounds: str) -> str:
     kind = noun.partition(" ")[0]
     article = "an " if kind == "integer" else "a " if kind in _NOUNS and kind != "text" else ""
@@ -253,7 +243,8 @@ def _rows(schema: Schema, root: Schema, prefix: str = "", depth: int = 0) -> lis
             required = key in option.get("required", ())
             default = None if required else flow(field["default"]) if "default" in field else _COMPUTED
             meaning = " ".join(field.get("description", "").split())
-            row = ConfigRow(f"{prefix}{key}", type_words(field, root), default, bounds_words(field, root), meaning)
+            nouns, bounds = zip(*_options(field, root), strict=True)
+            row = ConfigRow(f"{prefix}{key}", listed(nouns, "or"), default, listed(filter(None, bounds), "or"), meaning)
             in_list = _rows(subschema(field, 0, root), root, f"{row.key}[].", depth + 1)
             for each in (row, *_rows(field, root, f"{row.key}.", depth + 1), *in_list):
                 found.setdefault(each, []).append(str(tag))

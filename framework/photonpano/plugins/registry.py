@@ -239,13 +239,9 @@ class Catalog:
         return found[0]
 
     def including(self, *offers: object) -> Catalog:
-        """Return a catalog that also offers these, for notebooks and tests.
+        """Return a catalog that also offers contributions, or plugins (modules with hooks), for notebooks and tests.
 
-        Args:
-            offers: contributions, or plugins (modules with hooks).
-
-        Raises:
-            PluginError: one of the plugins is broken.
+        Raises a `PluginError` if one of the plugins is broken.
         """
         added: list[Entry] = []
         observers = list(self.observers)
@@ -264,9 +260,7 @@ class Catalog:
     def unknown(self, kind: str | None, name: str) -> str:
         """Return the message for a name that no plugin offers: with the nearest names, and the plugins that might offer it.
 
-        Args:
-            kind: such as "locator"; None if any would do.
-            name: the name that was looked up.
+        `kind` is such as "locator"; None if any would do.
         """
         message = f"there is no {kind or 'component'} {name!r}"
         others = [entry.kind for entry in self.rows if entry.name == name]

@@ -52,8 +52,7 @@ class FrameArray(NamedTuple):
     def frame_axis(self, others: int = 0) -> FrameAxis | None:
         """Return "first" if likeness shows that the first axis of an array of MATLAB is that of the frames.
 
-        Args:
-            others: number of frames of the capture in other files.
+        `others` is the number of frames of the capture in other files.
         """
         shape = self.stored.shape
         if not self.of_matlab or len(shape) != 3:

@@ -55,10 +55,9 @@ class RemoteFile(NamedTuple):
 
 
 def library(module: str, install: str, what: str) -> ModuleType:
-    """Import a library that only some files need; `install` goes to pip, `what` is the subject of the message.
+    """Import a library that only some files need; an `InputError` if it is not installed.
 
-    Raises:
-        InputError: it is not installed.
+    `install` goes to pip, `what` is the subject of the message.
     """
     try:
         return importlib.import_module(module)
@@ -350,8 +349,7 @@ class OpenFiles:
     def read(self, path: Location, position: int, target: NDArray[np.uint8]) -> None:
         """Fill a contiguous array with the bytes of a file from a position on.
 
-        Raises:
-            InputError: the file cannot be read, or has become shorter.
+        Raises an `InputError` if the file cannot be read, or has become shorter.
         """
         if isinstance(path, Url):
             data = read_range(path, position, position + target.nbytes)
@@ -430,15 +428,9 @@ def read_array(path: Path, expected: str, name: str = "") -> NDArray[Any]:
 
 
 def read_picture(path: Path, otherwise: str, flags: int) -> NDArray[Any]:
-    """Decode a picture with OpenCV: (H, W) or, with blue first, (H, W, 3).
+    """Decode a picture with OpenCV and its `flags`: (H, W) or, with blue first, (H, W, 3).
 
-    Args:
-        path: the file.
-        otherwise: follows the path in the message for a file that cannot be decoded.
-        flags: of `cv2.imdecode`.
-
-    Raises:
-        InputError: the file is missing, or is no picture.
+    Raises an `InputError` if the file is missing, or cannot be decoded; then `otherwise` follows its path in the message.
     """
     import cv2
 

@@ -153,18 +153,13 @@ class OtherOrder(NamedTuple):
         )
 
 
-ORDERS = (
-    PixelOrder("width", "big"),
-    PixelOrder("width", "little"),
-    PixelOrder("height", "big"),
-    PixelOrder("height", "little"),
-)
 _WORDS = {
     PixelOrder("width", "big"): "the first pixel is the highest bit",
     PixelOrder("width", "little"): "the first pixel is the lowest bit",
     PixelOrder("height", "big"): "bytes are packed along the height",
     PixelOrder("height", "little"): "bytes are packed along the height, with the first pixel in the lowest bit",
 }
+ORDERS = tuple(_WORDS)
 
 
 def other_order(samples: Sequence[NDArray[np.uint8]], expected: PixelOrder = ORDERS[0]) -> OtherOrder | None:
@@ -290,21 +285,15 @@ class Content(NamedTuple):
     """What the values of an array are."""
 
     holds: Literal["bits", "sums"]  # "bits" for a pixel to a value, of 0 and 1, or of 0 and 255; "sums" for counts
-    lowest: int  # the smallest value of the sample
     highest: int  # the largest value of the sample
     n_values: int  # values of the sample
 
 
 def sampled_frames(path: Location, header: NpyHeader) -> list[NDArray[Any]]:
-    """Read runs of consecutive frames from all over a .npy file.
+    """Read runs of consecutive frames from all over a .npy file, whose array has three dimensions or more, in C order.
 
-    Args:
-        path: the file.
-        header: its header; the array has three dimensions or more, in C order.
-
-    Returns:
-        Arrays (n, rows, columns, ...), 3 million values together. Of large frames, only the first columns are read. An empty
-        list where the file is cut short.
+    Returns arrays (n, rows, columns, ...), 3 million values together. Of large frames, only the first columns are read. An
+    empty list where the file is cut short.
     """
     n_frames, n_rows, n_columns, *_ = header.shape
     if size_of(path) < header.file_bytes:
@@ -340,14 +329,14 @@ def unpacked_content(samples: Sequence[NDArray[Any]]) -> Content | None:
     peak = np.max([each.max(axis=0) for each in samples], axis=0)
     n_lit = int(np.count_nonzero(peak))
     if samples[0].dtype != np.uint8:
-        return Content("bits" if (lowest, highest) in ((0, 1), (0, 0), (1, 1)) else "sums", lowest, highest, n_values)
+        return Content("bits" if (lowest, highest) in ((0, 1), (0, 0), (1, 1)) else "sums", highest, n_values)
     if highest == 1:
-        return Content("bits", 0, 1, n_values) if n_lit >= _MIN_BITS else None
+        return Content("bits", 1, n_values) if n_lit >= _MIN_BITS else None
     if highest == 255 and not any(((each + np.uint8(1)) > 1).any() for each in samples):
         n_varied = int(np.count_nonzero((peak > 0) & (np.min([each.min(axis=0) for each in samples], axis=0) == 0)))
-        return Content("bits", 0, 255, n_values) if n_varied >= _MIN_BITS else None
+        return Content("bits", 255, n_values) if n_varied >= _MIN_BITS else None
     if (highest < 128 and n_lit >= _MIN_SUMS) or (highest >= 128 and _are_numbers(samples, peak)):
-        return Content("sums", lowest, highest, n_values)
+        return Content("sums", highest, n_values)
     return None
 
 

@@ -90,7 +90,6 @@ class BinarySource(Closing, ABC):
         response: that of binary frames of single photons, unless the subclass, or who makes the source, sets another.
         valid: (H, W) mask, True everywhere: files do not mark bad pixels.
         layout: order of the pixels of a frame in its bytes.
-        files: reads pieces of files.
     """
 
     def __init__(self, n_frames: int, layout: FrameLayout, frame_rate_hz: float | None = None) -> None:
@@ -99,7 +98,6 @@ class BinarySource(Closing, ABC):
         self.valid = np.ones(layout.frame_shape, np.bool_)
         self.valid.flags.writeable = False
         self.layout = layout
-        self.files = OpenFiles()
 
     @abstractmethod
     def pieces(self, span: FrameSpan) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
@@ -132,10 +130,6 @@ class BinarySource(Closing, ABC):
         for place, rows in self.pieces(span):
             frames[place] = self.layout.packed(rows)
         return frames
-
-    def close(self) -> None:
-        """Close the files."""
-        self.files.close()
 
 
 class ThreeChannels(Closing):

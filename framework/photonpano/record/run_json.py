@@ -240,7 +240,8 @@ def findings_of(record: RunRecord) -> Findings:
 
 def panorama_record(plan: Plan, panorama: RenderedPanorama, rendered: Sequence[Decision]) -> PanoramaRecord:
     """Describe the panorama, and name the choices of renderer and exporters."""
-    record: PanoramaRecord = {
+    found = panorama.dynamic_range
+    return {
         "height": panorama.canvas.height,
         "width": panorama.canvas.width,
         "scale": plan.render.scale,
@@ -249,12 +250,10 @@ def panorama_record(plan: Plan, panorama: RenderedPanorama, rendered: Sequence[D
         "coverage_share": panorama.coverage_share,
         "seconds": round(panorama.seconds, 3),
         "decisions": [each.what for each in rendered],
+        "dynamic_range_db": _rounded(found.decibels),
+        "measurable_range_db": _rounded(found.measurable_decibels),
+        "saturated_share": found.saturated_share,
     }
-    found = panorama.dynamic_range
-    record["dynamic_range_db"] = _rounded(found.decibels)
-    record["measurable_range_db"] = _rounded(found.measurable_decibels)
-    record["saturated_share"] = found.saturated_share
-    return record
 
 
 def _rounded(decibels: float | None) -> float | None:

@@ -105,28 +105,22 @@ def add_axes(
     margins: Margins,
     rows: Sequence[float] = (1,),
     *,
-    columns: int = 1,
     gap_in: float = 0.25,
     share_x: bool = False,
 ) -> list[Axes]:
-    """Add axes in a column or in a row, with their labels at fixed distances.
-
-    The rows have these relative heights, and the columns are equal.
-    """
+    """Add axes in a column, in rows of these relative heights, with their labels at fixed distances."""
     from matplotlib.transforms import ScaledTranslation
 
     width, height = figure.get_size_inches()
-    inner = width - margins.left - margins.right, height - margins.top - margins.bottom
+    inner = height - margins.top - margins.bottom
     n_rows = len(rows)
     grid = figure.add_gridspec(
         n_rows,
-        columns,
         left=margins.left / width,
         right=1 - margins.right / width,
         bottom=margins.bottom / height,
         top=1 - margins.top / height,
-        hspace=gap_in * n_rows / (inner[1] - (n_rows - 1) * gap_in),
-        wspace=gap_in * columns / (inner[0] - (columns - 1) * gap_in),
+        hspace=gap_in * n_rows / (inner - (n_rows - 1) * gap_in),
         height_ratios=rows,
     )
     axes = list(grid.subplots(squeeze=False, sharex=share_x).ravel())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ from photonpano.residuals.block_sums import (
     fold,
     n_blocks,
 )
-from photonpano.residuals.patterns import Shaking, find_shaking
+from photonpano.residuals.patterns import PartsApart, Shaking, find_shaking, parts_apart
 from photonpano.residuals.prediction import Prediction, Predictions
 from photonpano.values import Counts, FloatArray, FluxImage, FrameSpan, SpanResiduals
 
@@ -64,7 +64,7 @@ class Lasting(NamedTuple):
     frames: int  # of each span
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Residuals:
     """Observed minus predicted photons, summed in four ways."""
 
@@ -89,6 +89,11 @@ class Residuals:
     frame_shape: tuple[int, int]  # (height, width) of a frame
     light: FloatArray  # (S,) mean gain of the light of each span, 1 in steady light
     shaking: Shaking  # motion that is faster than a span
+
+    @cached_property
+    def apart(self) -> PartsApart | None:
+        """The parts of the sensor that lie beside each other most clearly: see `parts_apart`."""
+        return parts_apart(self.pixel_slopes)
 
     def steps(self) -> SpanResiduals:
         """Solve for the motion of each span; the gain of the light is solved for, too, and left out."""

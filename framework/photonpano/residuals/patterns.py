@@ -187,12 +187,8 @@ def _scatter(information: FloatArray, left: FloatArray) -> float:
 def deformation_px(shifts: FloatArray, information: FloatArray) -> float | None:
     """Return the root mean square of a smooth pattern in the shifts of blocks, beyond noise and a motion of the whole frame.
 
-    Args:
-        shifts: (h, w, 2) in px.
-        information: (h, w, 2, 2) their inverse covariances by photon noise, 0 where a block carries no shift.
-
-    Returns:
-        The size of a cubic polynomial in px; None if no block carries a shift.
+    It is the size of a cubic polynomial in px; None if no block carries a shift. The shifts are (h, w, 2) in px, `information`,
+    (h, w, 2, 2), their inverse covariances by photon noise, 0 where a block carries none.
     """
     known = information[..., 0, 0] > 0
     if not known.any():
@@ -221,10 +217,8 @@ class Shaking:
 def find_shaking(shifts: FloatArray, variances: FloatArray, size: int) -> Shaking:
     """Compare the scatter of single frames within spans of `size` frames with photon noise.
 
-    Args:
-        shifts: (W, F, 2) shifts in px of the F frames of each of W windows against the panorama.
-        variances: (W, F, 2) their variances by photon noise.
-        size: frames of a span, F at most.
+    The shifts, (W, F, 2) in px, are those of the F frames of each of W windows, at least `size`, against the panorama;
+    `variances`, (W, F, 2), are theirs by photon noise.
     """
     found, span = scatter_px(shifts, variances, size), size
     if not found:

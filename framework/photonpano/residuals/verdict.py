@@ -18,7 +18,6 @@ from photonpano.residuals.block_sums import M, V
 from photonpano.residuals.causes import CAUSES, TestedRun, Tests, changing_places
 from photonpano.residuals.findings import NOTHING, Findings
 from photonpano.residuals.measure import FEWEST_FRAMES
-from photonpano.residuals.patterns import parts_apart
 from photonpano.residuals.refinement import FEWEST_SPANS, Explained
 from photonpano.text import listed, pixels
 from photonpano.values import Verdict
@@ -114,7 +113,7 @@ def parallax_of(run: TestedRun) -> float:
 )
 def _parts(run: TestedRun) -> Found | None:
     """As where rows take turns, or a part of the sensor is read out some frames later than the rest."""
-    apart = parts_apart(run.explained.residuals.pixel_slopes)
+    apart = run.explained.residuals.apart
     if apart is None or apart.chance > _PARTS_CHANCE:
         return None
     if run.findings.rival_motion is not None or _standing.judged(run):  # a thing in the frame moves, or stands, by itself
@@ -226,7 +225,7 @@ def others_px(run: TestedRun) -> float:
 
     Rows that take turns see the same motion: what lies between them tears the panorama alone.
     """
-    apart = parts_apart(run.explained.residuals.pixel_slopes)
+    apart = run.explained.residuals.apart
     found = _uncut_jump(run), _ambiguous(run), None if apart is None or apart.turns else _parts.judged(run)
     return float(np.linalg.norm([each.figure for each in found if each is not None]))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,23 +40,8 @@ def load_spec(
         SpecError: the file cannot be read, or the spec is wrong; carries all problems, each with line and column.
     """
     path, catalog = Path(path), discover() if catalog is None else catalog
-    try:
-        return parse_spec(
-            read_spec(path),
-            directory=path.parent,
-            name=path.stem,
-            overrides=overrides,
-            output=output,
-            catalog=catalog,
-            file=path,
-            arriving=arriving,
-        )
-    except SpecError:
-        if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not _is_capture(catalog, path):
-            raise
-    source = {"use": "auto", "with": {"path": path.name}}
-    return parse_spec(
-        {"version": 1, "source": source},
+    parsed = partial(
+        parse_spec,
         directory=path.parent,
         name=path.stem,
         overrides=overrides,
@@ -63,6 +49,12 @@ def load_spec(
         catalog=catalog,
         arriving=arriving,
     )
+    try:
+        return parsed(read_spec(path), file=path)
+    except SpecError:
+        if path.suffix.lower() in SPEC_SUFFIXES or not path.exists() or not _is_capture(catalog, path):
+            raise
+    return parsed({"version": 1, "source": {"use": "auto", "with": {"path": path.name}}})
 
 
 def _is_capture(catalog: Catalog, path: Path) -> bool:

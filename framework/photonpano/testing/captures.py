@@ -49,12 +49,7 @@ class Scene:
         return self._of(np.sin(np.asarray(points) @ self._waves + self._phases) @ self._amplitudes)
 
     def view(self, homography: Homography, shape: tuple[int, int]) -> FloatArray:
-        """Return the view of a camera: (H, W) flux.
-
-        Args:
-            homography: (3, 3), pixels of the image to points of the plane.
-            shape: (height, width) of the image.
-        """
+        """Return the view of a camera: (H, W) flux, where the homography maps pixels to points of the plane."""
         if homography[2, :2].any():
             return self.flux(transform_points(homography, np.indices(shape)[::-1].reshape(2, -1).T)).reshape(shape)
         # Along an affine map, each wave is the product of one of x and one of y.
@@ -77,15 +72,9 @@ def textured(shape: tuple[int, int], flux: float = 0.5, contrast: float = 0.8, s
 
 
 def seen_along(scene: ArrayLike, homographies: ArrayLike, shape: tuple[int, int]) -> FloatArray:
-    """Return what frames see of an image of flux.
+    """Return what frames of (height, width) see of an image of flux, (Hs, Ws), mirrored at its border: (T, H, W) flux.
 
-    Args:
-        scene: (Hs, Ws) flux; it is mirrored at its border, and interpolated linearly.
-        homographies: (T, 3, 3), pixels of a frame to pixels of the scene.
-        shape: (height, width) of a frame.
-
-    Returns:
-        (T, H, W) flux.
+    The homographies, (T, 3, 3), map pixels of a frame to pixels of the scene, which is interpolated linearly.
     """
     import cv2
 
@@ -166,17 +155,10 @@ def read_only(array: NDArray[Number]) -> NDArray[Number]:
 
 
 def recorded(scene: Scene, motion: Trajectory, n_frames: int, shape: tuple[int, int], seed: int = 0) -> NDArray[np.uint8]:
-    """Simulate frames of a scene from a binary camera (paper, equation 2).
+    """Simulate frames of a scene from a binary camera (paper, equation 2): (n_frames, H, W) of zeros and ones.
 
-    Args:
-        scene: the scene.
-        motion: pixels of a frame to points of the scene.
-        n_frames: number of frames.
-        shape: (height, width) of a frame.
-        seed: seed of the photon noise.
-
-    Returns:
-        (n_frames, H, W) of zeros and ones.
+    The shape is (height, width) of a frame. The motion maps pixels of a frame to points of the scene; `seed` is that of the
+    photon noise.
     """
     rng = np.random.default_rng(seed)
     frames = np.empty((n_frames, *shape), np.uint8)
@@ -188,11 +170,7 @@ def recorded(scene: Scene, motion: Trajectory, n_frames: int, shape: tuple[int, 
 def photographed(flux: FloatArray, n_frames: int = 1000, seed: int = 0, unseen: BoolArray | None = None) -> VirtualExposure:
     """Simulate a virtual exposure of a still camera, with the photon noise of `n_frames` binary frames.
 
-    Args:
-        flux: (H, W), photons per pixel per frame.
-        n_frames: number of merged frames.
-        seed: seed of the photon noise.
-        unseen: (H, W), true for pixels without any observation.
+    Flux is (H, W), photons per pixel per frame; `unseen`, (H, W), is true for pixels without any observation.
     """
     response = BinaryResponse()
     counts = np.random.default_rng(seed).binomial(n_frames, -np.expm1(-flux))

@@ -26,17 +26,7 @@ from photonpano.record.contents import contents_of
 from photonpano.record.schema import FileContent
 from photonpano.testing.captures import KnownMotion, MemorySource, ReadOnlySource, Scene, read_only, recorded, rolled
 from photonpano.testing.conformance import Answer, AnswerConformance, StageConformance, copied, fingerprint, in_threads, passing
-from photonpano.values import (
-    BoolArray,
-    Counts,
-    FloatArray,
-    FluxImage,
-    FrameSpan,
-    Group,
-    Homography,
-    Panorama,
-    VirtualExposure,
-)
+from photonpano.values import BoolArray, Counts, FloatArray, FluxImage, FrameSpan, Group, Homography, Panorama, VirtualExposure
 
 SHAPE = (40, 56)
 N_FRAMES = 240
@@ -132,7 +122,8 @@ class MergerConformance(AnswerConformance):
         """Pixels of frame t are mapped to the reference instant r by inverse(trajectory.at(r)) @ trajectory.at(t)."""
         self._require_compensation()
         exposure = self.merged(MemorySource(moving_frames()), group, MOTION)
-        shift, contrast = displacement_and_contrast(exposure, lit_probability(view_at(group.reference)))
+        known = lit_probability(SCENE.view(MOTION.at([group.reference])[0], SHAPE))
+        shift, contrast = displacement_and_contrast(exposure, known)
         assert contrast > _SHARP, "along a known motion the image must stay sharp"
         assert np.hypot(*shift) <= self.tolerance_px, f"the scene must be in its place at instant {group.reference:g}"
 
@@ -327,11 +318,6 @@ def dead_pixels() -> BoolArray:
     valid = np.random.default_rng(7).random(SHAPE) > 0.02
     valid[:, 30:33] = False
     return valid
-
-
-def view_at(instant: float) -> FloatArray:
-    """Return the flux that the moving camera sees at an instant."""
-    return SCENE.view(MOTION.at([instant])[0], SHAPE)
 
 
 def displacement_and_contrast(exposure: VirtualExposure, known: FloatArray) -> tuple[FloatArray, float]:

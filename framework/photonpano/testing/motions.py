@@ -42,11 +42,7 @@ TOLERANCE = 4.0  # largest correction of a motion without error, in expected err
 
 
 class ResamplerConformance(AnswerConformance):
-    """Checks of a resampler, for captures of about 2,000 frames and for short ones.
-
-    Attributes:
-        config: the keys under `with`, which must suit a capture of 2,000 frames.
-    """
+    """Checks of a resampler, for captures of about 2,000 frames, which the config must suit, and for short ones."""
 
     kind: ClassVar[str] = "resampler"
 

@@ -22,32 +22,22 @@ _MAX_FRAMES = 200  # frames that are checked, half of them at each end of a long
 
 
 class SourceConformance(Conformance):
-    """Checks of a source.
-
-    Attributes:
-        config: the keys under `with` of a small capture; those that `write` returns are added.
-        frame_shape: (height, width) of the frames that `write` is given; choose an odd width if the format supports it.
-        n_frames: number of these frames.
-        bit_depth: bits per pixel of these frames.
-        wrong: keys that replace those of the config and that `check` must reject, such as a missing file.
-        grows: whether this capture can be read while it is being written, if the contribution has an `arrived`.
-    """
+    """Checks of a source. The config is that of a small capture; the keys that `write` returns are added."""
 
     kind: ClassVar[str] = "source"
 
     contribution: SourceContribution
+    # (height, width) of the frames that `write` is given; choose an odd width if the format supports it
     frame_shape: tuple[int, int] = (18, 27)
-    n_frames: int = 75
-    bit_depth: int = 1
-    wrong: Sequence[Mapping[str, Any]] = ()
-    grows: bool = True
+    n_frames: int = 75  # number of these frames
+    bit_depth: int = 1  # bits per pixel of these frames
+    wrong: Sequence[Mapping[str, Any]] = ()  # keys that replace those of the config and that `check` must reject
+    grows: bool = True  # whether this capture can be read while it is being written, if the contribution has an `arrived`
 
     def write(self, frames: NDArray[np.generic], folder: Path) -> Mapping[str, Any]:
         """Write frames as a capture and return the keys that open it; override this for a source that reads files.
 
-        Args:
-            frames: (n_frames, *frame_shape), uint8, or uint16 for a bit depth of more than 8.
-            folder: an empty folder for the files.
+        They are (n_frames, *frame_shape), uint8, or uint16 for a bit depth of more than 8; the folder is empty.
         """
         del frames, folder
         return {}

@@ -126,11 +126,7 @@ class StreamInfo:
         return [FrameSpan(start, start + frames) for start in starts]
 
     def require(self, span: FrameSpan) -> None:
-        """Raise if a span reaches beyond the capture.
-
-        Raises:
-            InputError: the span reaches beyond the last frame.
-        """
+        """Raise an `InputError` if a span reaches beyond the capture."""
         if span.stop > self.n_frames:
             were = "was" if len(span) == 1 else "were"
             raise InputError(f"{span} {were} requested, but the capture has {self.n_frames} frames (0 to {self.n_frames - 1})")

@@ -185,13 +185,9 @@ def _common(forms: Iterable[tuple[str, _Form]]) -> _Form:
     return first[1]
 
 
-def _is_png(file: Path) -> bool:
-    return file.suffix.lower() == ".png"
-
-
 def _form_of(file: Path) -> _Form:
     """Return the form of a picture from its header."""
-    if not _is_png(file):
+    if file.suffix.lower() != ".png":
         with _tiff(file) as tiff, reading(file, _DAMAGED):
             if len(tiff.pages) > 1:
                 raise InputError(f"{file} has {len(tiff.pages)} pages; name the file itself if each is a frame")

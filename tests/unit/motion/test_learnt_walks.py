@@ -18,8 +18,7 @@ GROUPS = groups_of(N_NODES)
 AUTO = MotionModel(kind="auto")
 # Standard deviation of the small motions between exposures: shifts by tenths of a frame, others by hundredths of it.
 STEP = np.array([0.02, 0.02, 0.02, 0.02, 0.1, 0.05, 0.01, 0.01])
-# The walks in the order of the columns of `basis_of`, after shift and roll.
-WALKS = ("zoom", "shear of the axes", "shear of the diagonals", "perspective along x", "perspective along y")
+WALKS = ("zoom", "shear", "perspective")  # one more with each model beyond "euclidean"
 FOCAL_PX = 600.0
 
 
@@ -72,7 +71,7 @@ def test_learnt_walks_are_as_accurate_as_the_model_that_moved_and_as_sure(model:
             assert solution.outliers == ()
             if name == "auto":
                 assert solution.model.kind == "homography"
-                there = WALKS[: max(basis_of(model).shape[1] - 3, 0)]
+                there = WALKS[: max(PLANAR_NAMES.index(model) - 1, 0)]
                 assert all((solution.walks_px.get(walk, 0) > 4) == (walk in there) for walk in WALKS)
                 assert all(solution.walks_px.get(walk, 0) < 0.8 for walk in WALKS if walk not in there)
     assert np.mean(errors["auto"]) < 1.3 * np.mean(errors[model])
@@ -92,6 +91,26 @@ def test_zoom_out_and_back_is_no_outlier() -> None:
         assert rms_px(solution.homographies, true) < 2 * NOISE_PX
         assert solution.walks_px["zoom"] > 30
         assert all(px < 0.5 for walk, px in solution.walks_px.items() if walk != "zoom")
+
+
+def test_a_long_smooth_flight_past_a_wall_is_not_bent() -> None:
+    """From step to step it changes by less than noise, all in one direction: a walk as wide as its steps would hold it.
+
+    With walks of that width, they were 0.68 px off, where 0.46 px were expected.
+    """
+    basis, n_nodes = basis_of("homography"), 65
+    steady = np.array([[0.15, 0.02, 0.004, 0.016, 0.004, 0.004, 0.005, 0.0]])
+    true = [np.eye(3)]
+    for _ in range(n_nodes - 1):
+        true.append(moved(true[-1][None], steady, basis, SHAPE)[0])
+    errors, expected = [], []
+    for seed in range(3):
+        edges = measured_with(np.array(true), seed, 0.3)
+        solution = solve(groups_of(n_nodes), edges, n_nodes // 2, frame_shape=SHAPE, model=AUTO)
+        errors.append(rms_px(solution.homographies, np.array(true)))
+        expected.append(float(np.sqrt((solution.assess().std_px ** 2).mean())))
+    assert np.mean(errors) < 0.55
+    assert np.mean(errors) < 1.2 * np.mean(expected)
 
 
 def test_what_only_shifts_and_rolls_has_three_unknowns_an_exposure() -> None:

@@ -158,7 +158,7 @@ def test_solve_of_a_large_graph_takes_few_steps_with_sparse_factors(
         if late - early > 4
     ]
     solve(groups_of(300), edges, 150, frame_shape=SHAPE)
-    assert sum(size > max(filled) / 2 for size in filled) <= 31  # thirty, and one to compare
+    assert sum(size > max(filled) / 2 for size in filled) <= 33  # thirty, one to compare, and those with wider walks
     assert len(filled) <= 40
     assert max(filled) < 300 * 8**2 * most
 

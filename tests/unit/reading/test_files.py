@@ -87,7 +87,7 @@ def last(frames: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("dtype", [bool, np.uint8, np.int64, ">u2"])
 def test_zeros_and_ones_are_bits(clouds: Callable[..., np.ndarray], dtype: Any) -> None:
-    assert unpacked_content([clouds(0.003, n_frames=40).astype(dtype)])[:3] == ("bits", 0, 1)
+    assert unpacked_content([clouds(0.003, n_frames=40).astype(dtype)])[:2] == ("bits", 1)
 
 
 @pytest.mark.parametrize("flux", [2.0, 0.3, 0.01])
@@ -95,7 +95,7 @@ def test_zeros_and_ones_are_bits(clouds: Callable[..., np.ndarray], dtype: Any) 
 def test_counts_of_any_height_are_sums(clouds: Callable[..., np.ndarray], n: int, flux: float) -> None:
     sums = summed(clouds(flux, n_frames=510), n)
     found = unpacked_content([sums])
-    assert found == ("sums", sums.min(), sums.max(), sums.size)
+    assert found == ("sums", sums.max(), sums.size)
 
 
 def test_last_axis_is_that_of_the_frames_where_values_are_most_alike(clouds: Callable[..., np.ndarray]) -> None:

@@ -9,16 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from photonpano.contracts.protocols.sources import Source
-from photonpano.values import (
-    FloatArray,
-    Group,
-    Homography,
-    Located,
-    NotLocated,
-    Refined,
-    SpanResiduals,
-    VirtualExposure,
-)
+from photonpano.values import FloatArray, Group, Homography, Located, NotLocated, Refined, SpanResiduals, VirtualExposure
 
 if TYPE_CHECKING:
     from photonpano.geometry import Camera
