@@ -164,6 +164,9 @@ class Piece:
     halves: Halves  # what half of the points tell
 
 
+CONTRADICTED = "the {} contradict the focal length"  # images, such as `averages`
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeFocal:
     """The focal length that images have if it is not given."""
@@ -200,7 +203,7 @@ class FreeFocal:
             return None
         where = f"{self} fits, {given_px:.4g} px is given; in expected errors"
         todo = "calibrate the camera, and correct camera.focal_px, or leave it out"
-        return Reason(f"the {images} contradict the focal length", off, _FOCAL_SIGMAS, where, todo)
+        return Reason(CONTRADICTED.format(images), off, _FOCAL_SIGMAS, where, todo)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,7 +31,7 @@ from photonpano_colmap.exposures import (
 )
 from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Adjusted, Found, Observations, adjust, find_patches, patches_of, stabilised
-from photonpano_colmap.reconstruction import FOCAL_BIAS, FreeFocal
+from photonpano_colmap.reconstruction import CONTRADICTED, FOCAL_BIAS, FreeFocal
 from photonpano_poses import CameraGuess, LostFrames, PosedView, PoseEstimate, ScenePoints, between, see_depth, with_depth
 
 # A lens is contradicted by an error of k1 above this many standard errors that moves a corner of the frame as far.
@@ -84,7 +84,7 @@ class StratifiedEstimator:
                     scene = replace(scene, dense=with_depth(source, so_far, self._context.threads, progress))
         first = replace(first, levels=tuple(levels), lost=tuple(sorted(lost, key=lambda each: each.span.start)))
         found = level.adjusted
-        if guess.focal_px is not None and not first.doubts:  # from far off, the exposures lead nowhere
+        if guess.focal_px is not None and not _is_far_off(first):  # from there, the exposures lead nowhere
             found = adjust(found.poses, found.points, level.observations, camera, finds_focal=True)
         estimate = with_focal_judged(_Assembly(source, camera, first, level, found, before).estimate(), self._context)
         return with_depth(source, estimate, self._context.threads, progress) if self._config.depth else estimate
@@ -98,7 +98,7 @@ class _Assembly:
     camera: Camera
     first: PoseEstimate  # of the averages; with the records of all levels, and the frames that any of them lost
     level: _PosedLevel
-    free: Adjusted  # the exposures of the level with a focal length that is not given, unless the averages are doubtful
+    free: Adjusted  # the exposures of the level with a focal length that is not given, unless the averages contradict that
     before: FloatArray  # (T, 3, 4), poses of all frames by the level before
 
     def estimate(self) -> PoseEstimate:
@@ -109,7 +109,7 @@ class _Assembly:
         stds[1] = np.hypot(stds[1], tilt(level.adjusted.poses, level.adjusted.std_position))
         of_focal = self._free_focal.missed(self._free_focal.images, level.adjusted.poses, self.camera.focal_px)
         stds = [np.hypot(std, np.interp(frames, instants, each)) for std, each in zip(stds, of_focal, strict=True)]
-        if self.first.doubts:  # such as of the focal length, whose error is in those of the averages
+        if _is_far_off(self.first):
             stds = [
                 np.fmax(*each)
                 for each in zip(stds, (self.first.std_position, np.deg2rad(self.first.std_rotation_deg)), strict=True)
@@ -204,6 +204,11 @@ _LEAST_LOCATED = 5  # minimum number of located exposures
 # Corrections of tremor in a level end after 4, below 0.02 px, or when they grow: then depth is wrong, not the path.
 _MOST_TREMORS, _LEFT_PX = 4, 0.02
 _OUT_OF_SIGHT = 0.8  # exposures are compared if their centres are closer than this, in sides of a frame
+
+
+def _is_far_off(averages: PoseEstimate) -> bool:
+    """Return whether averages contradict the focal length that is given, whose error is in theirs."""
+    return any(doubt.what == CONTRADICTED.format("averages") for doubt in averages.doubts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

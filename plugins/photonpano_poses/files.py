@@ -25,7 +25,7 @@ from photonpano_poses.contract import PoseEstimate, ScenePoints
 if TYPE_CHECKING:  # it compiles loops over pixels
     from photonpano_poses.depth import Surface
 
-_GRAPHICS = np.diag([1.0, -1.0, -1.0])  # axes of a camera in OpenGL, x right, y up, z back, to ours
+GRAPHICS = np.diag([1.0, -1.0, -1.0])  # axes of a camera in OpenGL, x right, y up, z back, to ours
 _WHITE_QUANTILE = 0.995  # quantile of the flux of points, or of an exposure, that is white
 _MIDDLE_GREY = 128
 # Directions of the reference camera to a world whose z is up, in which that camera looks along y.
@@ -99,7 +99,7 @@ def nerfstudio(poses: Poses) -> dict[str, str]:
     """
     camera, (height, width) = poses.camera, poses.frame_shape
     poses_4x4 = np.tile(np.eye(4), (len(poses.names), 1, 1))
-    poses_4x4[:, :3, :3] = (_UPRIGHT if poses.positions is None else np.eye(3)) @ poses.rotations @ _GRAPHICS
+    poses_4x4[:, :3, :3] = (_UPRIGHT if poses.positions is None else np.eye(3)) @ poses.rotations @ GRAPHICS
     poses_4x4[:, :3, 3] = poses.places
     content = {
         "camera_model": "OPENCV",

@@ -6,21 +6,24 @@ trajectory error (ATE) after the best similarity (Umeyama 1991), and the relativ
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from photonpano import BoolArray, FloatArray, InputError
 from photonpano.evaluation.scores import of_focal_length
-from photonpano.geometry import Camera, nearest_rotations, positions_of, rotation_vectors
+from photonpano.geometry import Camera, nearest_rotations, positions_of, rotation_vectors, transform_points
 from photonpano.notebooks import facts
-from photonpano.reading import read_arrays
+from photonpano.reading import read_arrays, read_picture
 from photonpano.record.contents import require_one_run
 from photonpano_poses.contract import are_rigid
+from photonpano_poses.files import GRAPHICS, depth_name
 
 POSES = "poses.npz"
 _ORTHONORMAL = 1e-3  # maximum deviation of R R^T from the identity in a pose
@@ -111,6 +114,27 @@ def _require_rigid(path: Path, poses: FloatArray) -> None:
 _RPE_SHARE = 0.01  # step of the relative error, as a fraction of the frames
 
 
+@dataclass(frozen=True, slots=True)
+class DepthScore:
+    """Errors of the pixels of depth maps, after the best similarity of the positions of the cameras.
+
+    Attributes:
+        error: median of the errors of the depth, relative to the true one.
+        known_share: share of the pixels of the maps whose depth is known.
+        within_std_shares: shares of these whose error is within 1, 2 and 3 expected ones.
+    """
+
+    error: float
+    known_share: float
+    within_std_shares: tuple[float, float, float]
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the scores with their names, for people."""
+        shares = ", ".join(f"{100 * share:.1f} %" for share in self.within_std_shares)
+        found = f"{100 * self.error:.2f} %, of {100 * self.known_share:.0f} % of the pixels"
+        return [("error of depth, median", found), ("depths within 1, 2, 3 std", shares)]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseScore:
     """Errors of poses over the located frames, after the best similarity of their positions.
@@ -130,6 +154,7 @@ class PoseScore:
             knows none.
         std_ratio: root mean square of the errors of positions, in units of the expected ones; None if the run knows none.
         focal_error: error of the focal length, relative to the true one; None if that is not known.
+        depth: of the depth maps; None if the run has none, or the truth has no depth.
     """
 
     errors_m: FloatArray
@@ -145,6 +170,7 @@ class PoseScore:
     honest_shares: tuple[float, float, float] | None
     std_ratio: float | None
     focal_error: float | None = None
+    depth: DepthScore | None = None
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the scores with their names, for people."""
@@ -160,12 +186,14 @@ class PoseScore:
             rows += [("within 1, 2, 3 std_position", shares), ("error over std_position, rms", f"{self.std_ratio:.2f}")]
         if self.focal_error is not None:
             rows.append(("focal length", of_focal_length(self.focal_error)))
-        return rows
+        return rows if self.depth is None else rows + self.depth.rows()
 
     def data(self) -> dict[str, Any]:
         """Return the scores with their names, for programs."""
         named = {each.name: each.name for each in fields(self)} | {"honest_shares": "within_std_shares"}
-        return {named[name]: getattr(self, name) for name in named if name not in ("errors_m", "errors_deg")}
+        depth = None if self.depth is None else asdict(self.depth)
+        found = {named[name]: getattr(self, name) for name in named if name not in ("errors_m", "errors_deg")}
+        return {**found, "depth": depth}
 
     def figures(self) -> dict[str, Any]:
         """Return what the summary of a batch shows."""
@@ -203,7 +231,44 @@ def evaluate_poses(run_folder: Path | str, truth: Path | str, rpe_frames: int | 
         score = pose_errors(run.camera_from_world, true, run.located, frames, run.std_position)
     except ValueError as error:
         raise InputError(f"{folder} and {truth} cannot be compared: {error}") from error
+    score = replace(score, depth=_depth_score(folder, run, truth))
     return score if focal_px is None else replace(score, focal_error=run.camera.focal_px / focal_px - 1)
+
+
+def _depth_score(folder: Path, run: RunPoses, truth: Path) -> DepthScore | None:
+    """Compare depth maps with the true depth of frames near them, whose pixels show the same if a map is right.
+
+    A map is laid where its camera truly was, so that poses count by their scale alone.
+    """
+    arrays = read_arrays(truth, "a truth with poses")
+    if not (folder / "depth").exists() or not {"depths", "depth_frames", "camera_matrix"} <= arrays.keys():
+        return None
+    true, frames = arrays["camera_from_world"], arrays["depth_frames"]
+    scale, *_ = align_positions(positions_of(run.camera_from_world[run.located]), positions_of(true[run.located]))
+    camera = Camera(arrays["camera_matrix"], arrays.get("distortion", np.zeros(4)))
+    rays = run.camera.directions(np.indices(run.frame_shape)[::-1].reshape(2, -1).T)
+    errors, stds, known_shares = [], [], []
+    for view in json.loads((folder / "transforms.json").read_text(encoding="utf-8"))["frames"]:
+        files = [folder / depth_name(Path(view["file_path"]).name, suffix) for suffix in ("", "_std")]
+        if not files[0].exists():
+            continue
+        maps = (read_picture(file, "is no depth map; run the spec again", cv2.IMREAD_UNCHANGED) for file in files)
+        depths, std = (each.ravel() for each in maps)
+        known, pose = depths > 0, np.linalg.inv(np.array(view["transform_matrix"]))
+        here = int(np.nanargmin(np.linalg.norm(run.camera_from_world - GRAPHICS @ pose[:3], axis=(1, 2))))
+        nearest = int(np.abs(frames - here).argmin())
+        (motion,) = _relative(true[here, None], true[frames[nearest], None])
+        points = scale * rays[known] * (depths / rays[:, 2])[known, None] @ motion[:, :3].T + motion[:, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = camera.distorted(transform_points(camera.matrix, points[:, :2] / points[:, 2:])).round()
+        inside = (points[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < run.frame_shape[::-1]).all(axis=1)
+        x, y = pixels[inside].astype(int).T
+        errors.append(np.abs(points[inside, 2] / arrays["depths"][nearest, y, x] - 1))
+        stds.append((std[known] / depths[known])[inside])
+        known_shares.append(known.mean())
+    off, expected = np.concatenate(errors), np.concatenate(stds)
+    one, two, three = (float((off <= times * expected).mean()) for times in (1, 2, 3))
+    return DepthScore(float(np.median(off)), float(np.mean(known_shares)), (one, two, three))
 
 
 def pose_errors(

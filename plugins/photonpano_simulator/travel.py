@@ -39,6 +39,7 @@ _PLANES = {
 _ARRAYS = ["camera_from_world", "camera_matrix", "frame_shape", "taken", "light", "textures", "texture_shapes", "texture_flux"]
 _UNFOLDED_PX = 1e-3
 _SAME = 1e-6  # relative difference below which two inverse depths are of the same point
+_DEPTHS = 16  # frames whose depth is in the truth, at most
 _METERED = 9  # frames along the path over which the mean flux is taken
 
 
@@ -210,7 +211,9 @@ class TravelSource(SimulatedSource):
             camera, X_c = R X_w + t, with the same axes; pixels are K X_c, integers are pixel centres.
         """
         gains = {"gains": self._sensor.gains} if (self._sensor.gains != 1).any() else {}
-        return {**super().truth(), **self._truth.arrays(), **gains}
+        frames = np.unique(np.linspace(0, self.info.n_frames - 1, _DEPTHS).round().astype(int))
+        depths = np.stack([depth(self._truth, frame) for frame in frames.tolist()]).astype(np.float32)
+        return {**super().truth(), **self._truth.arrays(), **gains, "depth_frames": frames, "depths": depths}
 
     def sharp_view(self, frame: int) -> NDArray[np.float32]:
         """Return the flux of a frame without noise, dark counts and differences between pixels: (H, W)."""
