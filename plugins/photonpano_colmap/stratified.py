@@ -84,7 +84,7 @@ class StratifiedEstimator:
                     scene = replace(scene, dense=with_depth(source, so_far, self._context.threads, progress))
         first = replace(first, levels=tuple(levels), lost=tuple(sorted(lost, key=lambda each: each.span.start)))
         found = level.adjusted
-        if guess.focal_px is not None and not _is_far_off(first):  # from there, the exposures lead nowhere
+        if guess.focal_px is not None and not is_far_off(first):  # from there, the exposures lead nowhere
             found = adjust(found.poses, found.points, level.observations, camera, finds_focal=True)
         estimate = with_focal_judged(_Assembly(source, camera, first, level, found, before).estimate(), self._context)
         return with_depth(source, estimate, self._context.threads, progress) if self._config.depth else estimate
@@ -109,7 +109,7 @@ class _Assembly:
         stds[1] = np.hypot(stds[1], tilt(level.adjusted.poses, level.adjusted.std_position))
         of_focal = self._free_focal.missed(self._free_focal.images, level.adjusted.poses, self.camera.focal_px)
         stds = [np.hypot(std, np.interp(frames, instants, each)) for std, each in zip(stds, of_focal, strict=True)]
-        if _is_far_off(self.first):
+        if is_far_off(self.first):
             stds = [
                 np.fmax(*each)
                 for each in zip(stds, (self.first.std_position, np.deg2rad(self.first.std_rotation_deg)), strict=True)
@@ -206,7 +206,7 @@ _MOST_TREMORS, _LEFT_PX = 4, 0.02
 _OUT_OF_SIGHT = 0.8  # exposures are compared if their centres are closer than this, in sides of a frame
 
 
-def _is_far_off(averages: PoseEstimate) -> bool:
+def is_far_off(averages: PoseEstimate) -> bool:
     """Return whether averages contradict the focal length that is given, whose error is in theirs."""
     return any(doubt.what == CONTRADICTED.format("averages") for doubt in averages.doubts)
 

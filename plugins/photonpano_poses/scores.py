@@ -240,8 +240,10 @@ def _depth_score(folder: Path, run: RunPoses, truth: Path) -> DepthScore | None:
 
     A map is laid where its camera truly was, so that poses count by their scale alone.
     """
+    if not (folder / "depth").exists():
+        return None
     arrays = read_arrays(truth, "a truth with poses")
-    if not (folder / "depth").exists() or not {"depths", "depth_frames", "camera_matrix"} <= arrays.keys():
+    if not {"depths", "depth_frames", "camera_matrix"} <= arrays.keys():
         return None
     true, frames = arrays["camera_from_world"], arrays["depth_frames"]
     scale, *_ = align_positions(positions_of(run.camera_from_world[run.located]), positions_of(true[run.located]))

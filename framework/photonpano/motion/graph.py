@@ -522,8 +522,8 @@ class _Tied:
 
     def solution(self, fit: _Fit, model: MotionModel, compare: Callable[[], Mapping[str, Rival]]) -> GraphSolution:
         """Return a fit as the solution of the graph."""
-        if isinstance(fit.adjustment, PlanarAdjustment):
-            wide = fit.adjustment.widened(fit.state, fit.weights)
+        # Models were compared with the likeliest walks.
+        if isinstance(fit.adjustment, PlanarAdjustment) and (wide := fit.adjustment.widened(fit.state, fit.weights)):
             fit = _Fit(wide, *wide.minimise(fit.state, fit.kept, fit.weights), fit.kept)
         adjustment, found = fit.adjustment, fit.state
         homographies = np.full((len(self.located), 3, 3), np.nan)

@@ -278,14 +278,16 @@ class PlanarAdjustment(Adjustment[Plane]):
                 self.variances, least = without, other
         return bool(np.abs(np.log(self.variances / before)).max() > _SETTLED)
 
-    def widened(self, state: Plane, weights: FloatArray) -> PlanarAdjustment:
+    def widened(self, state: Plane, weights: FloatArray) -> PlanarAdjustment | None:
         """Return the problem with walks as wide at all time scales as in the octave of these in which they are widest.
+
+        None if it has no walks, or too few steps to tell.
 
         Most cameras move more smoothly than a walk: one that is as wide as all scales are in the mean holds the slow ones, in
         which most of the motion is, and bends a long path. Expected squares of the steps (Dempster et al. 1977).
         """
         if not self._n_walks or len(self._times) < _FEWEST_STEPS:
-            return self
+            return None
         problem, found = self._around(state, weights), self.of(self._problem)
         changes = problem.factors(self.variances).solve(problem.given(self.variances))
         octaves = np.array([0, *(2 ** np.arange((len(self._times) - 1).bit_length()))])

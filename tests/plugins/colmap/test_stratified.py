@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from photonpano import FrameSpan, Group, StageContext
+from photonpano import FrameSpan, Group, Reason, StageContext
 from photonpano.execution.context import Quiet
 from photonpano.geometry import Camera, positions_of, rotation_matrices
 from photonpano_poses import (
@@ -37,7 +37,16 @@ from photonpano_colmap.exposures import (
 from photonpano_colmap.hooks import StratifiedPoseConfig
 from photonpano_colmap.locating import Observations, adjust
 from photonpano_colmap.reconstruction import FreeFocal
-from photonpano_colmap.stratified import Merged, Scene, StratifiedEstimator, interpolate, locate, merge, resample
+from photonpano_colmap.stratified import (
+    Merged,
+    Scene,
+    StratifiedEstimator,
+    interpolate,
+    is_far_off,
+    locate,
+    merge,
+    resample,
+)
 
 CAMERA = Camera.of(FOCAL_PX, POSES_SHAPE)
 MATRIX = CAMERA.matrix
@@ -93,13 +102,17 @@ def test_tremor_within_a_group_is_found() -> None:
     assert (left < 0.3 * before).all(), left / before
 
 
+def estimate_of(*views: PosedView) -> PoseEstimate:
+    """The true poses of all frames, and the points of the scene."""
+    std, points = np.full(N_POSES, 1e-3), ScenePoints(_seen_points(), np.ones(450, np.float32))
+    return PoseEstimate(MATRIX, np.zeros(4), 0.0, TRUE.poses, EVERYWHERE, std, std, points, views)
+
+
 def test_groups_are_merged_through_dense_depth_where_it_is_known() -> None:
     [pose], depth = TRUE.at([79.5]), np.full(POSES_SHAPE, 0.25, np.float32)
     depth[:, :80] = np.nan
     view = PosedView(FrameSpan(0, 160), 79.5, pose, np.zeros(0, np.intp), np.zeros((0, 2)), lambda: depth)
-    std, points = np.full(N_POSES, 1e-3), ScenePoints(_seen_points(), np.ones(450, np.float32))
-    dense = PoseEstimate(MATRIX, np.zeros(4), 0.0, TRUE.poses, EVERYWHERE, std, std, points, (view,))
-    dense = replace(dense, depth=(DepthMap(0, *5 * (depth,)),))
+    dense = replace(estimate_of(view), depth=(DepthMap(0, *5 * (depth,)),))
     sparse = Scene(TRUE, EVERYWHERE, _seen_points())
     with ThreadPoolExecutor(2) as pool:
         merged = [
@@ -218,6 +231,15 @@ def test_lens_is_seen_through_and_a_wrong_one_is_doubted(given: tuple[float, flo
         [doubt] = estimate.doubts
         assert doubt.what == "the exposures contradict the lens"
         assert doubt.where.startswith("a k1 of about -0.")
+
+
+def test_errors_of_averages_count_only_where_these_contradict_the_focal_length() -> None:
+    averages = estimate_of()
+    contradicted = FreeFocal(2 * FOCAL_PX, 1.0, np.arange(1), TRUE.poses[:1]).doubt_of(FOCAL_PX, "averages")
+    reversed_depth = Reason("the depth of the scene may be reversed", 0.96, 0.9, "", "")
+    assert contradicted is not None
+    assert is_far_off(replace(averages, doubts=(reversed_depth, contradicted)))
+    assert not is_far_off(replace(averages, doubts=(reversed_depth,)))
 
 
 def test_poses_expect_the_error_of_a_wrong_focal_length() -> None:
