@@ -245,6 +245,8 @@ def _depth_score(folder: Path, run: RunPoses, truth: Path) -> DepthScore | None:
     arrays = read_arrays(truth, "a truth with poses")
     if not {"depths", "depth_frames", "camera_matrix"} <= arrays.keys():
         return None
+    if arrays["depths"].shape[1:] != run.frame_shape:
+        raise InputError(f"{truth} has depths of frames of another size than those of the run in {folder}")
     true, frames = arrays["camera_from_world"], arrays["depth_frames"]
     scale, *_ = align_positions(positions_of(run.camera_from_world[run.located]), positions_of(true[run.located]))
     camera = Camera(arrays["camera_matrix"], arrays.get("distortion", np.zeros(4)))

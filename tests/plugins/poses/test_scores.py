@@ -115,6 +115,9 @@ def test_depth_is_compared_with_that_of_the_nearest_frame_of_the_truth(folder: P
     assert score.known_share == pytest.approx(0.9, abs=0.01)
     assert score.within_std_shares == pytest.approx((0.683, 0.954, 0.997), abs=0.02)
     assert ("error of depth, median", f"{100 * score.error:.2f} %, of 90 % of the pixels") in score.rows()
+    np.savez(tmp_path / "truth.npz", **arrays | {"depths": depths[:, :30]})
+    with pytest.raises(InputError, match="depths of frames of another size"):
+        evaluate_poses(folder, tmp_path / "truth.npz")
 
 
 def test_perfect_poses_have_no_error() -> None:
